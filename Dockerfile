@@ -1,0 +1,48 @@
+# The proxy's image: docker build --target proxy -t rosproxy .
+# Any base with Debian's packages will do; where it has no Python, Debian's is installed.
+ARG BASE_IMAGE=python:3.12-slim-bookworm
+
+FROM ${BASE_IMAGE} AS base
+ENV PYTHONDONTWRITEBYTECODE=1 \
+    PYTHONUNBUFFERED=1
+RUN if ! command -v python3 >/dev/null; then \
+      apt-get update \
+      && apt-get install -y --no-install-recommends python3 \
+      && rm -rf /var/lib/apt/lists/* /var/cache/apt/*; \
+    fi
+
+
+FROM base AS builder
+RUN if ! python3 -c 'import ensurepip' 2>/dev/null; then \
+      apt-get update \
+      && apt-get install -y --no-install-recommends python3-venv ca-certificates; \
+    fi
+# Two environments: one with pip, that stays here, and the one that is shipped.
+RUN python3 -m venv /opt/build && python3 -m venv --without-pip /opt/rosproxy
+WORKDIR /src
+# Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
+ARG EXTRAS=""
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY proxy proxy
+# PIP_CONSTRAINT and not --constraint: it pins the build backend too.
+RUN PIP_CONSTRAINT=/src/constraints.txt /opt/build/bin/pip --python /opt/rosproxy/bin/python \
+      install --no-cache-dir --compile ".${EXTRAS:+[$EXTRAS]}"
+
+
+FROM base AS proxy
+LABEL org.opencontainers.image.title="rosproxy" \
+      org.opencontainers.image.description="A transparent proxy between isolated networks for ROS 1" \
+      org.opencontainers.image.licenses="Apache-2.0"
+COPY --from=builder /opt/rosproxy /opt/rosproxy
+ENV PATH=/opt/rosproxy/bin:$PATH
+# A number, so that Kubernetes can check runAsNonRoot. The proxy writes no file at all:
+# it runs with --read-only, --cap-drop ALL and --security-opt no-new-privileges.
+USER 10001:10001
+WORKDIR /
+# 11311: the master as nodes inside see it; needs no publishing.
+# 45000-45099: the ports of the nodes inside; publish them 1:1 (-p 45000-45099:45000-45099).
+EXPOSE 11311/tcp 45000-45099/tcp
+HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy", "health"]
+STOPSIGNAL SIGTERM
+ENTRYPOINT ["rosproxy"]
+CMD ["run"]

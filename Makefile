@@ -1,0 +1,61 @@
+# `make` lists the targets. Everything Python lives in .venv, made when needed.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+IMAGE ?= rosproxy:latest
+# Which layers `make test` runs, for example: make test LAYERS="unit ros"
+LAYERS ?=
+SOURCES := proxy tests scripts
+
+$(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
+	@scripts/venv.sh $(VENV)
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh
+	@scripts/venv.sh $(VENV) dev,uvloop
+	@touch $(VENV)/.runtime $@
+
+.PHONY: help
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+
+.PHONY: demo
+demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
+	@$(BIN)/python -m rosproxy.demo
+
+.PHONY: test
+test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS and Docker on Debian and Ubuntu as root
+	@$(BIN)/python scripts/test_layers.py $(LAYERS)
+
+.PHONY: check
+check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest -q tests/unit
+
+.PHONY: format
+format: $(VENV)/.dev ## rewrite the sources in the house format
+	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix $(SOURCES)
+
+.PHONY: venv
+venv: $(VENV)/.dev ## make .venv with the development tools
+
+.PHONY: lock
+lock: ## pin what is installed anew, into constraints.txt
+	@scripts/lock.sh constraints.txt
+
+.PHONY: image
+image: ## build the proxy's container image (IMAGE=rosproxy:latest)
+	docker build --target proxy --tag $(IMAGE) .
+
+.PHONY: clean
+clean: ## remove what the other targets made
+	rm -rf $(VENV) build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,5 @@
+"""``python -m rosproxy``."""
+
+from rosproxy.cli import main
+
+main(prog_name="rosproxy")

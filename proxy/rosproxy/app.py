@@ -1,0 +1,161 @@
+"""A running proxy: its parts put together, started and stopped."""
+
+import asyncio
+import logging
+import socket
+from typing import Any
+
+from rosproxy import listeners
+from rosproxy.acceptor import Acceptor, first_bytes
+from rosproxy.admin import Admin
+from rosproxy.context import make_context
+from rosproxy.core.registry import Endpoint
+from rosproxy.core.settings import SettingError, Settings
+from rosproxy.core.tcpros import speaks_http
+from rosproxy.core.uris import HostPort
+from rosproxy.http_server import Service, XmlRpcServer
+from rosproxy.keeper import Keeper
+from rosproxy.leases import Leases
+from rosproxy.master_service import MasterService, PublishedMaster
+from rosproxy.master_watch import MasterWatch
+from rosproxy.metrics import StateCollector
+from rosproxy.node_client import NodeClient
+from rosproxy.range_probe import probe_range
+from rosproxy.slave_service import SlaveService
+from rosproxy.status import describe
+from rosproxy.tcpros_service import TcprosService
+from rosproxy.upkeep import Upkeep
+
+log = logging.getLogger(__name__)
+
+
+class App:
+    """One proxy. `start` it in a running event loop, `stop` it in the same."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.context = context = make_context(settings)
+        nodes = NodeClient(context.upstream, settings.probe_timeout)
+        self._tcpros = TcprosService(context, nodes)
+        self._leases = Leases(context, nodes, self._connection)
+        self._upkeep = Upkeep(context, nodes)
+        self._keeper = Keeper(context, self._leases, nodes, self._upkeep)
+        self._watch = MasterWatch(context, self._keeper, self._upkeep)
+        self._slaves = XmlRpcServer(
+            SlaveService(context, self._leases), "rosproxy: slave API of a ROS node behind it\n"
+        )
+        self._servers = [self._slaves]
+        self._sockets: list[socket.socket] = []
+        self._admin = Admin(context.metrics.registry, self.status, self._unready, self._probe)
+
+    async def start(self) -> None:
+        """Bind all ports and begin. Raises SettingError if a port is taken."""
+        self._reserve_range()
+        settings = self.settings
+        master = MasterService(self.context, self._leases, self._watch.recovered)
+        self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
+        if settings.publish_master is not None:
+            where = HostPort(settings.advertise_host, settings.publish_master)
+            published = PublishedMaster(self.context, str(where))
+            self._listen("--publish-master", where.port, published, "ROS master API")
+        self.context.metrics.registry.register(self._state_metrics())
+        await self._start_admin()
+        spawn = self.context.tasks.spawn
+        spawn(self._watch.run(), "watching the master")
+        spawn(self._keeper.run(), "looking after nodes")
+        spawn(self._tcpros.sample_rates(), "sampling rates")
+        self._log_start()
+
+    async def stop(self) -> None:
+        """End everything; registrations stay at the master, for the next start to find."""
+        await self._admin.stop()
+        await self.context.tasks.cancel()
+        for server in self._servers:
+            await server.close()
+        for endpoint in self.context.registry:
+            await self._leases.close(endpoint)
+        for sock in self._sockets:
+            sock.close()
+        self.context.bank.close_all()
+        await self.context.upstream.close()
+
+    def status(self) -> dict[str, Any]:
+        """The state as JSON."""
+        return describe(self.context, self._watch, self._tcpros)
+
+    def _unready(self) -> str | None:
+        if self._watch.up:
+            return None
+        return self._watch.error or f"master {self.settings.master_uri} was not asked yet"
+
+    async def _probe(self) -> dict[str, Any]:
+        return await probe_range(self.context)
+
+    async def _connection(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+        """Serve a connection to a lease: XML-RPC or TCPROS, by its first bytes."""
+        first = await first_bytes(conn)
+        if len(first) < 4:
+            conn.close()
+        elif speaks_http(first):
+            await self._slaves.serve(conn)
+        else:
+            await self._tcpros.serve(endpoint, conn, peer)
+
+    def _reserve_range(self) -> None:
+        ports = self.settings.ports.listen
+        taken = self.context.bank.reserve(ports.ports())
+        for port in taken:
+            self.context.registry.pool.block(port)
+        if len(taken) == len(ports):
+            raise SettingError("--port-range", f"no port of {ports} can be bound; all are taken")
+        if taken:
+            text = f"ports of --port-range {ports} held by other programs: {taken}"
+            log.warning("%s", text)
+            self.context.problems.add("--port-range", text)
+
+    def _listen(self, option: str, port: int, service: Service, what: str) -> None:
+        try:
+            sock = listeners.listen(self.settings.bind, port)
+        except OSError as error:
+            raise SettingError(option, f"port {port} can't be bound: {error.strerror}") from None
+        server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
+        self._servers.append(server)
+        self._sockets.append(sock)
+        Acceptor(self.context.tasks, sock, lambda conn, peer: server.serve(conn))
+
+    async def _start_admin(self) -> None:
+        try:
+            await self._admin.start(self.settings.admin)
+        except OSError as error:
+            raise SettingError(
+                "--admin-bind", f"{self.settings.admin} can't be bound: {error.strerror}"
+            ) from None
+
+    def _state_metrics(self) -> StateCollector:
+        return StateCollector(
+            self.context.registry,
+            self._tcpros.traffic,
+            lambda: len(self._tcpros.relays),
+            lambda: bool(self._watch.up),
+        )
+
+    def _log_start(self) -> None:
+        settings = self.settings
+        log.info(
+            "ready: nodes use http://<this host>:%d as ROS_MASTER_URI; master %s; outside sees "
+            "%s:%s",
+            settings.master_port,
+            settings.master_uri,
+            settings.advertise_host,
+            settings.ports.advertise,
+        )
+
+
+async def serve(settings: Settings, stopped: asyncio.Event) -> None:
+    """Run a proxy until ``stopped`` is set. Raises SettingError if a port is taken."""
+    app = App(settings)
+    try:
+        await app.start()
+        await stopped.wait()
+    finally:
+        await app.stop()

@@ -1,0 +1,77 @@
+"""The rows of the master API that name addresses: which parameter, which part of the reply.
+
+Sources: http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API and
+ros_comm/tools/rosmaster/src/rosmaster/master_api.py. A method without a row is forwarded as it is.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Kind(Enum):
+    """What a node can be registered as."""
+
+    PUBLISHER = "publisher"
+    SUBSCRIBER = "subscriber"
+    SERVICE = "service"
+    PARAM = "param"
+
+
+class Reply(Enum):
+    """What the third element of a reply holds."""
+
+    OTHER = 0
+    SLAVE_URI = 1
+    SLAVE_URIS = 2
+    SERVICE_URI = 3
+    MASTER_URI = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One method: positions of the parameters that matter, what it registers and returns."""
+
+    name: int | None = None
+    type: int | None = None
+    service_api: int | None = None
+    caller_api: int | None = None
+    registers: Kind | None = None
+    unregisters: Kind | None = None
+    reply: Reply = Reply.OTHER
+
+
+MASTER_METHODS: dict[str, Row] = {
+    "registerService": Row(name=1, service_api=2, caller_api=3, registers=Kind.SERVICE),
+    "unregisterService": Row(name=1, service_api=2, unregisters=Kind.SERVICE),
+    "registerSubscriber": Row(
+        name=1, type=2, caller_api=3, registers=Kind.SUBSCRIBER, reply=Reply.SLAVE_URIS
+    ),
+    "unregisterSubscriber": Row(name=1, caller_api=2, unregisters=Kind.SUBSCRIBER),
+    "registerPublisher": Row(
+        name=1, type=2, caller_api=3, registers=Kind.PUBLISHER, reply=Reply.SLAVE_URIS
+    ),
+    "unregisterPublisher": Row(name=1, caller_api=2, unregisters=Kind.PUBLISHER),
+    "subscribeParam": Row(name=2, caller_api=1, registers=Kind.PARAM),
+    "unsubscribeParam": Row(name=2, caller_api=1, unregisters=Kind.PARAM),
+    "lookupNode": Row(reply=Reply.SLAVE_URI),
+    "lookupService": Row(reply=Reply.SERVICE_URI),
+    "getUri": Row(reply=Reply.MASTER_URI),
+}
+
+NO_ROW = Row()
+
+
+def row(method: str) -> Row:
+    """The row of a method; an empty one if nothing in it is rewritten."""
+    return MASTER_METHODS.get(method, NO_ROW)
+
+
+def resolve_name(name: str, caller_id: str) -> str:
+    """The global name that the master takes a name for (http://wiki.ros.org/Names)."""
+    if name.startswith("/"):
+        resolved = name
+    elif name.startswith("~"):
+        resolved = f"{caller_id}/{name[1:]}"
+    else:
+        resolved = f"{caller_id.rpartition('/')[0]}/{name}"
+    return "/" + "/".join(part for part in resolved.split("/") if part)

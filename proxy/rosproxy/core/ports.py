@@ -1,0 +1,94 @@
+"""The range of ports that the proxy listens on and how it maps to the advertised range."""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class PortRange:
+    """The ports ``first`` to ``last``, both included."""
+
+    first: int
+    last: int
+
+    def __len__(self) -> int:
+        """How many ports there are."""
+        return self.last - self.first + 1
+
+    def __contains__(self, port: object) -> bool:
+        """Whether a port is in the range."""
+        return isinstance(port, int) and self.first <= port <= self.last
+
+    def __str__(self) -> str:
+        """``first-last``."""
+        return f"{self.first}-{self.last}"
+
+    def ports(self) -> range:
+        """All ports, in order."""
+        return range(self.first, self.last + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class PortMap:
+    """Listen range and advertised range, of the same length: port n stands for n + offset."""
+
+    listen: PortRange
+    advertise: PortRange
+
+    def advertised(self, port: int) -> int:
+        """The port that outside sees for a port that the proxy listens on."""
+        return port - self.listen.first + self.advertise.first
+
+    def listening(self, advertised: int) -> int | None:
+        """The port behind an advertised one; None if it is not in the advertised range."""
+        if advertised not in self.advertise:
+            return None
+        return advertised - self.advertise.first + self.listen.first
+
+
+class PortPool:
+    """The free ports of a range.
+
+    A port given back goes to the end of the queue, so that it is used again as late as possible:
+    peers that still hold its old meaning find nobody there instead of somebody else.
+    """
+
+    def __init__(self, ports: PortRange) -> None:
+        self.range = ports
+        self._free = OrderedDict.fromkeys(ports.ports())
+        self._blocked: set[int] = set()
+
+    @property
+    def free(self) -> int:
+        """How many ports are free."""
+        return len(self._free)
+
+    @property
+    def blocked(self) -> int:
+        """How many ports another program holds."""
+        return len(self._blocked)
+
+    def take(self, prefer: int | None = None) -> int | None:
+        """Take ``prefer`` if it is free, else the port that was free longest; None if none is."""
+        if prefer is not None and prefer in self._free:
+            del self._free[prefer]
+            return prefer
+        return self._free.popitem(last=False)[0] if self._free else None
+
+    def claim(self, port: int) -> bool:
+        """Take exactly this port; False if it is not free."""
+        return port in self._free and self.take(port) == port
+
+    def peek(self) -> int | None:
+        """A port that is free, without taking it."""
+        return next(iter(self._free), None)
+
+    def give_back(self, port: int) -> None:
+        """Return a port that was taken."""
+        if port not in self._blocked:
+            self._free[port] = None
+
+    def block(self, port: int) -> None:
+        """Never hand out this port: another program on this machine holds it."""
+        self._blocked.add(port)
+        self._free.pop(port, None)

@@ -1,0 +1,111 @@
+"""Rebuilding the registry from what the master holds, after a start without memory.
+
+The advertised URIs at the master carry the inside addresses. Anybody can write such a URI to the
+master, so what is found there is only a claim: the shell asks the node itself before it serves it
+(see `confirmed_by`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from typing import Any
+
+from rosproxy.core.addressing import Addressing, Network
+from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Endpoint, Registration
+from rosproxy.core.uris import InsidePath, is_address, slave_uri
+
+_EVERYBODYS = frozenset({"/rosout"})
+_STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
+
+
+@dataclass(slots=True)
+class Claim:
+    """An endpoint that the master's data tell of: its port, its inside address, what it holds."""
+
+    port: int
+    inside: InsidePath
+    registrations: list[Registration] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        """The address to look for the node at."""
+        return self.inside.address or self.inside.node.host
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """What the endpoint would be keyed by."""
+        return self.address, self.inside.node.port
+
+    @property
+    def uri(self) -> str:
+        """The slave URI as the node must have given it."""
+        return slave_uri(self.inside.node)
+
+
+def registrations(state: Sequence[Any], types: Mapping[str, str]) -> dict[str, list[Registration]]:
+    """What each node has registered, from getSystemState and getTopicTypes.
+
+    ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``.
+    """
+    found: dict[str, list[Registration]] = {}
+    for kind, entries in zip(_STATE_KINDS, state, strict=True):
+        for name, nodes in entries:
+            for node in nodes:
+                held = Registration(kind, name, node, types.get(name, "*"))
+                found.setdefault(node, []).append(held)
+    return found
+
+
+def claims(
+    held: Mapping[str, list[Registration]], uris: Mapping[str, str], addressing: Addressing
+) -> list[Claim]:
+    """The endpoints of this proxy among the nodes of a master.
+
+    ``uris`` are the nodes' slave URIs. Of two claims to one port or one inside address the one
+    with the most registrations is kept; the other is a left-over.
+    """
+    found: dict[str, Claim] = {}
+    for node, uri in uris.items():
+        ours = addressing.identify(uri)
+        if ours:
+            found.setdefault(uri, Claim(*ours)).registrations += held.get(node, [])
+    ports: dict[int, Claim] = {}
+    keys: set[tuple[str, int]] = set()
+    for claim in sorted(found.values(), key=lambda claim: -len(claim.registrations)):
+        if claim.port not in ports and claim.key not in keys:
+            ports[claim.port] = claim
+            keys.add(claim.key)
+    return list(ports.values())
+
+
+def allowed(address: str, networks: Sequence[Network]) -> bool:
+    """Whether a recovered endpoint may lie at an address: inside the inside networks only."""
+    return is_address(address) and any(ip_address(address) in network for network in networks)
+
+
+def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
+    """Whether the topics that a node itself names bear out what the master says of it.
+
+    A forged URI that leads to something other than the node of that name finds no answer here,
+    or one of another node.
+    """
+    telling = endpoint.topics - _EVERYBODYS
+    return bool((telling or endpoint.topics) & topics)
+
+
+def lost(
+    ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
+) -> list[Registration]:
+    """Which of our registrations the master no longer has.
+
+    Those made after ``before``, the time at which the master was asked, don't count; nor do
+    parameter subscriptions, which the master's state leaves out, unless their node is unknown.
+    """
+    known = {held.key for held_list in state.values() for held in held_list}
+    gone = [h for h in ours if h.since < before and h.kind is not Kind.PARAM]
+    missing = [held for held in gone if held.key not in known]
+    lost_nodes = {held.caller_id for held in missing} - set(state)
+    return missing + [
+        held for held in ours if held.kind is Kind.PARAM and held.caller_id in lost_nodes
+    ]

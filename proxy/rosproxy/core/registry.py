@@ -1,0 +1,279 @@
+"""What the proxy knows: endpoints, the ports they hold, and what is registered for them.
+
+Plain state without I/O. It is changed in place rather than copied: with a thousand nodes of ten
+topics each a copy per call would make registration quadratic.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from rosproxy.core.liveness import Health
+from rosproxy.core.methods import Kind
+from rosproxy.core.ports import PortPool, PortRange
+from rosproxy.core.uris import HostPort, parse_service_uri
+
+
+class RangeExhausted(Exception):
+    """No port of the range is left for another node; the message is meant for the node's user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a node's slave API really is.
+
+    ``address`` is the IP address the proxy connects to. ``named``: the host that the node gives
+    leads there, so that neighbours can use it. ``confirmed``: the address is the one that the
+    registration came from; if not, the node's TCPROS port is believed only from the node itself.
+    """
+
+    address: str
+    named: bool
+    confirmed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """One registration at the master, on behalf of an endpoint.
+
+    ``type`` is the topic's message type, ``service_api`` the service URI as the node gave it
+    (None after a recovery, when only the node knows it).
+    """
+
+    kind: Kind
+    name: str
+    caller_id: str
+    type: str = "*"
+    service_api: str | None = None
+    since: float = 0.0
+
+    @property
+    def key(self) -> tuple[Kind, str, str]:
+        """What tells registrations apart at the master."""
+        return self.kind, self.name, self.caller_id
+
+
+@dataclass(slots=True, eq=False)
+class Endpoint:
+    """An inside slave URI and the port that stands for it outside.
+
+    ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
+    listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
+    ``trusted`` is False while only the master's data tell of the endpoint.
+    """
+
+    uri: str
+    node: HostPort
+    place: Place
+    port: int
+    registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
+    topic_ports: dict[str, int] = field(default_factory=dict)
+    tcpros_port: int | None = None
+    connections: int = 0
+    idle_since: float | None = None
+    trusted: bool = True
+    health: Health = field(default_factory=Health)
+    admissions: set[tuple[str, str]] = field(default_factory=set)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """The address and port of the slave API: what an endpoint is keyed by."""
+        return self.place.address, self.node.port
+
+    @property
+    def slave(self) -> HostPort:
+        """Where the proxy reaches the slave API."""
+        return HostPort(*self.key)
+
+    @property
+    def caller_ids(self) -> list[str]:
+        """The names of the nodes registered here; one, as a rule."""
+        return sorted({held.caller_id for held in self.registrations.values()})
+
+    @property
+    def label(self) -> str:
+        """How messages name this endpoint: node name and own URI."""
+        return f"{', '.join(self.caller_ids) or 'unnamed node'} ({self.uri})"
+
+    def names(self, kind: Kind) -> list[str]:
+        """The topics, services or parameters registered as ``kind``."""
+        return sorted(held.name for held in self.registrations.values() if held.kind is kind)
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics registered here, published or subscribed to."""
+        return {*self.names(Kind.PUBLISHER), *self.names(Kind.SUBSCRIBER)}
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is registered and nobody is connected."""
+        return not self.registrations and not self.connections
+
+
+class Registry:
+    """All endpoints, found by port, by address, by URI, by service and by node name."""
+
+    def __init__(self, ports: PortRange) -> None:
+        self.pool = PortPool(ports)
+        self.by_port: dict[int, Endpoint] = {}
+        self._by_key: dict[tuple[str, int], Endpoint] = {}
+        self._by_uri: dict[str, list[Endpoint]] = {}
+        self._by_caller: dict[str, dict[int, Endpoint]] = {}
+        self._services: dict[str, tuple[Endpoint, Registration]] = {}
+        self._admitted: dict[tuple[str, str], Endpoint] = {}
+        self._last_port: dict[tuple[str, int], int] = {}
+        self._last_key: dict[int, tuple[str, int]] = {}
+
+    def __iter__(self) -> Iterator[Endpoint]:
+        """All endpoints; safe against changes while iterating."""
+        return iter(list(self.by_port.values()))
+
+    def __len__(self) -> int:
+        """How many ports are held."""
+        return len(self.by_port)
+
+    def admitted(self, uri: str, source: str) -> Endpoint | None:
+        """The endpoint that ``uri`` was found to mean when ``source`` registered it before."""
+        return self._admitted.get((uri, source))
+
+    def admit(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+        """The endpoint of a slave URI that ``source`` registers; made if there is none.
+
+        Raises RangeExhausted if it needs a port and none can be had.
+        """
+        endpoint = self._by_key.get((place.address, node.port))
+        if endpoint is None:
+            endpoint = self._add(uri, node, place, self._port_for(place, node))
+        elif endpoint.uri != uri:
+            self._rename(endpoint, uri, node, place)
+        self._admit(endpoint, uri, source)
+        return endpoint
+
+    def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
+        """Rebuild an endpoint on the port that it had; None if either is taken."""
+        if (place.address, node.port) in self._by_key or not self.pool.claim(port):
+            return None
+        endpoint = self._add(uri, node, place, port)
+        endpoint.trusted = False
+        self._admit(endpoint, uri, place.address)
+        return endpoint
+
+    def remove(self, endpoint: Endpoint) -> None:
+        """Forget an endpoint with all its registrations and give its port back."""
+        for held in list(endpoint.registrations.values()):
+            self.unregister(held.kind, held.name, held.caller_id)
+        del self.by_port[endpoint.port], self._by_key[endpoint.key]
+        self._forget_uri(endpoint)
+        for admission in endpoint.admissions:
+            self._admitted.pop(admission, None)
+        self.pool.give_back(endpoint.port)
+
+    def reclaimable(self) -> Endpoint | None:
+        """The endpoint to give up first when the range is short: idle for the longest time."""
+        idle = [e for e in self if e.idle or (e.health.cleaned and not e.connections)]
+        return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
+
+    def exhausted(self) -> RangeExhausted:
+        """The error for a node that can't get a port."""
+        return RangeExhausted(
+            f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} leases "
+            f"held, {self.pool.blocked} taken by other programs); give the proxy a larger "
+            "--port-range (ROSPROXY_PORT_RANGE)"
+        )
+
+    def register(self, endpoint: Endpoint, held: Registration) -> None:
+        """Note what the master has accepted.
+
+        As the master does, a service has one provider, and a name that registers from another
+        URI loses all that it had at the old one (rosmaster/registrations.py).
+        """
+        for other in list(self._by_caller.get(held.caller_id, {}).values()):
+            if other is not endpoint:
+                self.drop_caller(other, held.caller_id)
+        if held.kind is Kind.SERVICE:
+            self._replace_service(endpoint, held)
+        endpoint.registrations[held.key] = held
+        self._by_caller.setdefault(held.caller_id, {})[endpoint.port] = endpoint
+        endpoint.idle_since = None
+
+    def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
+        """Note that a registration has ended, whoever ended it."""
+        for endpoint in list(self._by_caller.get(caller_id, {}).values()):
+            self._drop(endpoint, (kind, name, caller_id))
+
+    def drop_caller(self, endpoint: Endpoint, caller_id: str) -> None:
+        """Note that a node is no longer registered at an endpoint at all."""
+        for key in [key for key in endpoint.registrations if key[2] == caller_id]:
+            self._drop(endpoint, key)
+
+    def by_uri(self, uri: str) -> list[Endpoint]:
+        """The endpoints that call themselves ``uri``; several only for host names reused."""
+        return self._by_uri.get(uri, [])
+
+    def by_caller(self, caller_id: str) -> Endpoint | None:
+        """The endpoint of a node's name."""
+        return next(iter(self._by_caller.get(caller_id, {}).values()), None)
+
+    def service(self, name: str) -> tuple[Endpoint, Registration] | None:
+        """Who provides a service."""
+        return self._services.get(name)
+
+    def service_port(self, endpoint: Endpoint, name: str) -> int | None:
+        """The TCPROS port that an endpoint's node gave for a service, if it may be believed."""
+        known = self._services.get(name)
+        if known is None or known[0] is not endpoint or not endpoint.place.confirmed:
+            return None
+        where = parse_service_uri(known[1].service_api or "")
+        return where.port if where else None
+
+    def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
+        """Everything that is registered, with its endpoint."""
+        return [(e, held) for e in self for held in e.registrations.values()]
+
+    def _port_for(self, place: Place, node: HostPort) -> int:
+        port = self.pool.take(prefer=self._last_port.get((place.address, node.port)))
+        if port is None:
+            raise self.exhausted()
+        return port
+
+    def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
+        endpoint = Endpoint(uri, node, place, port)
+        self.by_port[port] = self._by_key[endpoint.key] = endpoint
+        self._remember(port, endpoint.key)
+        self._by_uri.setdefault(uri, []).append(endpoint)
+        return endpoint
+
+    def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
+        self._admitted[uri, source] = endpoint
+        endpoint.admissions.add((uri, source))
+
+    def _remember(self, port: int, key: tuple[str, int]) -> None:
+        self._last_port.pop(self._last_key.get(port, key), None)
+        self._last_key[port] = key
+        self._last_port[key] = port
+
+    def _rename(self, endpoint: Endpoint, uri: str, node: HostPort, place: Place) -> None:
+        self._forget_uri(endpoint)
+        endpoint.uri, endpoint.node, endpoint.place = uri, node, place
+        self._by_uri.setdefault(uri, []).append(endpoint)
+
+    def _forget_uri(self, endpoint: Endpoint) -> None:
+        same = [other for other in self._by_uri.pop(endpoint.uri) if other is not endpoint]
+        if same:
+            self._by_uri[endpoint.uri] = same
+
+    def _replace_service(self, endpoint: Endpoint, held: Registration) -> None:
+        before = self._services.get(held.name)
+        if before and before[1].key != held.key:
+            self._drop(before[0], before[1].key)
+        self._services[held.name] = (endpoint, held)
+
+    def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
+        if endpoint.registrations.pop(key, None) is None:
+            return
+        kind, name, caller_id = key
+        if kind is Kind.SERVICE:
+            self._services.pop(name, None)
+        if not any(other[2] == caller_id for other in endpoint.registrations):
+            self._by_caller[caller_id].pop(endpoint.port, None)
+            if not self._by_caller[caller_id]:
+                del self._by_caller[caller_id]

@@ -1,0 +1,172 @@
+"""The settings of a proxy, validated."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from ipaddress import ip_address, ip_network
+from typing import Any, Literal
+from urllib.parse import urlsplit
+
+from rosproxy.core.addressing import Network
+from rosproxy.core.ports import PortMap, PortRange
+from rosproxy.core.uris import HostPort, parse_host_port
+
+DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
+
+
+class SettingError(ValueError):
+    """A setting that can't be used. ``option`` names it as on the command line."""
+
+    def __init__(self, option: str, problem: str) -> None:
+        super().__init__(f"{option}: {problem}")
+        self.option = option
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Everything that ``rosproxy run`` can be told. Times are in seconds.
+
+    ``inside_networks`` empty means: the networks of the proxy's own interfaces.
+    """
+
+    master_uri: str
+    advertise_host: str
+    ports: PortMap
+    master_port: int = 11311
+    publish_master: int | None = None
+    bind: str = "0.0.0.0"
+    admin: HostPort = DEFAULT_ADMIN
+    inside_networks: tuple[Network, ...] = ()
+    probe_interval: float = 5.0
+    probe_timeout: float = 3.0
+    cleanup_after: float = 30.0
+    linger: float = 30.0
+    master_interval: float = 2.0
+    slave_control: Literal["any", "master"] = "any"
+
+
+def parse_settings(options: Mapping[str, Any]) -> Settings:
+    """Settings from the values of the command line's options.
+
+    Raises SettingError for the first value that can't be used.
+    """
+    listen = parse_range("--port-range", options["port_range"])
+    text = options.get("advertise_port_range")
+    advertise = parse_range("--advertise-port-range", text) if text else listen
+    if len(advertise) != len(listen):
+        raise SettingError(
+            "--advertise-port-range",
+            f"{advertise} has {len(advertise)} ports and --port-range {listen} has {len(listen)}; "
+            "both need the same number",
+        )
+    settings = Settings(
+        master_uri=_master_uri(options.get("master_uri")),
+        advertise_host=_advertise_host(options.get("advertise_host")),
+        ports=PortMap(listen, advertise),
+        master_port=_port("--master-port", options["master_port"]),
+        publish_master=_optional_port("--publish-master", options.get("publish_master")),
+        bind=_bind(options["bind"]),
+        admin=_admin(options["admin_bind"]),
+        inside_networks=tuple(_network(text) for text in options.get("inside_network") or ()),
+        slave_control=options["slave_control"],
+        **{name: _seconds(name, options[name]) for name in _TIMES},
+    )
+    _check_overlaps(settings)
+    return settings
+
+
+_TIMES = ("probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval")
+_MAY_BE_ZERO = ("cleanup_after", "linger")
+
+
+def parse_range(option: str, text: str) -> PortRange:
+    """Parse ``first-last``. Raises SettingError that names ``option``."""
+    first, _, last = text.partition("-")
+    if not (first.strip().isdecimal() and last.strip().isdecimal()):
+        raise SettingError(option, f"{text!r} is not a range such as 45000-45099")
+    ports = PortRange(int(first), int(last))
+    if not 1 <= ports.first <= ports.last <= 65535:
+        raise SettingError(option, f"{text!r} must rise and lie between 1 and 65535")
+    return ports
+
+
+def _master_uri(uri: str | None) -> str:
+    if not uri:
+        raise SettingError(
+            "--master-uri",
+            "missing; give the real master, e.g. http://robot:11311 (ROS_MASTER_URI)",
+        )
+    try:
+        parts = urlsplit(uri)
+        valid = parts.scheme == "http" and bool(parts.hostname) and parts.port is not None
+    except ValueError:
+        valid = False
+    if not valid:
+        raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
+    return uri
+
+
+def _advertise_host(host: str | None) -> str:
+    if not host:
+        raise SettingError(
+            "--advertise-host",
+            "missing; give the name or address under which outside nodes reach this host "
+            "(ROSPROXY_ADVERTISE_HOST)",
+        )
+    bare = host.strip("[]")
+    if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
+        raise SettingError("--advertise-host", f"{host!r} is neither a host name nor an address")
+    return bare
+
+
+def _port(option: str, port: int) -> int:
+    if not 1 <= port <= 65535:
+        raise SettingError(option, f"{port} is not a port between 1 and 65535")
+    return port
+
+
+def _optional_port(option: str, port: int | None) -> int | None:
+    return None if port is None else _port(option, port)
+
+
+def _bind(address: str) -> str:
+    try:
+        return str(ip_address(address))
+    except ValueError:
+        raise SettingError("--bind", f"{address!r} is not an IP address of this host") from None
+
+
+def _admin(text: str) -> HostPort:
+    where = parse_host_port(text)
+    if where is None:
+        raise SettingError("--admin-bind", f"{text!r} is not of the form 127.0.0.1:11312")
+    return where
+
+
+def _network(text: str) -> Network:
+    try:
+        return ip_network(text)
+    except ValueError as error:
+        raise SettingError("--inside-network", f"{text!r} is not a network: {error}") from None
+
+
+def _seconds(name: str, value: float) -> float:
+    option = "--" + name.replace("_", "-")
+    low = 0.0 if name in _MAY_BE_ZERO else 0.05
+    if not low <= value <= 86400:
+        raise SettingError(option, f"{value:g} s is not between {low:g} and 86400 s")
+    return float(value)
+
+
+def _check_overlaps(settings: Settings) -> None:
+    for option, port in (
+        ("--master-port", settings.master_port),
+        ("--publish-master", settings.publish_master),
+        ("--admin-bind", settings.admin.port),
+    ):
+        if port in settings.ports.listen:
+            raise SettingError(
+                option,
+                f"port {port} lies in --port-range {settings.ports.listen}; move one of them",
+            )
+    if settings.master_port == settings.publish_master:
+        raise SettingError("--publish-master", "must differ from --master-port")

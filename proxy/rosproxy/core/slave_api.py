@@ -1,0 +1,135 @@
+"""The slave API as outside and the master call it: what is rewritten on the way in and back.
+
+Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
+clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
+"""
+
+from dataclasses import dataclass
+
+from rosproxy.core import xmlrpc
+from rosproxy.core.addressing import Addressing, Asker
+from rosproxy.core.uris import HostPort, parse_slave_uri
+from rosproxy.core.xmlrpc import Call, Edit, Value
+
+MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
+"""What the master calls at nodes; a policy can refuse it from anybody else."""
+
+_URI_REPLIES = frozenset({"getUri", "getMasterUri"})
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPort:
+    """The TCPROS port on which a node serves a topic, as it told a subscriber."""
+
+    topic: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A call at an endpoint.
+
+    ``node`` is the endpoint's node as an asker of imported addresses, ``reached`` the address and
+    port that the caller used for the endpoint, ``master_uri`` the master's URI outside.
+    """
+
+    node: Asker
+    reached: HostPort
+    master_uri: str
+
+
+def rewritten(call: Call) -> bool:
+    """Whether anything in a call or its reply is rewritten."""
+    return call.method in _URI_REPLIES or call.method in (
+        "publisherUpdate",
+        "requestTopic",
+        "getBusInfo",
+    )
+
+
+def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -> bytes:
+    """The call for the inside node: the publishers of a ``publisherUpdate`` imported.
+
+    Their order is kept; a publisher that is named twice is left out the second time.
+    """
+    if call.method != "publisherUpdate" or len(call.params) < 3:
+        return body
+    edits, seen = [], set()
+    for item in (item for item in call.params[2].items if item.kind == "string"):
+        uri = addressing.import_slave(item.text, visit.node)
+        edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
+        seen.add(uri)
+    return xmlrpc.apply(body, edits)
+
+
+def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing) -> bytes:
+    """The reply for outside: addresses exported."""
+    triple = _triple(reply)
+    if triple is None:
+        return reply
+    if call.method == "requestTopic":
+        edits = _export_topic(triple, visit)
+    elif call.method == "getBusInfo":
+        edits = _export_bus_info(triple, visit, addressing)
+    elif call.method in _URI_REPLIES:
+        edits = _export_uri(call.method, triple, visit, addressing)
+    else:
+        edits = []
+    return xmlrpc.apply(reply, edits)
+
+
+def topic_port(call: Call, reply: bytes) -> TopicPort | None:
+    """The port that a reply to ``requestTopic`` names, if it is one for TCPROS."""
+    triple = _triple(reply)
+    protocol = triple.items[2] if triple else None
+    topic = call.string(1)
+    if not topic or protocol is None or not _is_tcpros(protocol):
+        return None
+    port = protocol.items[2].integer()
+    return TopicPort(topic, port) if port and 0 < port < 65536 else None
+
+
+def _triple(reply: bytes) -> Value | None:
+    value = xmlrpc.parse_reply(reply)
+    return value if value and value.kind == "array" and len(value.items) == 3 else None
+
+
+def _is_tcpros(protocol: Value) -> bool:
+    return len(protocol.items) == 3 and protocol.items[0].string() == "TCPROS"
+
+
+def _export_topic(triple: Value, visit: Visit) -> list[Edit]:
+    protocol, message = triple.items[2], triple.items[1]
+    if not _is_tcpros(protocol):
+        return []
+    host, port = protocol.items[1], protocol.items[2]
+    edits = [
+        xmlrpc.replace(host, visit.reached.host),
+        xmlrpc.replace(port, str(visit.reached.port)),
+    ]
+    inside = f"{host.text}:{port.text}"
+    if message.kind == "string" and inside in message.text:
+        edits.append(xmlrpc.replace(message, message.text.replace(inside, str(visit.reached))))
+    return edits
+
+
+def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
+    edits = []
+    for row in triple.items[2].items:
+        peer = row.items[1].string() if len(row.items) > 1 else None
+        if peer and parse_slave_uri(peer):
+            edits.append(xmlrpc.replace(row.items[1], addressing.export_slave(peer, visit.node)))
+    return edits
+
+
+def _export_uri(method: str, triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
+    held, message = triple.items[2], triple.items[1]
+    if held.kind != "string" or not held.text:
+        return []
+    after = visit.master_uri
+    if method == "getUri":
+        after = addressing.export_slave(held.text, visit.node)
+    edits = [xmlrpc.replace(held, after)]
+    if message.kind == "string" and message.text == held.text:
+        edits.append(xmlrpc.replace(message, after))
+    return edits

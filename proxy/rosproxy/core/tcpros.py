@@ -1,0 +1,61 @@
+"""The TCPROS connection header.
+
+Format: a 4-byte little-endian length of everything that follows, then fields, each a 4-byte
+little-endian length and ``name=value`` (http://wiki.ros.org/ROS/Connection%20Header).
+"""
+
+import struct
+from collections.abc import Mapping
+
+MAX_HEADER = 1_000_000
+"""Longest header in bytes that is read; roscpp refuses longer ones as well (connection.cpp)."""
+
+_LENGTH = struct.Struct("<I")
+
+
+class HeaderError(ValueError):
+    """Bytes that are not a connection header; the message says why."""
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """A complete header with its leading total length."""
+    parts = [f"{name}={value}".encode() for name, value in fields.items()]
+    body = b"".join(_LENGTH.pack(len(part)) + part for part in parts)
+    return _LENGTH.pack(len(body)) + body
+
+
+def decode_header(body: bytes) -> dict[str, str]:
+    """The fields of a header, given without its leading total length.
+
+    Raises HeaderError if a field's length leads outside the body or a field has no ``=``.
+    """
+    fields, position = {}, 0
+    while position < len(body):
+        start = position + 4
+        if start > len(body):
+            raise HeaderError("connection header ends inside a field's length")
+        position = start + _LENGTH.unpack_from(body, position)[0]
+        if position > len(body):
+            raise HeaderError("connection header ends inside a field")
+        name, equals, value = body[start:position].decode("utf-8", "replace").partition("=")
+        if not equals:
+            raise HeaderError("connection header has a field without '='")
+        fields[name] = value
+    return fields
+
+
+def header_length(first: bytes) -> int:
+    """The length in bytes that the first four bytes of a connection announce.
+
+    Raises HeaderError if it is more than MAX_HEADER. Four ASCII letters, as at the start of an
+    HTTP request, always are: that is how the two protocols share one port.
+    """
+    length: int = _LENGTH.unpack(first)[0]
+    if length > MAX_HEADER:
+        raise HeaderError(f"connection header of {length} bytes, at most {MAX_HEADER} are read")
+    return length
+
+
+def speaks_http(first: bytes) -> bool:
+    """Whether a connection's first four bytes are the start of an HTTP request."""
+    return len(first) == 4 and first.isascii() and first.replace(b" ", b"A").isalpha()

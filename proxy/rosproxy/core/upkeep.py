@@ -1,0 +1,56 @@
+"""The calls by which the proxy registers and unregisters at the master on behalf of nodes."""
+
+from typing import Any
+
+from rosproxy.core.addressing import Addressing
+from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Endpoint, Registration
+
+MethodCall = tuple[str, list[Any]]
+"""A method and its parameters, the caller_id first."""
+
+
+def register_call(endpoint: Endpoint, held: Registration, addressing: Addressing) -> MethodCall:
+    """The call that makes a registration at the master."""
+    uri = addressing.advertised_uri(endpoint)
+    match held.kind:
+        case Kind.PUBLISHER:
+            return "registerPublisher", [held.caller_id, held.name, held.type, uri]
+        case Kind.SUBSCRIBER:
+            return "registerSubscriber", [held.caller_id, held.name, held.type, uri]
+        case Kind.SERVICE:
+            service = addressing.advertised_service(endpoint)
+            return "registerService", [held.caller_id, held.name, service, uri]
+        case Kind.PARAM:
+            return "subscribeParam", [held.caller_id, uri, held.name]
+
+
+def unregister_call(endpoint: Endpoint, held: Registration, addressing: Addressing) -> MethodCall:
+    """The call that takes a registration back; the master wants the URI exactly as registered."""
+    uri = addressing.advertised_uri(endpoint)
+    match held.kind:
+        case Kind.PUBLISHER:
+            return "unregisterPublisher", [held.caller_id, held.name, uri]
+        case Kind.SUBSCRIBER:
+            return "unregisterSubscriber", [held.caller_id, held.name, uri]
+        case Kind.SERVICE:
+            service = addressing.advertised_service(endpoint)
+            return "unregisterService", [held.caller_id, held.name, service]
+        case Kind.PARAM:
+            return "unsubscribeParam", [held.caller_id, uri, held.name]
+
+
+def still_held(
+    endpoint: Endpoint, published: frozenset[str], subscribed: frozenset[str], same_process: bool
+) -> list[Registration]:
+    """Which of an endpoint's registrations hold for a node that has come back.
+
+    Topics count if the node itself names them; services and parameters, which it can't be asked
+    for, only if it is the ``same_process`` and at least one topic holds.
+    """
+    topics = {Kind.PUBLISHER: published, Kind.SUBSCRIBER: subscribed}
+    everything = list(endpoint.registrations.values())
+    kept = [held for held in everything if held.name in topics.get(held.kind, ())]
+    if not (kept and same_process):
+        return kept
+    return kept + [held for held in everything if held.kind not in topics]

@@ -1,0 +1,106 @@
+"""The HTTP side of XML-RPC: aiohttp reads requests, this module answers them.
+
+What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
+no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
+"""
+
+import asyncio
+import logging
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from aiohttp import web
+
+from rosproxy.core import xmlrpc
+from rosproxy.core.uris import HostPort, parse_host_port, plain_address
+from rosproxy.relay import reset_on_close
+from rosproxy.upstream import LOOP_HEADER, MAX_BODY, Unreachable, read_bounded
+
+log = logging.getLogger(__name__)
+
+BODY_TIMEOUT = 60.0
+"""Seconds in which a request's body must arrive."""
+
+
+class Call:
+    """One XML-RPC request: its body, who sent it and where it arrived."""
+
+    def __init__(self, request: web.BaseRequest, body: bytes) -> None:
+        peer = _address(request, "peername")
+        here = _address(request, "sockname")
+        self.body = body
+        self.source = peer.host
+        self.local = here
+        self.host_header = request.headers.get("Host", "")
+        self.loop_id = request.headers.get(LOOP_HEADER, "")
+
+    @property
+    def reached_locally(self) -> bool:
+        """Whether the caller named the very address and port of this machine that it reached.
+
+        So does a neighbour that was given the proxy's inside address; whoever comes through a
+        published port names the host instead.
+        """
+        return parse_host_port(self.host_header) == self.local
+
+
+Service = Callable[[Call], Awaitable[bytes]]
+
+
+class XmlRpcServer:
+    """Turns accepted sockets into XML-RPC calls to a service."""
+
+    def __init__(self, service: Service, greeting: str) -> None:
+        self._service, self._greeting = service, greeting
+        self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
+
+    async def serve(self, conn: socket.socket) -> None:
+        """Take over a connection. Raises OSError if it has ended already."""
+        loop = asyncio.get_running_loop()
+        await loop.connect_accepted_socket(self._server, sock=conn)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._server.shutdown(1.0)
+
+    async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        if request.method in ("GET", "HEAD"):
+            return web.Response(text=self._greeting)
+        if request.method != "POST":
+            return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
+        try:
+            async with asyncio.timeout(BODY_TIMEOUT):
+                body = await read_bounded(request.content)
+        except TimeoutError:
+            return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
+        except ValueError:
+            return web.Response(status=413, text=f"at most {MAX_BODY} bytes are read\n")
+        return await self._answer(request, body)
+
+    async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
+        try:
+            reply = await self._service(Call(request, body))
+        except xmlrpc.XmlRpcError as error:
+            reply = xmlrpc.dump_fault(error.code, f"rosproxy: {error}")
+        except Unreachable as error:
+            log.debug("no answer for %s: %s", request.remote, error)
+            return _refuse(request)
+        except Exception:
+            log.exception("a call from %s failed in the proxy", request.remote)
+            reply = xmlrpc.dump_fault(xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see its log")
+        return web.Response(body=reply, content_type="text/xml")
+
+
+def _address(request: web.BaseRequest, which: str) -> HostPort:
+    found: Any = request.transport.get_extra_info(which) if request.transport else None
+    return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
+
+
+def _refuse(request: web.BaseRequest) -> web.StreamResponse:
+    """Reset the connection: what a caller finds whose peer is gone; ROS's clients try again."""
+    transport = request.transport
+    if transport is not None:
+        reset_on_close(transport.get_extra_info("socket"))
+        transport.abort()
+    return web.Response(status=503)

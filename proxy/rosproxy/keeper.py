@@ -1,0 +1,119 @@
+"""Housekeeping: probes, clean-up of dead nodes, and the end of leases that nobody uses."""
+
+import asyncio
+import logging
+
+from rosproxy.context import Context
+from rosproxy.core.liveness import Change, Probe
+from rosproxy.core.recovery import confirmed_by
+from rosproxy.core.registry import Endpoint, Place
+from rosproxy.leases import Leases
+from rosproxy.network import resolve
+from rosproxy.node_client import NodeClient
+from rosproxy.upkeep import Upkeep
+from rosproxy.upstream import Unreachable
+
+log = logging.getLogger(__name__)
+
+TICK = 0.25
+"""Seconds between looks at all endpoints."""
+FORGET_AFTER = 3600.0
+"""Seconds after which a node that was cleaned up while it was silent is forgotten."""
+PARALLEL_PROBES = 64
+
+
+class Keeper:
+    """Looks after all endpoints."""
+
+    def __init__(self, context: Context, leases: Leases, nodes: NodeClient, upkeep: Upkeep) -> None:
+        self._context, self._leases, self._nodes, self._upkeep = context, leases, nodes, upkeep
+        self._probing: set[Endpoint] = set()
+        self._limit = asyncio.Semaphore(PARALLEL_PROBES)
+
+    async def run(self) -> None:
+        """Look after the endpoints until cancelled."""
+        while True:
+            for endpoint in self._context.registry:
+                self._look(endpoint)
+                await self._maybe_end(endpoint)
+            await asyncio.sleep(TICK)
+
+    async def verify(self, endpoint: Endpoint) -> None:
+        """Serve a recovered endpoint if its node bears out what the master says of it."""
+        said = await self._nodes.describe(endpoint.slave)
+        if said is None or endpoint.trusted:
+            return
+        if not confirmed_by(endpoint, said.topics):
+            log.warning("%s: the node there has none of its topics; not served", endpoint.label)
+            await self._upkeep.clean_up(endpoint)
+            await self._leases.end(endpoint)
+            return
+        endpoint.tcpros_port, endpoint.trusted = said.tcpros_port, True
+        await self._name(endpoint)
+        self._leases.open(endpoint)
+
+    async def probe(self, endpoint: Endpoint) -> None:
+        """Probe an endpoint and act on the result."""
+        answer = await self._nodes.probe(endpoint.slave)
+        change = endpoint.health.note(answer.probe, self._context.now())
+        if answer.probe is Probe.ANSWERED:
+            await self._answered(endpoint, answer.pid)
+        elif change is Change.DOWN:
+            self._report_down(endpoint, answer.reason)
+            await self._leases.close(endpoint)
+        if endpoint.health.clean_up(self._context.now(), self._context.settings.cleanup_after):
+            await self._upkeep.clean_up(endpoint)
+
+    def _look(self, endpoint: Endpoint) -> None:
+        due = endpoint.health.due(self._context.now(), self._context.settings.probe_interval)
+        if due and endpoint not in self._probing:
+            self._probing.add(endpoint)
+            self._context.tasks.spawn(self._probe(endpoint), f"probe of {endpoint.uri}")
+
+    async def _probe(self, endpoint: Endpoint) -> None:
+        try:
+            async with self._limit:
+                await self.probe(endpoint)
+        except Unreachable as error:
+            log.debug("upkeep of %s has to wait: %s", endpoint.label, error)
+        finally:
+            self._probing.discard(endpoint)
+
+    async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
+        if not endpoint.trusted:
+            await self.verify(endpoint)
+            return
+        if endpoint.health.cleaned:
+            await self._upkeep.come_back(endpoint)
+        endpoint.health.pid = pid
+        if not self._leases.is_open(endpoint) and endpoint.port in self._context.registry.by_port:
+            log.info("%s answers again", endpoint.label)
+            self._context.problems.clear(endpoint.label)
+            self._leases.open(endpoint)
+
+    def _report_down(self, endpoint: Endpoint, reason: str) -> None:
+        if endpoint.registrations:
+            log.warning("%s does not answer: %s", endpoint.label, reason)
+            self._context.problems.add(endpoint.label, f"does not answer: {reason}")
+
+    async def _name(self, endpoint: Endpoint) -> None:
+        """Find out whether neighbours can use a recovered node's host name."""
+        place = endpoint.place
+        named = place.address in await resolve(endpoint.node.host)
+        endpoint.place = Place(place.address, named, place.confirmed)
+
+    async def _maybe_end(self, endpoint: Endpoint) -> None:
+        now, health = self._context.now(), endpoint.health
+        if endpoint.connections:
+            endpoint.idle_since = None
+            return
+        if not (endpoint.idle or health.cleaned):
+            return
+        if endpoint.idle_since is None:
+            endpoint.idle_since = now
+        linger = self._context.settings.linger
+        if health.cleaned and not health.refused:
+            linger = FORGET_AFTER
+        if now - endpoint.idle_since >= linger:
+            log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
+            await self._leases.end(endpoint)

@@ -1,0 +1,143 @@
+"""Leases: admitting nodes, opening and closing the ports that stand for them."""
+
+import logging
+import socket
+from collections.abc import Awaitable, Callable
+
+from rosproxy.acceptor import Acceptor
+from rosproxy.context import Context
+from rosproxy.core.addressing import Asker
+from rosproxy.core.liveness import Probe
+from rosproxy.core.master_api import Admission, Refusal, registering_uri
+from rosproxy.core.registry import Endpoint, Place, RangeExhausted
+from rosproxy.core.uris import HostPort, is_loopback, parse_slave_uri
+from rosproxy.core.xmlrpc import Call
+from rosproxy.network import resolve
+from rosproxy.node_client import NodeClient
+
+log = logging.getLogger(__name__)
+
+Connection = Callable[[Endpoint, socket.socket, str], Awaitable[None]]
+"""Serves a connection to an endpoint's port; the last argument is the peer's address."""
+
+
+class Leases:
+    """Which node holds which port, and whether the port listens."""
+
+    def __init__(self, context: Context, nodes: NodeClient, on_connection: Connection) -> None:
+        self._context, self._nodes, self._on_connection = context, nodes, on_connection
+        self._acceptors: dict[int, Acceptor] = {}
+
+    async def admit(self, call: Call, asker: Asker) -> Admission:
+        """The endpoint of a call that registers, or why there is none; None for other calls."""
+        uri = registering_uri(call)
+        if uri is None:
+            return None
+        endpoint = self._context.registry.admitted(uri, asker.address)
+        if endpoint is not None:
+            return endpoint
+        node = parse_slave_uri(uri)
+        if node is None:
+            return Refusal(
+                f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
+            )
+        if self._context.addressing.handed_out(uri, asker):
+            return None
+        return await self._admit_new(uri, node, asker)
+
+    def open(self, endpoint: Endpoint) -> None:
+        """Let an endpoint's port listen."""
+        if endpoint.port in self._acceptors:
+            return
+        try:
+            sock = self._context.bank.open(endpoint.port)
+        except OSError as error:
+            self._context.problems.add(endpoint.label, f"port {endpoint.port} is taken: {error}")
+            log.error("port %d of %s can't be opened: %s", endpoint.port, endpoint.label, error)
+            return
+        self._acceptors[endpoint.port] = Acceptor(
+            self._context.tasks, sock, lambda conn, peer: self._on_connection(endpoint, conn, peer)
+        )
+
+    async def close(self, endpoint: Endpoint) -> None:
+        """Let an endpoint's port refuse; the lease and open connections stay."""
+        acceptor = self._acceptors.pop(endpoint.port, None)
+        if acceptor is not None:
+            await acceptor.stop()
+            self._context.bank.close(endpoint.port, acceptor.sock)
+
+    async def end(self, endpoint: Endpoint) -> None:
+        """End a lease: close its port and forget its endpoint."""
+        registry = self._context.registry
+        if registry.by_port.get(endpoint.port) is endpoint:
+            registry.remove(endpoint)
+            await self.close(endpoint)
+
+    def is_open(self, endpoint: Endpoint) -> bool:
+        """Whether an endpoint's port listens."""
+        return endpoint.port in self._acceptors
+
+    async def _admit_new(self, uri: str, node: HostPort, asker: Asker) -> Admission:
+        place = await self._place(node, asker.address)
+        try:
+            endpoint = await self._lease(uri, node, place, asker.address)
+        except RangeExhausted as error:
+            self._context.metrics.exhausted.inc()
+            self._context.problems.add(asker.caller_id, str(error))
+            log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
+            return Refusal(str(error))
+        self.open(endpoint)
+        self._context.tasks.spawn(self._greet(endpoint, asker.caller_id), f"first probe of {uri}")
+        return endpoint
+
+    async def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+        registry = self._context.registry
+        try:
+            return registry.admit(uri, node, place, source)
+        except RangeExhausted:
+            oldest = registry.reclaimable()
+            if oldest is None:
+                raise
+            await self.end(oldest)
+            return registry.admit(uri, node, place, source)
+
+    async def _place(self, node: HostPort, source: str) -> Place:
+        """Where a node is that gives ``node`` as its address and registers from ``source``."""
+        addresses = await resolve(node.host)
+        if source in addresses:
+            return Place(source, named=True)
+        elsewhere = [address for address in addresses if not is_loopback(address)]
+        if not elsewhere or (await self._nodes.probe(HostPort(source, node.port))).pid is not None:
+            return Place(source, named=False)
+        for address in elsewhere:
+            if (await self._nodes.probe(HostPort(address, node.port))).pid is not None:
+                return Place(address, named=True, confirmed=False)
+        return Place(source, named=False)
+
+    async def _greet(self, endpoint: Endpoint, caller_id: str) -> None:
+        """Look at once whether a new node can be reached, and say so if not."""
+        answer = await self._nodes.probe(endpoint.slave)
+        endpoint.health.note(answer.probe, self._context.now())
+        endpoint.health.pid = answer.pid
+        log.info("%s at %s is %s", caller_id, endpoint.uri, self._advertised(endpoint))
+        if answer.probe is Probe.ANSWERED:
+            return
+        text = _unreachable_text(endpoint, answer.reason)
+        self._context.problems.add(caller_id, text)
+        log.warning("%s: %s", caller_id, text)
+
+    def _advertised(self, endpoint: Endpoint) -> str:
+        return self._context.addressing.advertised_uri(endpoint)
+
+
+def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
+    if is_loopback(endpoint.node.host):
+        return (
+            f"gives its address as {endpoint.uri}, a loopback address, and listens only there: no "
+            "other machine can reach it. Unset ROS_IP and ROS_HOSTNAME where it runs, or set "
+            f"ROS_IP={endpoint.place.address}"
+        )
+    return (
+        f"can't be reached by the proxy at {endpoint.slave} ({reason}). Check that it listens on "
+        "that address and that no firewall or network policy is in between"
+    )

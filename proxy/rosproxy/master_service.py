@@ -1,0 +1,100 @@
+"""The master port: inside nodes call it as their master."""
+
+import logging
+from collections.abc import Awaitable, Callable
+
+from rosproxy.context import Context
+from rosproxy.core import master_api, xmlrpc
+from rosproxy.core.addressing import Asker
+from rosproxy.core.master_api import Admission, Answer, Request
+from rosproxy.http_server import Call
+from rosproxy.leases import Leases
+from rosproxy.upstream import Unreachable
+
+log = logging.getLogger(__name__)
+
+
+class MasterService:
+    """Forwards master API calls, rewritten, and keeps the registry in step with the master.
+
+    ``recovered`` waits until the registry is rebuilt: a node that registered before would get
+    another port, and the master would shut it down for having moved.
+    """
+
+    def __init__(
+        self, context: Context, leases: Leases, recovered: Callable[[], Awaitable[None]]
+    ) -> None:
+        self._context, self._leases, self._recovered = context, leases, recovered
+
+    async def __call__(self, call: Call) -> bytes:
+        """The reply to a call. Raises XmlRpcError, Unreachable."""
+        self._refuse_loop(call)
+        asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
+        request = master_api.read_request(call.body, asker)
+        try:
+            reply = await self._reply(request)
+        except Unreachable:
+            self._context.metrics.count("master", request.method, "unreachable")
+            raise
+        self._context.metrics.count("master", request.method, "answered")
+        return reply
+
+    async def _reply(self, request: Request) -> bytes:
+        if request.plain:
+            return await self._context.upstream.master(request.body)
+        await self._recovered()
+        self._context.refresh_networks()
+        request.admissions = await self._admit_all(request)
+        local = master_api.local_reply(request)
+        if local is not None:
+            return local
+        body = master_api.export_request(request, self._context.addressing)
+        reply = await self._context.upstream.master(body)
+        answer = master_api.read_answer(request, reply)
+        self._note(answer)
+        return master_api.import_answer(request, answer, self._context.addressing)
+
+    async def _admit_all(self, request: Request) -> list[Admission]:
+        """One after the other: several calls may register the same new node."""
+        return [
+            await self._leases.admit(call, request.asker) if call else None
+            for call in request.calls
+        ]
+
+    def _note(self, answer: Answer) -> None:
+        registry, now = self._context.registry, self._context.now()
+        for fact in master_api.noted(answer, now):
+            held = fact.registration
+            if fact.endpoint is None:
+                registry.unregister(held.kind, held.name, held.caller_id)
+            elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
+                registry.register(fact.endpoint, held)
+
+    def _refuse_loop(self, call: Call) -> None:
+        if call.loop_id == self._context.instance:
+            uri = self._context.settings.master_uri
+            log.error("--master-uri %s leads back to this proxy", uri)
+            raise xmlrpc.XmlRpcError(
+                xmlrpc.SYSTEM_ERROR, f"--master-uri {uri} leads back to the proxy itself"
+            )
+
+
+class PublishedMaster:
+    """The master itself for outside (``--publish-master``), where it runs inside.
+
+    What the master holds are outside addresses already; only its own URI is replaced.
+    """
+
+    def __init__(self, context: Context, address: str) -> None:
+        self._context, self._address = context, address
+
+    async def __call__(self, call: Call) -> bytes:
+        """The master's reply to a call. Raises XmlRpcError, Unreachable."""
+        asker = Asker(call.source, call.local.host, master=self._address)
+        request = master_api.read_request(call.body, asker)
+        request.admissions = [None] * len(request.calls)
+        reply = await self._context.upstream.master(call.body)
+        if not any(inner and inner.method == "getUri" for inner in request.calls):
+            return reply
+        answer = master_api.read_answer(request, reply)
+        return master_api.rename_master(answer, self._address)

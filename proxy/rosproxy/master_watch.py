@@ -1,0 +1,146 @@
+"""Watching the real master: is it there, is it still the same, does it still know our nodes?"""
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from rosproxy.context import Context
+from rosproxy.core import recovery
+from rosproxy.core.registry import Endpoint, Place, Registration
+from rosproxy.keeper import Keeper
+from rosproxy.upkeep import Upkeep
+from rosproxy.upstream import CALLER_ID, MasterError, Unreachable
+
+log = logging.getLogger(__name__)
+
+LOOKS_PER_CHECK = 5
+"""How many looks at the master go by between two checks of what it knows."""
+
+
+class MasterWatch:
+    """Polls the master, recovers from what it holds, and restores what it has lost."""
+
+    def __init__(self, context: Context, keeper: Keeper, upkeep: Upkeep) -> None:
+        self._context, self._keeper, self._upkeep = context, keeper, upkeep
+        self._recovering = asyncio.Lock()
+        self._recovered = False
+        self._looks = 0
+        self.up: bool | None = None
+        self.error = ""
+        self.pid: int | None = None
+        self.round_trip: float | None = None
+        self.since = context.now()
+
+    async def run(self) -> None:
+        """Look at the master in intervals until cancelled."""
+        while True:
+            await self.look()
+            await asyncio.sleep(self._context.settings.master_interval)
+
+    async def recovered(self) -> None:
+        """Wait until the registry is rebuilt from the master. Raises Unreachable."""
+        async with self._recovering:
+            if not self._recovered:
+                await self._recover()
+                self._recovered = True
+
+    async def look(self) -> None:
+        """Ask the master for its pid; recover or restore where that is due."""
+        started = self._context.now()
+        try:
+            pid = await self._context.upstream.ask_master("getPid")
+            self.round_trip = self._context.now() - started
+            await self.recovered()
+            await self._check(pid)
+            self._mark(True)
+        except (Unreachable, MasterError) as error:
+            self._mark(False, str(error))
+
+    async def _check(self, pid: int) -> None:
+        restarted = not self.up or pid != self.pid
+        self.pid = pid
+        self._looks += 1
+        if restarted or self._looks % LOOKS_PER_CHECK == 0:
+            await self._restore_lost()
+
+    def _mark(self, up: bool, error: str = "") -> None:
+        uri = self._context.settings.master_uri
+        if up != self.up:
+            self.since = self._context.now()
+            if up:
+                log.info("master %s answers (pid %s)", uri, self.pid)
+                self._context.problems.clear("master")
+            else:
+                log.warning("%s; waiting for it", error)
+                self._context.problems.add("master", error)
+        self.up, self.error = up, error
+
+    async def _recover(self) -> None:
+        self._context.refresh_networks()
+        held, uris = await self._snapshot()
+        claims = recovery.claims(held, uris, self._context.addressing)
+        endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
+        if endpoints:
+            log.info("recovering %d nodes from the master", len(endpoints))
+            self._context.tasks.spawn(self._resume(endpoints), "recovery")
+
+    def _restore(self, claim: recovery.Claim) -> Endpoint | None:
+        address = claim.address
+        if not recovery.allowed(address, self._context.addressing.networks):
+            log.warning(
+                "port %d: the master has %s for it, which is not in an inside network; refused",
+                claim.port,
+                address,
+            )
+            return None
+        place = Place(address, named=claim.inside.node.host == address, confirmed=False)
+        registry = self._context.registry
+        endpoint = registry.restore(claim.uri, claim.inside.node, place, claim.port)
+        if endpoint is None:
+            log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
+            return None
+        for held in claim.registrations:
+            registry.register(endpoint, held)
+        return endpoint
+
+    async def _resume(self, endpoints: list[Endpoint]) -> None:
+        """Serve recovered endpoints, then make up for the calls that were missed."""
+        await asyncio.gather(*(self._keeper.verify(endpoint) for endpoint in endpoints))
+        try:
+            await self._upkeep.announce(e for e in endpoints if e.trusted)
+        except Unreachable as error:
+            log.warning("recovery is incomplete: %s", error)
+
+    async def _snapshot(self) -> tuple[Mapping[str, list[Registration]], dict[str, str]]:
+        held = await self._held()
+        names = sorted(held)
+        uris = await self._context.upstream.batch(
+            [("lookupNode", [CALLER_ID, name]) for name in names]
+        )
+        found = zip(names, uris, strict=False)
+        return held, {name: uri for name, uri in found if isinstance(uri, str)}
+
+    async def _held(self) -> dict[str, list[Registration]]:
+        state, types = await asyncio.gather(
+            self._context.upstream.ask_master("getSystemState"),
+            self._context.upstream.ask_master("getTopicTypes"),
+        )
+        return recovery.registrations(state, _types(types))
+
+    async def _restore_lost(self) -> None:
+        started = self._context.now()
+        state = await self._held()
+        ours = {
+            held: endpoint
+            for endpoint, held in self._context.registry.registrations()
+            if endpoint.trusted and not endpoint.health.cleaned and not endpoint.health.down
+        }
+        lost = recovery.lost(list(ours), state, started)
+        if lost:
+            log.warning("the master has lost %d registrations; making them again", len(lost))
+            await self._upkeep.register([(ours[held], held) for held in lost])
+
+
+def _types(rows: Any) -> dict[str, str]:
+    return {row[0]: row[1] for row in rows if isinstance(row, list) and len(row) == 2}

@@ -1,0 +1,146 @@
+"""Prometheus metrics: counters that the proxy keeps, and gauges read off its state when scraped."""
+
+from collections.abc import Callable, Iterable
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from rosproxy.core.methods import MASTER_METHODS
+from rosproxy.core.registry import Registry
+
+_SLAVE_METHODS = frozenset(
+    {
+        "getBusInfo",
+        "getBusStats",
+        "getMasterUri",
+        "getName",
+        "getPid",
+        "getPublications",
+        "getSubscriptions",
+        "getUri",
+        "paramUpdate",
+        "publisherUpdate",
+        "requestTopic",
+        "shutdown",
+    }
+)
+_OTHER_MASTER_METHODS = frozenset(
+    {
+        "deleteParam",
+        "getParam",
+        "getParamNames",
+        "getPublishedTopics",
+        "getSystemState",
+        "getTopicTypes",
+        "hasParam",
+        "searchParam",
+        "setParam",
+        "system.multicall",
+    }
+)
+_KNOWN_METHODS = _SLAVE_METHODS | _OTHER_MASTER_METHODS | frozenset(MASTER_METHODS)
+
+
+class Traffic:
+    """Bytes relayed per topic or service, summed over ended connections.
+
+    ``sent`` went outside, ``received`` came from there.
+    """
+
+    def __init__(self) -> None:
+        self.sent: dict[tuple[str, str], int] = {}
+        self.received: dict[tuple[str, str], int] = {}
+
+    def add(self, kind: str, name: str, sent: int, received: int) -> None:
+        """Add the bytes of a connection that ended."""
+        self.sent[kind, name] = self.sent.get((kind, name), 0) + sent
+        self.received[kind, name] = self.received.get((kind, name), 0) + received
+
+
+class Metrics:
+    """All metrics of a proxy, in a registry of their own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.calls = Counter(
+            "rosproxy_xmlrpc_calls",
+            "XML-RPC calls by API (master, slave), method and outcome.",
+            ["api", "method", "outcome"],
+            registry=self.registry,
+        )
+        self.relay_errors = Counter(
+            "rosproxy_relay_errors",
+            "TCPROS connections that could not be relayed.",
+            ["reason"],
+            registry=self.registry,
+        )
+        self.cleanups = Counter(
+            "rosproxy_cleanups",
+            "Nodes unregistered at the master because they were gone.",
+            registry=self.registry,
+        )
+        self.exhausted = Counter(
+            "rosproxy_range_exhausted",
+            "Registrations refused because no port was left.",
+            registry=self.registry,
+        )
+        self.master_round_trip = Histogram(
+            "rosproxy_master_round_trip_seconds",
+            "Time for a call of the proxy's own to the master.",
+            registry=self.registry,
+            buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1, 5),
+        )
+
+    def count(self, api: str, method: str, outcome: str) -> None:
+        """Count a call; method names that nobody defined share one label."""
+        known = method if method in _KNOWN_METHODS else "other"
+        self.calls.labels(api, known, outcome).inc()
+
+
+class StateCollector(Collector):
+    """Gauges and byte counters, computed from the proxy's state at each scrape."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        totals: Callable[[], Traffic],
+        open_connections: Callable[[], int],
+        master_up: Callable[[], bool],
+    ) -> None:
+        self._registry, self._totals = registry, totals
+        self._open_connections, self._master_up = open_connections, master_up
+
+    def collect(self) -> Iterable[Metric]:
+        """All state metrics."""
+        pool = self._registry.pool
+        yield _gauge("leases_used", "Ports held by inside nodes.", len(self._registry))
+        yield _gauge("leases_free", "Ports left for inside nodes.", pool.free)
+        yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
+        yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())
+        yield _gauge("master_up", "Whether the master answers.", int(self._master_up()))
+        yield self._endpoints()
+        yield self._bytes()
+
+    def _endpoints(self) -> Metric:
+        family = GaugeMetricFamily("rosproxy_endpoints", "Inside nodes by state.", labels=["state"])
+        states = [endpoint.health.state for endpoint in self._registry]
+        for state in sorted(set(states)):
+            family.add_metric([state], states.count(state))
+        return family
+
+    def _bytes(self) -> Metric:
+        family = CounterMetricFamily(
+            "rosproxy_relayed_bytes",
+            "Bytes relayed by topic or service and direction.",
+            labels=["kind", "name", "direction"],
+        )
+        totals = self._totals()
+        for direction, sums in (("outward", totals.sent), ("inward", totals.received)):
+            for (kind, name), size in sums.items():
+                family.add_metric([kind, name, direction], size)
+        return family
+
+
+def _gauge(name: str, text: str, value: float) -> Metric:
+    return GaugeMetricFamily(f"rosproxy_{name}", text, value=value)

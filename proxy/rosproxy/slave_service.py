@@ -1,0 +1,83 @@
+"""The slave API of inside nodes, as outside and the master reach it through a lease."""
+
+import logging
+from urllib.parse import urlsplit
+
+from rosproxy.context import Context
+from rosproxy.core import slave_api, xmlrpc
+from rosproxy.core.liveness import Change, Probe
+from rosproxy.core.registry import Endpoint
+from rosproxy.core.slave_api import Visit
+from rosproxy.core.uris import HostPort
+from rosproxy.http_server import Call
+from rosproxy.leases import Leases
+from rosproxy.network import resolve
+from rosproxy.upstream import Unreachable
+
+log = logging.getLogger(__name__)
+
+
+class SlaveService:
+    """Forwards slave API calls to the node behind the port at which they arrive."""
+
+    def __init__(self, context: Context, leases: Leases) -> None:
+        self._context, self._leases = context, leases
+
+    async def __call__(self, call: Call) -> bytes:
+        """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
+        endpoint = self._context.registry.by_port.get(call.local.port)
+        if endpoint is None:
+            raise Unreachable(f"port {call.local.port} has no node any more")
+        parsed = xmlrpc.parse_call(call.body)
+        if not await self._may(parsed.method, call.source):
+            self._context.metrics.count("slave", parsed.method, "refused")
+            return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+        try:
+            reply = await self._forward(endpoint, parsed, call)
+        except Unreachable:
+            self._context.metrics.count("slave", parsed.method, "unreachable")
+            raise
+        self._context.metrics.count("slave", parsed.method, "answered")
+        return reply
+
+    async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+        if not slave_api.rewritten(parsed):
+            return await self._ask(endpoint, call.body)
+        self._context.refresh_networks()
+        visit = self._visit(endpoint, call)
+        addressing = self._context.addressing
+        reply = await self._ask(
+            endpoint, slave_api.import_call(call.body, parsed, visit, addressing)
+        )
+        topic = slave_api.topic_port(parsed, reply)
+        if topic is not None:
+            endpoint.topic_ports[topic.topic] = endpoint.tcpros_port = topic.port
+        return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
+        try:
+            reply = await self._context.upstream.node(endpoint.slave, body)
+        except Unreachable as error:
+            await self._suspect(endpoint, error)
+            raise
+        endpoint.health.note(Probe.ANSWERED, self._context.now())
+        return reply
+
+    async def _suspect(self, endpoint: Endpoint, error: Unreachable) -> None:
+        """A refused call tells that the node has ended: its port refuses as well at once."""
+        health, now = endpoint.health, self._context.now()
+        if error.refused and health.note(error.probe, now) is Change.DOWN:
+            log.info("%s is gone: %s", endpoint.label, error)
+            await self._leases.close(endpoint)
+
+    def _visit(self, endpoint: Endpoint, call: Call) -> Visit:
+        reached = self._context.addressing.outside(endpoint.port)
+        if call.reached_locally:
+            reached = HostPort(call.local.host, endpoint.port)
+        return Visit(self._context.node_asker(endpoint), reached, self._context.settings.master_uri)
+
+    async def _may(self, method: str, source: str) -> bool:
+        settings = self._context.settings
+        if settings.slave_control == "any" or method not in slave_api.MASTER_ONLY:
+            return True
+        return source in await resolve(urlsplit(settings.master_uri).hostname or "")

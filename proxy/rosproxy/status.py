@@ -1,0 +1,107 @@
+"""The state of a running proxy as JSON, for ``/status``."""
+
+import os
+import time
+from typing import Any
+
+from rosproxy import __version__
+from rosproxy.context import Context, Problem
+from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Endpoint
+from rosproxy.master_watch import MasterWatch
+from rosproxy.relay import Relay
+from rosproxy.tcpros_service import TcprosService
+
+
+def describe(context: Context, watch: MasterWatch, tcpros: TcprosService) -> dict[str, Any]:
+    """Everything that ``rosproxy status`` and ``rosproxy doctor`` show.
+
+    Times are seconds, rates bytes per second; ``sent`` is what went outside.
+    """
+    relays: dict[int, list[Relay]] = {}
+    for relay in tcpros.relays:
+        relays.setdefault(relay.port, []).append(relay)
+    endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
+    return {
+        "version": __version__,
+        "pid": os.getpid(),
+        "settings": _settings(context),
+        "master": _master(context, watch),
+        "ports": _ports(context),
+        "nodes": [_node(context, e, relays.get(e.port, [])) for e in endpoints],
+        "problems": [_problem(problem) for problem in context.problems.list()],
+    }
+
+
+def _settings(context: Context) -> dict[str, Any]:
+    settings = context.settings
+    return {
+        "master_port": settings.master_port,
+        "publish_master": settings.publish_master,
+        "advertise_host": settings.advertise_host,
+        "bind": settings.bind,
+        "inside_networks": [str(network) for network in context.addressing.networks],
+        "cleanup_after": settings.cleanup_after,
+        "linger": settings.linger,
+    }
+
+
+def _master(context: Context, watch: MasterWatch) -> dict[str, Any]:
+    return {
+        "uri": context.settings.master_uri,
+        "up": bool(watch.up),
+        "error": watch.error,
+        "pid": watch.pid,
+        "since": round(context.now() - watch.since, 1),
+        "round_trip": watch.round_trip,
+    }
+
+
+def _ports(context: Context) -> dict[str, Any]:
+    ports, pool = context.settings.ports, context.registry.pool
+    return {
+        "listen": str(ports.listen),
+        "advertise": str(ports.advertise),
+        "used": len(context.registry),
+        "free": pool.free,
+        "blocked": pool.blocked,
+    }
+
+
+def _node(context: Context, endpoint: Endpoint, relays: list[Relay]) -> dict[str, Any]:
+    return {
+        "nodes": endpoint.caller_ids,
+        "uri": endpoint.uri,
+        "address": str(endpoint.slave),
+        "advertised_uri": context.addressing.advertised_uri(endpoint),
+        "port": endpoint.port,
+        "state": endpoint.health.state if endpoint.trusted else "unverified",
+        "publishes": endpoint.names(Kind.PUBLISHER),
+        "subscribes": endpoint.names(Kind.SUBSCRIBER),
+        "services": endpoint.names(Kind.SERVICE),
+        "parameters": endpoint.names(Kind.PARAM),
+        "connections": [_connection(relay) for relay in relays],
+        "problems": [
+            problem.text
+            for subject in (endpoint.label, *endpoint.caller_ids)
+            for problem in context.problems.list(subject)
+        ],
+    }
+
+
+def _connection(relay: Relay) -> dict[str, Any]:
+    return {
+        "kind": relay.kind,
+        "name": relay.name,
+        "caller_id": relay.caller_id,
+        "peer": relay.peer,
+        "sent": relay.sent,
+        "received": relay.received,
+        "sent_rate": round(relay.rates[0], 1),
+        "received_rate": round(relay.rates[1], 1),
+    }
+
+
+def _problem(problem: Problem) -> dict[str, Any]:
+    age = round(time.time() - problem.when, 1)
+    return {"age": age, "subject": problem.subject, "text": problem.text}

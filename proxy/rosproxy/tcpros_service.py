@@ -1,0 +1,152 @@
+"""TCPROS through a lease: read the connection header, find the node's port, relay."""
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+
+from rosproxy.acceptor import read_header
+from rosproxy.context import Context
+from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Endpoint
+from rosproxy.core.tcpros import HeaderError, decode_header, encode_header
+from rosproxy.metrics import Traffic
+from rosproxy.node_client import NodeClient
+from rosproxy.relay import Relay, reset_on_close
+
+log = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT = 5.0
+RATE_INTERVAL = 2.0
+
+
+class TcprosService:
+    """Relays TCPROS connections to inside nodes.
+
+    The target is a port on the endpoint's own address, as that node itself named it; the host in
+    a reply or registration is never used, so none can lead to another inside host.
+    """
+
+    def __init__(self, context: Context, nodes: NodeClient) -> None:
+        self._context, self._nodes = context, nodes
+        self._relays: set[Relay] = set()
+        self._ended = Traffic()
+
+    @property
+    def relays(self) -> list[Relay]:
+        """The open connections."""
+        return list(self._relays)
+
+    def traffic(self) -> Traffic:
+        """Bytes by topic and service, of ended and open connections."""
+        total = Traffic()
+        total.sent, total.received = dict(self._ended.sent), dict(self._ended.received)
+        for relay in self._relays:
+            total.add(relay.kind, relay.name, relay.sent, relay.received)
+        return total
+
+    async def sample_rates(self) -> None:
+        """Compute the rates of all connections each RATE_INTERVAL until cancelled."""
+        while True:
+            now = self._context.now()
+            for relay in self._relays:
+                relay.sample(now)
+            await asyncio.sleep(RATE_INTERVAL)
+
+    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+        """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
+        try:
+            header = await read_header(conn)
+            fields = decode_header(header[4:])
+        except HeaderError as error:
+            await self._answer_error(conn, f"rosproxy: {error}")
+            self._context.metrics.relay_errors.labels("bad header").inc()
+            return
+        inside = await self._connect(endpoint, fields)
+        if inside is None:
+            self._fail(endpoint, conn, fields)
+            return
+        await asyncio.get_running_loop().sock_sendall(inside, header)
+        self._start(endpoint, fields, conn, inside, peer)
+
+    async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
+        """A connection to the node; its port is asked for anew if the known one refuses."""
+        port = self._known_port(endpoint, fields)
+        inside = await _dial(endpoint.place.address, port) if port else None
+        if inside is not None:
+            return inside
+        learned = await self._nodes.learn_tcpros_port(endpoint)
+        return await _dial(endpoint.place.address, learned) if learned else None
+
+    def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
+        service = fields.get("service")
+        if service is None:
+            return endpoint.topic_ports.get(fields.get("topic", ""), endpoint.tcpros_port)
+        return self._context.registry.service_port(endpoint, service) or endpoint.tcpros_port
+
+    def _start(
+        self,
+        endpoint: Endpoint,
+        fields: dict[str, str],
+        conn: socket.socket,
+        inside: socket.socket,
+        peer: str,
+    ) -> None:
+        kind = "service" if "service" in fields else "topic"
+        name = self._registered_name(endpoint, kind, fields.get(kind, ""))
+        relay = Relay(endpoint.port, kind, name, fields.get("callerid", ""), peer, conn, inside)
+        self._relays.add(relay)
+        endpoint.connections += 1
+        endpoint.idle_since = None
+        loop = asyncio.get_running_loop()
+        relay.start(lambda ended: _call_in(loop, lambda: self._finished(endpoint, ended)))
+
+    def _registered_name(self, endpoint: Endpoint, kind: str, name: str) -> str:
+        """The name if the node has registered it: a label that outsiders can't multiply."""
+        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
+        return name if name in endpoint.names(wanted) else "unregistered"
+
+    def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
+        self._relays.discard(relay)
+        endpoint.connections -= 1
+        self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
+
+    def _fail(self, endpoint: Endpoint, conn: socket.socket, fields: dict[str, str]) -> None:
+        """Reset, as a node that is gone would: roscpp and rospy try again."""
+        self._context.metrics.relay_errors.labels("node unreachable").inc()
+        what = fields.get("service") or fields.get("topic") or "?"
+        log.warning("%s: no TCPROS connection to it for %s", endpoint.label, what)
+        reset_on_close(conn)
+        conn.close()
+
+    async def _answer_error(self, conn: socket.socket, message: str) -> None:
+        try:
+            reply = encode_header({"error": message})
+            await asyncio.get_running_loop().sock_sendall(conn, reply)
+        finally:
+            conn.close()
+
+
+async def _dial(address: str, port: int) -> socket.socket | None:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    sock.setblocking(False)
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            await asyncio.get_running_loop().sock_connect(sock, (address, port))
+    except (OSError, TimeoutError) as error:
+        log.debug("connecting to %s:%d: %s", address, port, error)
+        sock.close()
+        return None
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
+def _call_in(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
+    """Run a function in the loop from a thread; not at all if the loop has ended."""
+    try:
+        loop.call_soon_threadsafe(function)
+    except RuntimeError:
+        log.debug("the event loop has ended before a relay")

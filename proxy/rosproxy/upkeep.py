@@ -1,0 +1,119 @@
+"""Keeping the master right: registering nodes again, cleaning up after those that are gone."""
+
+import asyncio
+import logging
+from collections.abc import Iterable, Sequence
+
+from rosproxy.context import Context
+from rosproxy.core import upkeep, xmlrpc
+from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Endpoint, Registration
+from rosproxy.node_client import NodeClient
+from rosproxy.upstream import CALLER_ID, Unreachable
+
+log = logging.getLogger(__name__)
+
+Held = tuple[Endpoint, Registration]
+PARALLEL_CALLS = 32
+
+
+class Upkeep:
+    """Calls to the master on behalf of inside nodes, and what follows from the replies."""
+
+    def __init__(self, context: Context, nodes: NodeClient) -> None:
+        self._context, self._nodes = context, nodes
+
+    async def register(self, held: Sequence[Held]) -> None:
+        """Register again what the master has lost. Raises Unreachable.
+
+        A name that somebody else holds by now is left to them. Subscribers are handed the
+        publishers that the replies name.
+        """
+        wanted = [item for item in await self._not_superseded(held) if _current(item)]
+        calls = [upkeep.register_call(*item, self._context.addressing) for item in wanted]
+        values = await self._context.upstream.batch(calls)
+        updates = [
+            (item, value)
+            for item, value in zip(wanted, values, strict=False)
+            if item[1].kind is Kind.SUBSCRIBER and isinstance(value, list)
+        ]
+        await self._tell_publishers(updates)
+
+    async def announce(self, endpoints: Iterable[Endpoint]) -> None:
+        """Make up for the master's calls that were missed while the proxy was away.
+
+        Registering one publisher of a topic makes the master notify all of its subscribers;
+        registering a subscriber again yields its publishers. Raises Unreachable.
+        """
+        topics: dict[str, Held] = {}
+        subscribers: list[Held] = []
+        for endpoint in endpoints:
+            for held in endpoint.registrations.values():
+                if held.kind is Kind.PUBLISHER:
+                    topics.setdefault(held.name, (endpoint, held))
+                elif held.kind is Kind.SUBSCRIBER:
+                    subscribers.append((endpoint, held))
+        await self.register([*topics.values(), *subscribers])
+
+    async def clean_up(self, endpoint: Endpoint) -> None:
+        """Unregister a node that is gone at the master. Raises Unreachable."""
+        addressing = self._context.addressing
+        held = list(endpoint.registrations.values())
+        await self._context.upstream.batch(
+            [upkeep.unregister_call(endpoint, one, addressing) for one in held]
+        )
+        endpoint.health.cleaned = True
+        self._context.metrics.cleanups.inc()
+        log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
+
+    async def come_back(self, endpoint: Endpoint) -> None:
+        """Register a node again that was cleaned up and answers after all. Raises Unreachable."""
+        pid = endpoint.health.pid
+        said = await self._nodes.describe(endpoint.slave)
+        answer = await self._nodes.probe(endpoint.slave)
+        if said is None:
+            return
+        kept = upkeep.still_held(endpoint, said.published, said.subscribed, answer.pid == pid)
+        for held in list(endpoint.registrations.values()):
+            if held not in kept:
+                self._context.registry.unregister(held.kind, held.name, held.caller_id)
+        endpoint.health.pid, endpoint.health.cleaned = answer.pid, False
+        await self.register([(endpoint, held) for held in kept])
+        log.info("%s is back: %d registrations made again", endpoint.label, len(kept))
+
+    async def _not_superseded(self, held: Sequence[Held]) -> list[Held]:
+        names = sorted({one.caller_id for _, one in held})
+        uris = await self._context.upstream.batch(
+            [("lookupNode", [CALLER_ID, name]) for name in names]
+        )
+        at_master = dict(zip(names, uris, strict=False))
+        kept = []
+        for endpoint, one in held:
+            uri = at_master.get(one.caller_id)
+            if uri in (None, self._context.addressing.advertised_uri(endpoint)):
+                kept.append((endpoint, one))
+            else:
+                log.info("%s is registered as %s by now; left to it", one.caller_id, uri)
+                self._context.registry.drop_caller(endpoint, one.caller_id)
+        return kept
+
+    async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
+        limit = asyncio.Semaphore(PARALLEL_CALLS)
+        await asyncio.gather(*(self._tell(limit, item, uris) for item, uris in updates))
+
+    async def _tell(self, limit: asyncio.Semaphore, item: Held, uris: list[str]) -> None:
+        endpoint, held = item
+        asker = self._context.node_asker(endpoint)
+        publishers = self._context.addressing.import_slaves(uris, asker)
+        body = xmlrpc.dump_call("publisherUpdate", "/master", held.name, publishers)
+        async with limit:
+            try:
+                await self._context.upstream.node(endpoint.slave, body)
+            except Unreachable as error:
+                log.debug("publisherUpdate for %s: %s", endpoint.label, error)
+
+
+def _current(item: Held) -> bool:
+    """Whether a registration has not ended meanwhile."""
+    endpoint, held = item
+    return endpoint.registrations.get(held.key) is held

@@ -1,0 +1,100 @@
+"""The Docker engine that the tests use, by its command line."""
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
+    """Run a command, return what it prints, show all of it when it fails."""
+    done = subprocess.run(
+        [str(part) for part in command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=seconds,
+        check=False,
+        **options,
+    )
+    if check and done.returncode != 0:
+        words = " ".join(map(str, command))
+        raise AssertionError(f"{words}: exit {done.returncode}\n{done.stdout}")
+    return str(done.stdout).strip()
+
+
+def docker(*arguments: str | Path, check: bool = True, seconds: float = 60) -> str:
+    return run("docker", *arguments, check=check, seconds=seconds)
+
+
+def inspect(name: str) -> dict[str, Any]:
+    """Everything that the engine knows about a container or an image."""
+    found: list[dict[str, Any]] = json.loads(docker("inspect", name))
+    return found[0]
+
+
+def wait_until(true: Callable[[], bool], seconds: float, what: str | Callable[[], str]) -> float:
+    """Wait for something to come true; return the seconds it took."""
+    started = time.monotonic()
+    while not true():
+        if time.monotonic() > started + seconds:
+            raise AssertionError(f"not in {seconds} s: {what if isinstance(what, str) else what()}")
+        time.sleep(0.1)
+    return time.monotonic() - started
+
+
+def answers() -> bool:
+    return subprocess.run(["docker", "info"], capture_output=True, check=False).returncode == 0
+
+
+@contextmanager
+def running_engine(log: Path) -> Iterator[None]:
+    """Use the engine that runs; start one and stop it again where none does."""
+    if answers():
+        yield
+        return
+    policy = forward_policy()
+    with log.open("wb") as output:
+        daemon = subprocess.Popen(["dockerd"], stdout=output, stderr=output, start_new_session=True)
+    try:
+        wait_until(lambda: daemon.poll() is not None or answers(), 60, log.read_text)
+        assert daemon.poll() is None, log.read_text()
+        yield
+    finally:
+        daemon.terminate()
+        daemon.wait(60)
+        run("iptables", "-P", "FORWARD", policy)
+
+
+def forward_policy() -> str:
+    """The policy for forwarded packets, which an engine sets to DROP and leaves so."""
+    first = run("iptables", "-S", "FORWARD").splitlines()[0]
+    return first.rsplit(" ", 1)[-1]
+
+
+def build(tag: str, *arguments: str | Path) -> str:
+    """Build an image; the network is the host's, so that package indexes are in reach."""
+    docker("build", "--network", "host", "--tag", tag, *arguments, seconds=600)
+    return tag
+
+
+def compose_command() -> list[str]:
+    """Compose as this machine has it: the plug-in, or the program of its first version."""
+    if subprocess.run(
+        ["docker", "compose", "version"], capture_output=True, check=False
+    ).returncode:
+        return [shutil.which("docker-compose") or "docker-compose"]
+    return ["docker", "compose"]
+
+
+def compose(project: Path, *arguments: str, variables: dict[str, str]) -> str:
+    """Run Compose on the example in a directory, with these variables in its environment."""
+    command = [*compose_command(), "--project-name", "rosproxy-test", *arguments]
+    return run(*command, cwd=project, env={**os.environ, **variables}, seconds=120)

@@ -1,0 +1,81 @@
+"""The proxy's image by itself: its user, its rights, its health, its size."""
+
+import re
+import time
+
+from tests.docker.engine import docker, inspect, wait_until
+
+HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges")
+# Nothing listens there: a proxy is healthy and waits while its master is away.
+SETTINGS = ("--env", "ROS_MASTER_URI=http://127.0.0.1:9", "--env", "ROSPROXY_ADVERTISE_HOST=host")
+
+
+def start(image: str, name: str, *options: str) -> None:
+    docker("run", "--detach", "--name", name, *HARDENED, *SETTINGS, *options, image)
+
+
+def health(name: str) -> str:
+    state = inspect(name)["State"]
+    assert state["Running"], docker("logs", name)
+    return str(state["Health"]["Status"])
+
+
+def test_names_a_user_by_number(proxy_image: str) -> None:
+    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", inspect(proxy_image)["Config"]["User"])
+
+
+def test_becomes_healthy_without_any_privilege(proxy_image: str, container_name: str) -> None:
+    start(proxy_image, container_name)
+
+    wait_until(
+        lambda: health(container_name) == "healthy", 30, lambda: docker("logs", container_name)
+    )
+
+    lines = docker("exec", container_name, "cat", "/proc/1/status").splitlines()
+    status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+    assert status["Uid"].split() == ["10001"] * 4
+    assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
+    assert status["NoNewPrivs"] == "1"
+
+
+def test_writes_no_file(proxy_image: str, container_name: str) -> None:
+    start(proxy_image, container_name)
+    wait_until(
+        lambda: health(container_name) == "healthy", 30, lambda: docker("logs", container_name)
+    )
+    mounts = docker("exec", container_name, "cat", "/proc/1/mounts").splitlines()
+    root = next(line.split() for line in mounts if line.split()[1] == "/")
+    assert "ro" in root[3].split(",")
+    assert docker("diff", container_name) == ""
+
+
+def test_stops_at_once_and_cleanly(proxy_image: str, container_name: str) -> None:
+    start(proxy_image, container_name)
+    wait_until(lambda: "ready" in docker("logs", container_name), 20, "it logs that it is ready")
+
+    started = time.monotonic()
+    docker("stop", "--time", "20", container_name)
+
+    assert time.monotonic() - started < 10
+    assert inspect(container_name)["State"]["ExitCode"] == 0, docker("logs", container_name)
+
+
+def test_names_a_bad_setting_and_exits(proxy_image: str, container_name: str) -> None:
+    start(proxy_image, container_name, "--env", "ROSPROXY_PORT_RANGE=9-1")
+
+    assert docker("wait", container_name) == "2"
+
+    logged = docker("logs", container_name)
+    assert "port-range" in logged
+    assert len(logged.splitlines()) == 1
+
+
+def test_adds_little_to_its_base(proxy_image: str) -> None:
+    """What the build adds to a base that has Python."""
+    measure = ("--entrypoint", "du", proxy_image, "-sm", "/opt/rosproxy")
+    assert int(docker("run", "--rm", *measure).split()[0]) <= 25
+
+
+def test_ships_no_installer(proxy_image: str) -> None:
+    listing = ("--entrypoint", "ls", proxy_image, "/opt/rosproxy/bin")
+    assert "pip" not in docker("run", "--rm", *listing).split()

@@ -1,0 +1,57 @@
+"""Compiles the C++ test nodes, once per version of their sources."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+from pathlib import Path
+
+NODES = Path(__file__).parent / "nodes"
+CACHE = Path(__file__).parents[2] / "build" / "ros-nodes"
+PACKAGES = ("roscpp", "std_msgs", "actionlib", "topic_tools")
+FLAGS = ("-std=c++17", "-O1", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
+
+
+def compiled_node() -> Path:
+    """The path of the C++ node program, compiled now if its sources have changed."""
+    binary = CACHE / f"node-{_digest()}"
+    if not binary.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        _compile(binary)
+    return binary
+
+
+def _digest() -> str:
+    digest = hashlib.sha256(" ".join([*FLAGS, *PACKAGES]).encode())
+    for source in sorted(NODES.glob("*.[ch]pp")):
+        digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _compile(binary: Path) -> None:
+    """Compiles each source at the same time as the others, then links."""
+    flags = [*FLAGS, *_pkg_config("--cflags")]
+    parts = {
+        source: binary.with_suffix(f".{os.getpid()}.{source.stem}.o")
+        for source in NODES.glob("*.cpp")
+    }
+    compilers = [
+        subprocess.Popen(["g++", *flags, "-c", str(source), "-o", str(part)])
+        for source, part in parts.items()
+    ]
+    if any([compiler.wait() for compiler in compilers]):
+        raise RuntimeError("the C++ test nodes do not compile: see above")
+    unfinished = binary.with_suffix(f".{os.getpid()}")
+    objects = [str(part) for part in parts.values()]
+    subprocess.run(["g++", *objects, "-o", str(unfinished), *_pkg_config("--libs")], check=True)
+    for part in parts.values():
+        part.unlink()
+    unfinished.rename(binary)
+
+
+def _pkg_config(option: str) -> list[str]:
+    done = subprocess.run(["pkg-config", option, *PACKAGES], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(done.stderr.strip())
+    return done.stdout.split()

@@ -1,0 +1,204 @@
+"""What a test drives: machines, a roscore, a proxy, and the nodes and tools it starts."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.ros import wire
+from tests.ros.cpp import NODES, compiled_node
+from tests.ros.processes import Process, stop_all, wait_until
+from tests.ros.topology import MASTER_PORT, OUT_HOST, OUT_NODE, Place, Topology
+
+SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
+"""ROS's programs are the system Python's: no other Python may come first."""
+MASTER_URI = f"http://robot:{MASTER_PORT}"
+INSIDE_MASTER_URI = f"http://rosproxy:{MASTER_PORT}"
+CALLER = "/rosproxy_tests"
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a tool ended, and all that it printed."""
+
+    returncode: int
+    output: str
+
+
+class Lab:
+    """One topology with a real roscore outside and a proxy at the boundary."""
+
+    def __init__(self, topology: Topology, folder: Path) -> None:
+        self.topology = topology
+        self.folder = folder
+        self.flat = topology.plan.flat
+        self.advertise_host = OUT_HOST
+        self.proxy_options: tuple[str, ...] = ()
+        self.master: Process | None = None
+        self.proxy: Process | None = None
+        self.nodes: list[Process] = []
+        self._proxy_mark = 0
+        self._numbers = itertools.count(1)
+
+    def place(self, role: str) -> Place:
+        return self.topology.places[role]
+
+    def unique(self, word: str) -> str:
+        """A name that no other test uses."""
+        return f"{word}_{next(self._numbers)}"
+
+    # roscore and proxy
+
+    def start_master(self, role: str = "out") -> None:
+        """Starts a real roscore and waits until it serves."""
+        uri = f"http://{self.place(role).hostname}:{MASTER_PORT}"
+        env = self.environment(role) | {"ROS_MASTER_URI": uri}
+        argv = ["/usr/bin/roscore", "-p", str(MASTER_PORT)]
+        self.master = self._spawn("roscore", self.place(role), argv, env)
+        self.master.wait_for(r"started core service \[/rosout\]", timeout=30)
+
+    def start_proxy(self) -> None:
+        """Starts the proxy with this lab's settings and waits until it is listening."""
+        if self.flat:
+            return
+        ports = self.topology.plan.ports
+        argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER_URI]
+        argv += ["--advertise-host", self.advertise_host, "--port-range", ports.bound]
+        if ports.published != ports.bound:
+            argv += ["--advertise-port-range", ports.published]
+        self.proxy = self._spawn_proxy([*argv, *self.proxy_options])
+        self.proxy.wait_for(r"ready: ", timeout=15)
+
+    def _spawn_proxy(self, argv: list[str]) -> Process:
+        env = {"PATH": SYSTEM_PATH, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
+        env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+        return self._spawn("rosproxy", self.place("px"), argv, env)
+
+    def ensure_running(self) -> None:
+        """Starts roscore and proxy where a test before has left them dead."""
+        if self.master is None or self.master.returncode is not None:
+            self.start_master()
+        if self.proxy is None or self.proxy.returncode is not None:
+            self.start_proxy()
+        self._proxy_mark = self.proxy.mark() if self.proxy else 0
+
+    def check_proxy(self) -> None:
+        """Raises AssertionError if the proxy has died or printed a traceback in this test."""
+        if self.proxy:
+            log = self.proxy.output(self._proxy_mark)
+            assert self.proxy.returncode is None, f"the proxy has ended:\n{log[-3000:]}"
+            assert "Traceback" not in log, log[-6000:]
+
+    def transcripts(self) -> list[tuple[str, str]]:
+        """(title, output) of the proxy and of each node since the test began."""
+        parts = [(node.title, node.output()[-2000:]) for node in self.nodes]
+        if self.proxy:
+            parts.append(("rosproxy", self.proxy.output(self._proxy_mark)[-6000:]))
+        return parts
+
+    def stop(self) -> None:
+        """Ends everything that was started here."""
+        self.stop_nodes(patience=1)
+        stop_all([process for process in (self.proxy, self.master) if process])
+
+    # nodes and tools
+
+    def node(
+        self, library: str, role: str, kind: str, name: str = "", env: Any = None, **options: Any
+    ) -> Process:
+        """Starts a test node: `library` is rospy or roscpp, `kind` one of its roles.
+
+        Remappings go in through an option named `remap`, as a list of words.
+        """
+        words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
+        for option, value in options.items():
+            words += [f"--{option.replace('_', '-')}", str(value)]
+        program = {
+            "rospy": ["/usr/bin/python3", str(NODES / "node.py")],
+            "roscpp": [str(compiled_node())],
+        }[library]
+        return self.start(role, *program, kind, *words, env=env)
+
+    def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
+        """Starts any program on a machine; it is ended with the test."""
+        words = [word for word in argv if "/python3" not in word]
+        title = " ".join([Path(words[0]).name, *words[1:]])
+        process = self._spawn(
+            f"{title} ({role})", self.place(role), argv, self.environment(role) | dict(env or {})
+        )
+        self.nodes.append(process)
+        return process
+
+    def run(
+        self, role: str, *argv: str, timeout: float = 30, check: bool = True
+    ) -> Result:
+        """Runs a program on a machine to its end. Raises AssertionError when it fails."""
+        process = self.start(role, *argv)
+        code = process.wait(timeout)
+        if check and code != 0:
+            raise AssertionError(f"{process.title} ended {code}:\n{process.output()}")
+        return Result(code, process.output())
+
+    def environment(self, role: str) -> dict[str, str]:
+        """All that a ROS program on this machine gets: no ROS_IP, no ROS_HOSTNAME."""
+        inside = role.startswith("c") and not self.flat
+        home = self.folder / role
+        home.mkdir(exist_ok=True)
+        return {
+            "PATH": SYSTEM_PATH,
+            "LANG": "C.UTF-8",
+            "HOME": str(home),
+            "ROS_HOME": str(home),
+            "ROS_LOG_DIR": str(home / "log"),
+            "ROS_MASTER_URI": INSIDE_MASTER_URI if inside else MASTER_URI,
+            "PYTHONUNBUFFERED": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+    def stop_nodes(self, patience: float = 4) -> None:
+        """Ends what `node` and `start` have started."""
+        stop_all(self.nodes, patience)
+        self.nodes.clear()
+
+    def _spawn(self, title: str, place: Place, argv: Any, env: Mapping[str, str]) -> Process:
+        log = self.folder / f"{next(self._numbers):04d}.log"
+        return Process(title, place, argv, env, log)
+
+    # what the real master knows
+
+    def ask_master(self, method: str, *arguments: Any, role: str = "out") -> Any:
+        """Calls the master as a program on that machine does: inside, through the proxy."""
+        address, port = self.master_address(role)
+        return wire.call(self.place(role), address, port, method, CALLER, *arguments)
+
+    def master_address(self, role: str) -> tuple[str, int]:
+        """Where programs on a machine find their master."""
+        inside = role.startswith("c") and not self.flat
+        return (self.place("px").address if inside else OUT_NODE), MASTER_PORT
+
+    def node_uri(self, name: str) -> str | None:
+        """The slave URI that outside sees for a node, or nothing."""
+        try:
+            return str(self.ask_master("lookupNode", _absolute(name)))
+        except LookupError:
+            return None
+
+    def registered(self, name: str) -> bool:
+        """Whether any publication, subscription or service of this node is registered."""
+        state = self.ask_master("getSystemState")
+        return any(_absolute(name) in names for part in state for _, names in part)
+
+    def wait_registered(self, name: str, timeout: float = 10) -> None:
+        wait_until(f"{name} is registered", lambda: self.registered(name), timeout)
+
+    def wait_unregistered(self, name: str, timeout: float = 15) -> None:
+        wait_until(f"{name} is unregistered", lambda: not self.registered(name), timeout)
+
+
+def _absolute(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"

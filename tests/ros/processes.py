@@ -1,0 +1,133 @@
+"""Programs on the machines of a topology: started, watched by their output, and reaped."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tests.ros.topology import Place
+
+STOP_PATIENCE = 8.0
+"""Seconds that a process gets to end after SIGINT before it is killed."""
+_POLL = 0.01
+
+
+class Process:
+    """One running program, in a process group of its own, with its output in a file."""
+
+    def __init__(
+        self, title: str, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path
+    ) -> None:
+        self.title = title
+        self.place = place
+        self.log = log
+        self.started = time.time()
+        with log.open("wb") as output:
+            self._popen = subprocess.Popen(
+                place.command(argv),
+                env=dict(env),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def pid(self) -> int:
+        return self._popen.pid
+
+    @property
+    def returncode(self) -> int | None:
+        return self._popen.poll()
+
+    def output(self, since: int = 0) -> str:
+        """What it printed, from character `since` on."""
+        return self.log.read_text(errors="replace")[since:]
+
+    def mark(self) -> int:
+        """The present end of the output, as a `since` for later."""
+        return len(self.output())
+
+    def wait_for(self, pattern: str, timeout: float = 15.0, since: int = 0) -> re.Match[str]:
+        """Waits until a line matches. Raises AssertionError with the output otherwise."""
+        return self.wait_for_count(pattern, 1, timeout, since)[0]
+
+    def wait_for_count(
+        self, pattern: str, count: int, timeout: float = 15.0, since: int = 0
+    ) -> list[re.Match[str]]:
+        """Waits until `count` matches are there; returns all of them."""
+        compiled = re.compile(pattern, re.MULTILINE)
+        deadline = time.monotonic() + timeout
+        while True:
+            ended = self.returncode is not None
+            found = list(compiled.finditer(self.output(since)))
+            if len(found) >= count:
+                return found
+            if ended or time.monotonic() > deadline:
+                raise AssertionError(self._missed(pattern, count, len(found), timeout))
+            time.sleep(_POLL)
+
+    def _missed(self, pattern: str, count: int, found: int, timeout: float) -> str:
+        state = f"within {timeout:g} s" if self.returncode is None else "before it ended"
+        return (
+            f"{self.title} printed {pattern!r} {found} of {count} times {state}; "
+            f"its output:\n{self.output()[-3000:]}"
+        )
+
+    def wait(self, timeout: float = 15.0) -> int:
+        """Waits until it ends by itself; returns its exit code."""
+        try:
+            return self._popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            text = f"{self.title} still runs after {timeout:g} s; its output:\n"
+            raise AssertionError(text + self.output()[-3000:]) from None
+
+    def send(self, number: signal.Signals) -> None:
+        """Signals the whole process group. Nothing happens when it is gone."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, number)
+
+    def kill(self) -> None:
+        """SIGKILL, to the whole group, and reaps it."""
+        self.send(signal.SIGKILL)
+        self._popen.wait()
+
+    def stop(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Asks it to end, kills what is left, and returns its exit code."""
+        if self.returncode is None:
+            self.send(signal.SIGCONT)
+            self.send(number)
+        return self.reap()
+
+    def reap(self, patience: float = STOP_PATIENCE) -> int:
+        """Waits for the end that was asked for, killing it when that takes too long."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._popen.wait(patience)
+        self.kill()
+        return self._popen.wait()
+
+
+def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> None:
+    """Ends all of them at the same time."""
+    running = [process for process in processes if process.returncode is None]
+    for process in running:
+        process.send(signal.SIGCONT)
+        process.send(signal.SIGINT)
+    for process in running:
+        process.reap(patience)
+
+
+def wait_until(condition: str, check: object, timeout: float = 15.0) -> None:
+    """Polls the callable `check` until it gives something true."""
+    assert callable(check)
+    deadline = time.monotonic() + timeout
+    while not check():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {timeout:g} s: {condition}")
+        time.sleep(0.05)

@@ -1,0 +1,32 @@
+"""What this layer needs from the machine, and what to say where it is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+from pathlib import Path
+
+_PROGRAMS = ("roscore", "rostopic", "rosbag", "g++", "pkg-config", "ip", "nft", "unshare")
+_FILES = (
+    "/usr/include/ros/ros.h",
+    "/usr/include/actionlib/TwoIntsAction.h",
+    "/usr/include/topic_tools/MuxSelect.h",
+    "/usr/lib/topic_tools/relay",
+    "/usr/lib/python3/dist-packages/actionlib",
+    "/usr/lib/python3/dist-packages/topic_tools",
+    "/usr/lib/python3/dist-packages/geometry_msgs",
+)
+
+
+def missing(with_proxy: bool) -> str | None:
+    """What stops this layer from running and the command that mends it, or nothing."""
+    gone = [name for name in _PROGRAMS if shutil.which(name) is None]
+    gone += [name for name in _FILES if not Path(name).exists()]
+    if gone:
+        return f"the real-ROS layer needs ROS 1: run `scripts/install-ros.sh` as root (missing: {', '.join(gone)})"
+    if os.geteuid() != 0:
+        return "the real-ROS layer makes network namespaces: run it as root (`sudo make test LAYERS=ros`)"
+    if with_proxy and importlib.util.find_spec("rosproxy") is None:
+        return "rosproxy is not installed in this Python: run `make venv`"
+    return None

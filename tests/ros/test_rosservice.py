@@ -1,0 +1,69 @@
+"""Every subcommand of rosservice, run inside and outside, about services of either side."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.ros.combinations import each_library, each_side
+from tests.ros.lab import Lab
+
+each_origin = pytest.mark.parametrize(
+    "where", ["c1", "c2", "out"], ids=["of-inside", "of-another-inside", "of-outside"]
+)
+
+
+def server(lab: Lab, where: str, library: str = "roscpp") -> tuple[str, str]:
+    """Starts a server; gives its name and its service."""
+    name = lab.unique("server")
+    service = f"/{name}/echo"
+    lab.node(library, where, "serve", name=name, service=service).wait_for("^ready")
+    return f"/{name}", service
+
+
+@each_side
+def test_list_find_and_node(lab: Lab, side: str) -> None:
+    servers = [server(lab, where) for where in ("c1", "out")]
+    listed = lab.run(side, "rosservice", "list").output.split()
+    with_nodes = lab.run(side, "rosservice", "list", "-n").output
+    found = lab.run(side, "rosservice", "find", "topic_tools/MuxSelect").output.split()
+    for name, service in servers:
+        assert service in listed
+        assert service in found
+        assert f"{service} {name}\n" in with_nodes
+        assert lab.run(side, "rosservice", "node", service).output == f"{name}\n"
+
+
+@each_side
+@each_origin
+@each_library
+def test_info_type_args_and_uri(lab: Lab, library: str, where: str, side: str) -> None:
+    name, service = server(lab, where, library)
+    info = lab.run(side, "rosservice", "info", service).output
+    assert f"Node: {name}\n" in info
+    assert re.search(r"^URI: rosrpc://\S+:\d+$", info, re.MULTILINE), info
+    assert "Type: topic_tools/MuxSelect\nArgs: topic\n" in info
+    assert lab.run(side, "rosservice", "type", service).output == "topic_tools/MuxSelect\n"
+    assert lab.run(side, "rosservice", "args", service).output == "topic\n"
+    uri = lab.run(side, "rosservice", "uri", service).output
+    assert re.fullmatch(r"rosrpc://\S+:\d+\n", uri)
+    assert f"URI: {uri}" in info
+
+
+@each_side
+@each_origin
+@each_library
+def test_call_prints_the_answer(lab: Lab, library: str, where: str, side: str) -> None:
+    _, service = server(lab, where, library)
+    output = lab.run(side, "rosservice", "call", service, "tool 7 x").output
+    assert output == 'prev_topic: "echo tool 7 x"\n'
+
+
+@each_side
+@each_origin
+def test_list_works_for_the_services_that_every_node_has(lab: Lab, where: str, side: str) -> None:
+    name, _ = server(lab, where, "rospy")
+    assert f"{name}/get_loggers" in lab.run(side, "rosservice", "list", name).output.split()
+    loggers = lab.run(side, "rosservice", "call", f"{name}/get_loggers").output
+    assert 'name: "rosout"' in loggers

@@ -1,0 +1,81 @@
+"""Messages arrive, whatever the library, the direction and the order of start."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from tests.ros.combinations import each_direction, each_library, each_pair
+from tests.ros.lab import Lab
+
+BIG = 10 * 1024 * 1024
+
+
+@each_direction
+@each_pair("publisher", "subscriber")
+@pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
+def test_every_message_arrives_once_and_in_order(
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, first: str
+) -> None:
+    topic = f"/{lab.unique('topic')}"
+    if first == "publisher":
+        lab.node(publisher, source, "pub", topic=topic, rate=50).wait_for(r"sent hello 2 ")
+        receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    else:
+        receiver = lab.node(subscriber, sink, "sub", topic=topic)
+        receiver.wait_for("^ready")
+        lab.node(publisher, source, "pub", topic=topic, rate=50)
+    got = receiver.wait_for_count(r"^got hello (\d+) ", 20)[:20]
+    numbers = [int(match[1]) for match in got]
+    assert numbers == list(range(numbers[0], numbers[0] + 20))
+
+
+@each_direction
+@each_pair("publisher", "subscriber")
+def test_a_latched_message_reaches_a_late_subscriber(
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str
+) -> None:
+    topic = f"/{lab.unique('latched')}"
+    sender = lab.node(publisher, source, "pub", topic=topic, latch=1, count=3)
+    sent = sender.wait_for(r"sent (hello 2 size \d+ crc \w+)")[1]
+    receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    assert receiver.wait_for(r"^got (\w+ \d+ size \d+ crc \w+)")[1] == sent
+
+
+@each_direction
+@each_pair("publisher", "subscriber")
+def test_messages_of_10_mb_arrive_unharmed(
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str
+) -> None:
+    topic = f"/{lab.unique('big')}"
+    receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    receiver.wait_for("^ready")
+    sender = lab.node(publisher, source, "pub", topic=topic, size=BIG, rate=4)
+    lines = receiver.wait_for_count(rf"^got (hello \d+ size {BIG} crc \w+)", 3, timeout=30)
+    for line in lines:
+        sender.wait_for(f"^sent {re.escape(line[1])}")
+
+
+@each_library
+def test_one_topic_with_publishers_and_subscribers_on_both_sides(lab: Lab, library: str) -> None:
+    topic = f"/{lab.unique('shared')}"
+    receivers = [lab.node(library, role, "sub", topic=topic) for role in ("c1", "c2", "out")]
+    for receiver in receivers:
+        receiver.wait_for("^ready")
+    for role in ("c1", "c2", "out"):
+        lab.node(library, role, "pub", topic=topic, word=f"from-{role}")
+    for receiver in receivers:
+        for role in ("c1", "c2", "out"):
+            receiver.wait_for_count(f"^got from-{role} ", 5)
+
+
+@each_library
+def test_a_publisher_that_ends_and_another_that_comes(lab: Lab, library: str) -> None:
+    topic = f"/{lab.unique('relayrace')}"
+    receiver = lab.node(library, "out", "sub", topic=topic)
+    first = lab.node(library, "c1", "pub", topic=topic, word="first")
+    receiver.wait_for_count("^got first ", 3)
+    first.stop()
+    lab.node(library, "c1", "pub", topic=topic, word="second")
+    receiver.wait_for_count("^got second ", 3)

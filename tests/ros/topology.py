@@ -1,0 +1,267 @@
+"""A network with a boundary: machines outside, machines inside, NAT between them.
+
+Every machine is a network namespace with its own host name and its own `/etc/hosts`,
+so that a host name which is known in one place and nowhere else is the real thing.
+
+    out (roscore, outside nodes) -- host (NAT, published ports) -- bridge -- px, c1, c2
+
+The host drops what outside sends to inside, apart from the ports it publishes to `px`;
+inside gets out through masquerade only: just what Docker's bridge network does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+OUT_HOST = "10.77.0.1"
+OUT_NODE = "10.77.0.2"
+ADVERTISED_NAME = "dockerhost"
+"""A name for the host that outside machines know; `OUT_HOST` is its address."""
+MASTER_PORT = 11311
+PUBLISHED_MASTER_PORT = 11411
+
+_PREFIX = "rost"
+_NETNS_ETC = Path("/etc/netns")
+_CLONE_NEWNET = 0x40000000
+
+
+class PortMap(NamedTuple):
+    """The ports that the proxy binds, and the host ports which are published to them."""
+
+    first: int
+    last: int
+    published_first: int
+
+    @property
+    def bound(self) -> str:
+        return f"{self.first}-{self.last}"
+
+    @property
+    def published(self) -> str:
+        offset = self.published_first - self.first
+        return f"{self.first + offset}-{self.last + offset}"
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """(host port, proxy port) for each published port."""
+        offset = self.published_first - self.first
+        return [(port + offset, port) for port in range(self.first, self.last + 1)]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a topology looks like: its inside networks, ports, and whether it has a boundary.
+
+    With `flat`, nothing separates the machines and every name resolves everywhere: nodes
+    then work without a proxy, which shows that a test and its nodes are sound.
+    """
+
+    name: str
+    networks: tuple[tuple[str, ...], ...]
+    ports: PortMap
+    flat: bool = False
+
+
+SHARED = Plan("s", (("c1", "c2"),), PortMap(45000, 45099, 45000))
+SPLIT = Plan("d", (("c1",), ("c2",)), PortMap(45000, 45029, 46000))
+
+
+@dataclass
+class Place:
+    """One machine: a network namespace, its host name and its addresses."""
+
+    role: str
+    namespace: str
+    hostname: str
+    addresses: list[str] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        return self.addresses[0]
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """The command line that runs `argv` on this machine, as the same single process."""
+        name = 'hostname "$0" && exec "$@"'
+        enter = ["ip", "netns", "exec", self.namespace, "unshare", "--uts", "sh", "-c", name]
+        return [*enter, self.hostname, *argv]
+
+    @contextlib.contextmanager
+    def entered(self) -> Iterator[None]:
+        """Makes the sockets that this thread opens belong to this machine."""
+        with open("/proc/self/ns/net") as before, open(f"/run/netns/{self.namespace}") as here:
+            _set_network(here.fileno())
+            try:
+                yield
+            finally:
+                _set_network(before.fileno())
+
+
+class Topology:
+    """The machines of one plan. Made by `build`, taken away by `remove`."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.places: dict[str, Place] = {}
+        for role in ("out", "host", "px", *(c for network in plan.networks for c in network)):
+            hostname = {"out": "robot", "px": "rosproxy"}.get(role, f"{role}box")
+            self.places[role] = Place(role, self._namespace(role), hostname)
+
+    def _namespace(self, role: str) -> str:
+        return f"{_PREFIX}{os.getpid()}{self.plan.name}-{role}"
+
+    def build(self) -> None:
+        """Lays out every namespace, link, route, rule and hosts file."""
+        for place in self.places.values():
+            _ip("netns", "add", place.namespace)
+            _ip("-n", place.namespace, "link", "set", "lo", "up")
+        self._join_outside()
+        for number, members in enumerate(self.plan.networks, start=1):
+            self._join_inside(number, members)
+        self._load_rules()
+        for place in self.places.values():
+            self._write_names(place)
+
+    def remove(self) -> None:
+        """Kills what still runs in the namespaces and deletes them."""
+        for place in self.places.values():
+            _remove_namespace(place.namespace)
+
+    def _join_outside(self) -> None:
+        self._link("out", "eth0", "out0", f"{OUT_NODE}/24")
+        self._on_host("addr", "add", f"{OUT_HOST}/24", "dev", "out0")
+        # A route to inside exists on purpose: what stops outside is the host's policy.
+        _ip("-n", self.places["out"].namespace, "route", "add", "default", "via", OUT_HOST)
+        self.places["host"].addresses.append(OUT_HOST)
+
+    def _join_inside(self, number: int, members: tuple[str, ...]) -> None:
+        bridge, subnet = f"br{number}", f"172.30.{number}"
+        self._on_host("link", "add", bridge, "type", "bridge")
+        self._on_host("addr", "add", f"{subnet}.1/24", "dev", bridge)
+        self._on_host("link", "set", bridge, "up")
+        for role in ("px", *members):
+            last = 2 if role == "px" else 10 + int(role[1:])
+            port = f"{role}-{number}"
+            device = f"eth{len(self.places[role].addresses)}"
+            self._link(role, device, port, f"{subnet}.{last}/24")
+            self._on_host("link", "set", port, "master", bridge)
+            if device == "eth0":
+                gateway = ("default", "via", f"{subnet}.1")
+                _ip("-n", self.places[role].namespace, "route", "add", *gateway)
+
+    def _link(self, role: str, device: str, host_device: str, address: str) -> None:
+        place = self.places[role]
+        peer = ("peer", "name", device, "netns", place.namespace)
+        self._on_host("link", "add", host_device, "type", "veth", *peer)
+        self._on_host("link", "set", host_device, "up")
+        _ip("-n", place.namespace, "addr", "add", address, "dev", device)
+        _ip("-n", place.namespace, "link", "set", device, "up")
+        place.addresses.append(address.partition("/")[0])
+
+    def _on_host(self, *arguments: str) -> None:
+        _ip("-n", self.places["host"].namespace, *arguments)
+
+    def _load_rules(self) -> None:
+        host = self.places["host"].namespace
+        _run("ip", "netns", "exec", host, "sysctl", "-q", "-w", "net.ipv4.ip_forward=1")
+        if not self.plan.flat:
+            rules = _rules(self.plan.ports, self.places["px"].address)
+            _run("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
+
+    def _write_names(self, place: Place) -> None:
+        folder = _NETNS_ETC / place.namespace
+        folder.mkdir(parents=True, exist_ok=True)
+        lines = [f"{address} {name}" for address, name in self._known_names(place)]
+        (folder / "hosts").write_text("127.0.0.1 localhost\n" + "\n".join(lines) + "\n")
+        # No DNS: an unknown name fails at once, as it does with a container network's own DNS.
+        (folder / "nsswitch.conf").write_text("hosts: files\n")
+
+    def _known_names(self, place: Place) -> Iterator[tuple[str, str]]:
+        others = self.places.values() if self.plan.flat else [place]
+        yield from ((other.address, other.hostname) for other in others)
+        if not self.plan.flat:
+            yield OUT_HOST, ADVERTISED_NAME
+            yield OUT_NODE, self.places["out"].hostname
+        if place.role.startswith("c"):
+            yield self._proxy_address(place), "rosproxy"
+
+    def _proxy_address(self, place: Place) -> str:
+        subnet = place.address.rpartition(".")[0]
+        return next(a for a in self.places["px"].addresses if a.startswith(f"{subnet}."))
+
+
+def _rules(ports: PortMap, proxy: str) -> str:
+    pairs = [*ports.pairs(), (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)]
+    published = ", ".join(f"{host} : {bound}" for host, bound in pairs)
+    return f"""
+    table ip boundary {{
+      chain published {{
+        type nat hook prerouting priority dstnat;
+        iifname "out0" meta l4proto tcp dnat ip to {proxy} : tcp dport map {{ {published} }}
+      }}
+      chain leaving {{
+        type nat hook postrouting priority srcnat;
+        ip saddr 172.30.0.0/16 oifname "out0" masquerade
+      }}
+      chain forward {{
+        type filter hook forward priority filter; policy drop;
+        ct state established,related accept
+        ct status dnat accept
+        iifname "br*" oifname "out0" accept
+        iifname "br1" oifname "br1" accept
+        iifname "br2" oifname "br2" accept
+      }}
+    }}
+    """
+
+
+def remove_leftovers() -> None:
+    """Takes away the namespaces of runs whose process is gone, killed before it could."""
+    listed = _run("ip", "netns", "list")
+    for namespace in re.findall(rf"^({_PREFIX}\d+\w-\w+)", listed, re.MULTILINE):
+        pid = int(re.findall(r"\d+", namespace)[0])
+        if not Path(f"/proc/{pid}").exists():
+            _remove_namespace(namespace)
+
+
+def _remove_namespace(namespace: str) -> None:
+    if Path(f"/run/netns/{namespace}").exists():
+        _kill_all(namespace)
+        _ip("netns", "del", namespace)
+    shutil.rmtree(_NETNS_ETC / namespace, ignore_errors=True)
+
+
+def _kill_all(namespace: str) -> None:
+    deadline = time.monotonic() + 5
+    while pids := _run("ip", "netns", "pids", namespace).split():
+        for pid in pids:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(pid), signal.SIGKILL)
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"processes in {namespace} do not end: {pids}")
+        time.sleep(0.02)
+
+
+def _set_network(descriptor: int) -> None:
+    if ctypes.CDLL(None, use_errno=True).setns(descriptor, _CLONE_NEWNET) != 0:
+        raise OSError(ctypes.get_errno(), "setns")
+
+
+def _ip(*arguments: str) -> None:
+    _run("ip", *arguments)
+
+
+def _run(*argv: str, text: str | None = None) -> str:
+    done = subprocess.run(argv, input=text, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(argv)}: {done.stderr.strip()[:500]}")
+    return done.stdout

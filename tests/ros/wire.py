@@ -1,0 +1,34 @@
+"""Raw XML-RPC over HTTP, where a test looks at the exact bytes or types."""
+
+from __future__ import annotations
+
+from http.client import HTTPConnection
+from typing import Any
+from xmlrpc.client import dumps, loads
+
+from tests.ros.topology import Place
+
+TIMEOUT = 5.0
+
+
+def post(place: Place, address: str, port: int, body: bytes, path: str = "/") -> bytes:
+    """POSTs a body from a machine and gives the body of the reply."""
+    with place.entered():
+        connection = HTTPConnection(address, port, timeout=TIMEOUT)
+        try:
+            connection.request("POST", path, body, {"Content-Type": "text/xml"})
+            reply = connection.getresponse()
+            content = reply.read()
+        finally:
+            connection.close()
+    assert reply.status == 200, f"HTTP {reply.status}: {content[:500]!r}"
+    return content
+
+
+def call(place: Place, address: str, port: int, method: str, *arguments: Any) -> Any:
+    """Calls a method; gives the value of its ROS status triple, or raises LookupError."""
+    reply = post(place, address, port, dumps(arguments, method).encode())
+    code, message, value = loads(reply)[0][0]
+    if code != 1:
+        raise LookupError(message)
+    return value

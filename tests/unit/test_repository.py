@@ -1,0 +1,74 @@
+"""Habits of the repository that no linter holds."""
+
+import ast
+import re
+from pathlib import Path
+from statistics import median
+
+import click
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted((ROOT / "proxy").rglob("*.py"))
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 45
+MAX_MEDIAN_LINES = 10
+
+
+def functions(path: Path) -> dict[str, int]:
+    """The functions of a module, each with its lines of code: no docstring, no decorators."""
+    found = {}
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            docstring = node.body[0] if ast.get_docstring(node) else None
+            described = docstring.end_lineno - docstring.lineno + 1 if docstring else 0
+            length = node.end_lineno - node.lineno + 1 - described
+            found[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = length
+    return found
+
+
+def run_options() -> list[click.Option]:
+    from rosproxy.cli import main
+
+    command = main.commands["run"]
+    return [option for option in command.params if isinstance(option, click.Option)]
+
+
+def test_files_are_short() -> None:
+    lengths = {path.relative_to(ROOT): len(path.read_text().splitlines()) for path in SOURCES}
+    assert not {path: length for path, length in lengths.items() if length > MAX_FILE_LINES}
+
+
+def test_functions_are_short() -> None:
+    lengths = {name: length for path in SOURCES for name, length in functions(path).items()}
+    assert not {name: length for name, length in lengths.items() if length > MAX_FUNCTION_LINES}
+    assert median(lengths.values()) <= MAX_MEDIAN_LINES
+
+
+def test_no_package_hides_the_standard_library() -> None:
+    """`operator` is a source root: as a package it would hide a module of Python."""
+    assert not (ROOT / "operator/__init__.py").exists()
+
+
+@pytest.mark.parametrize("command", ["make demo", "make test", "make check"])
+def test_readme_names_the_commands(command: str) -> None:
+    assert command in (ROOT / "README.md").read_text()
+
+
+def test_every_option_is_documented() -> None:
+    text = (ROOT / "docs/configuration.md").read_text()
+    names = [name for option in run_options() for name in option.opts]
+    variables = [str(option.envvar) for option in run_options() if option.envvar]
+    missing = [word for word in names + variables if not re.search(rf"(?<![\w-]){word}\b", text)]
+    assert not missing
+
+
+def test_readme_names_tests_that_exist() -> None:
+    """A table of what works is worth as much as the tests that it names."""
+    named = set(re.findall(r"\btests/[\w/]+\.py\b", (ROOT / "README.md").read_text()))
+    assert not {path for path in named if not (ROOT / path).is_file()}
+
+
+def test_scripts_can_be_run() -> None:
+    scripts = [*(ROOT / "scripts").glob("*.sh"), ROOT / ".ci/run"]
+    assert not [path.name for path in scripts if not path.stat().st_mode & 0o111]
