@@ -14,7 +14,7 @@ from rosproxy.core.settings import SettingError, Settings
 from rosproxy.core.tcpros import speaks_http
 from rosproxy.core.uris import HostPort
 from rosproxy.http_server import Service, XmlRpcServer
-from rosproxy.keeper import Keeper
+from rosproxy.keeper import TICK, Keeper
 from rosproxy.leases import Leases
 from rosproxy.master_service import MasterService, PublishedMaster
 from rosproxy.master_watch import MasterWatch
@@ -23,7 +23,7 @@ from rosproxy.node_client import NodeClient
 from rosproxy.range_probe import probe_range
 from rosproxy.slave_service import SlaveService
 from rosproxy.status import describe
-from rosproxy.tcpros_service import TcprosService
+from rosproxy.tcpros_service import RATE_INTERVAL, TcprosService
 from rosproxy.upkeep import Upkeep
 
 log = logging.getLogger(__name__)
@@ -60,10 +60,10 @@ class App:
             self._listen("--publish-master", where.port, published, "ROS master API")
         self.context.metrics.registry.register(self._state_metrics())
         await self._start_admin()
-        spawn = self.context.tasks.spawn
-        spawn(self._watch.run(), "watching the master")
-        spawn(self._keeper.run(), "looking after nodes")
-        spawn(self._tcpros.sample_rates(), "sampling rates")
+        repeat = self.context.tasks.repeat
+        repeat(self._watch.look, settings.master_interval, "watching the master")
+        repeat(self._keeper.look, TICK, "looking after nodes")
+        repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
     async def stop(self) -> None:
@@ -121,7 +121,7 @@ class App:
         server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
         self._servers.append(server)
         self._sockets.append(sock)
-        Acceptor(self.context.tasks, sock, lambda conn, peer: server.serve(conn))
+        Acceptor(self.context.tasks, sock, lambda conn, peer: _serve_speaker(server, conn))
 
     async def _start_admin(self) -> None:
         try:
@@ -149,6 +149,14 @@ class App:
             settings.advertise_host,
             settings.ports.advertise,
         )
+
+
+async def _serve_speaker(server: XmlRpcServer, conn: socket.socket) -> None:
+    """Serve a connection once its client has said something; silent ones time out."""
+    if await first_bytes(conn):
+        await server.serve(conn)
+    else:
+        conn.close()
 
 
 async def serve(settings: Settings, stopped: asyncio.Event) -> None:

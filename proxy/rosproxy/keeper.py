@@ -30,13 +30,11 @@ class Keeper:
         self._probing: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_PROBES)
 
-    async def run(self) -> None:
-        """Look after the endpoints until cancelled."""
-        while True:
-            for endpoint in self._context.registry:
-                self._look(endpoint)
-                await self._maybe_end(endpoint)
-            await asyncio.sleep(TICK)
+    async def look(self) -> None:
+        """Look after all endpoints once."""
+        for endpoint in self._context.registry:
+            self._probe_if_due(endpoint)
+            await self._maybe_end(endpoint)
 
     async def verify(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears out what the master says of it."""
@@ -64,7 +62,7 @@ class Keeper:
         if endpoint.health.clean_up(self._context.now(), self._context.settings.cleanup_after):
             await self._upkeep.clean_up(endpoint)
 
-    def _look(self, endpoint: Endpoint) -> None:
+    def _probe_if_due(self, endpoint: Endpoint) -> None:
         due = endpoint.health.due(self._context.now(), self._context.settings.probe_interval)
         if due and endpoint not in self._probing:
             self._probing.add(endpoint)
@@ -85,6 +83,8 @@ class Keeper:
             return
         if endpoint.health.cleaned:
             await self._upkeep.come_back(endpoint)
+        elif endpoint.health.pid not in (None, pid):
+            await self._upkeep.audit(endpoint)
         endpoint.health.pid = pid
         if not self._leases.is_open(endpoint) and endpoint.port in self._context.registry.by_port:
             log.info("%s answers again", endpoint.label)

@@ -3,6 +3,7 @@
 import logging
 import socket
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 from rosproxy.acceptor import Acceptor
 from rosproxy.context import Context
@@ -35,6 +36,7 @@ class Leases:
             return None
         endpoint = self._context.registry.admitted(uri, asker.address)
         if endpoint is not None:
+            self._welcome_back(endpoint, asker)
             return endpoint
         node = parse_slave_uri(uri)
         if node is None:
@@ -89,6 +91,17 @@ class Leases:
         self.open(endpoint)
         self._context.tasks.spawn(self._greet(endpoint, asker.caller_id), f"first probe of {uri}")
         return endpoint
+
+    def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
+        """A node that registers is alive, whatever was believed of it."""
+        place = endpoint.place
+        if not place.confirmed and place.address == asker.address:
+            endpoint.place, endpoint.trusted = replace(place, confirmed=True), True
+        if endpoint.trusted:
+            self.open(endpoint)
+        known = endpoint.caller_ids
+        if endpoint.health.down or (known and asker.caller_id not in known):
+            endpoint.health.suspect()
 
     async def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         registry = self._context.registry

@@ -32,12 +32,6 @@ class MasterWatch:
         self.round_trip: float | None = None
         self.since = context.now()
 
-    async def run(self) -> None:
-        """Look at the master in intervals until cancelled."""
-        while True:
-            await self.look()
-            await asyncio.sleep(self._context.settings.master_interval)
-
     async def recovered(self) -> None:
         """Wait until the registry is rebuilt from the master. Raises Unreachable."""
         async with self._recovering:

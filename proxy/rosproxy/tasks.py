@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 log = logging.getLogger(__name__)
@@ -20,6 +20,20 @@ class Tasks:
         self._tasks.add(task)
         task.add_done_callback(self._done)
         return task
+
+    def repeat(self, step: Callable[[], Awaitable[None]], interval: float, name: str) -> None:
+        """Run ``step`` again and again, ``interval`` seconds apart, whatever becomes of it."""
+        self.spawn(self._repeat(step, interval, name), name)
+
+    async def _repeat(
+        self, step: Callable[[], Awaitable[None]], interval: float, name: str
+    ) -> None:
+        while True:
+            try:
+                await step()
+            except Exception:
+                log.exception("%s failed; going on", name)
+            await asyncio.sleep(interval)
 
     async def cancel(self) -> None:
         """Cancel everything and wait until it has ended."""

@@ -10,6 +10,7 @@ from rosproxy.context import Context
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.tcpros import HeaderError, decode_header, encode_header
+from rosproxy.core.uris import is_loopback
 from rosproxy.metrics import Traffic
 from rosproxy.node_client import NodeClient
 from rosproxy.relay import Relay, reset_on_close
@@ -46,12 +47,10 @@ class TcprosService:
         return total
 
     async def sample_rates(self) -> None:
-        """Compute the rates of all connections each RATE_INTERVAL until cancelled."""
-        while True:
-            now = self._context.now()
-            for relay in self._relays:
-                relay.sample(now)
-            await asyncio.sleep(RATE_INTERVAL)
+        """Compute the rates of all connections since the last time."""
+        now = self._context.now()
+        for relay in self._relays:
+            relay.sample(now)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
@@ -115,7 +114,14 @@ class TcprosService:
         """Reset, as a node that is gone would: roscpp and rospy try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
         what = fields.get("service") or fields.get("topic") or "?"
-        log.warning("%s: no TCPROS connection to it for %s", endpoint.label, what)
+        text = f"no TCPROS connection to it for {what}"
+        if is_loopback(endpoint.node.host):
+            text += (
+                f": it listens on loopback only ({endpoint.uri}). Unset ROS_IP and ROS_HOSTNAME "
+                f"where it runs, or set ROS_IP={endpoint.place.address}"
+            )
+        log.warning("%s: %s", endpoint.label, text)
+        self._context.problems.add(endpoint.label, text)
         reset_on_close(conn)
         conn.close()
 

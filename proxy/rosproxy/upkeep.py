@@ -57,14 +57,34 @@ class Upkeep:
 
     async def clean_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that is gone at the master. Raises Unreachable."""
-        addressing = self._context.addressing
         held = list(endpoint.registrations.values())
-        await self._context.upstream.batch(
-            [upkeep.unregister_call(endpoint, one, addressing) for one in held]
-        )
+        await self._unregister(endpoint, held)
         endpoint.health.cleaned = True
         self._context.metrics.cleanups.inc()
         log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
+
+    async def audit(self, endpoint: Endpoint) -> None:
+        """Take back what a former process left: topics that the node there does not have.
+
+        Raises Unreachable.
+        """
+        started = self._context.now()
+        said = await self._nodes.describe(endpoint.slave)
+        if said is None:
+            return
+        endpoint.topic_ports.clear()
+        endpoint.tcpros_port = said.tcpros_port
+        stale = upkeep.left_over(endpoint, said.published, said.subscribed, started)
+        await self._unregister(endpoint, stale)
+        for held in stale:
+            log.info("%s is no longer at %s; taken back", held.caller_id, endpoint.uri)
+            self._context.registry.unregister(held.kind, held.name, held.caller_id)
+
+    async def _unregister(self, endpoint: Endpoint, held: Sequence[Registration]) -> None:
+        addressing = self._context.addressing
+        await self._context.upstream.batch(
+            [upkeep.unregister_call(endpoint, one, addressing) for one in held]
+        )
 
     async def come_back(self, endpoint: Endpoint) -> None:
         """Register a node again that was cleaned up and answers after all. Raises Unreachable."""

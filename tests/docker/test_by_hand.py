@@ -84,8 +84,11 @@ def test_talker_hears_the_robot(robot: Robot, inside: Inside) -> None:
 
 def test_roscpp_node_inside_hears_and_is_heard(robot: Robot, inside: Inside) -> None:
     robot.start("rostopic", "pub", "-r", "5", "/there", "std_msgs/String", "round trip")
-    inside.start("/usr/lib/topic_tools/relay", "/there", "/back")
+    inside.start("/usr/lib/topic_tools/relay", "/there", "/back", "__name:=relay")
     assert robot.run("rostopic", "echo", "-n", "3", "/back").count("round trip") == 3
+
+    robot.run("rosnode", "kill", "/relay")
+    wait_until(lambda: "/relay" not in nodes(robot), 10, "the killed node signs off")
 
 
 def test_services_are_called_both_ways(robot: Robot, inside: Inside) -> None:
@@ -112,5 +115,5 @@ def test_robot_is_heard_again_after_the_proxy_was_killed(robot: Robot, inside: I
 
 
 def test_stopping_the_example_leaves_no_entry_behind(robot: Robot, inside: Inside) -> None:
-    inside.compose("down", "--timeout", "10")
+    inside.compose("stop", "--timeout", "10")
     wait_until(lambda: not inside_ports(robot), 10, lambda: str(nodes(robot)))

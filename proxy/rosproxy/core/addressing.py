@@ -122,7 +122,7 @@ class Addressing:
         return (port, path) if port and path else None
 
     def _import(self, endpoint: Endpoint, asker: Asker) -> str:
-        if self._direct(endpoint, asker):
+        if self._direct(endpoint, asker) and self._own(endpoint.uri, asker) is endpoint:
             return endpoint.uri
         return slave_uri(HostPort(asker.proxy, endpoint.port), self._path(endpoint))
 
@@ -152,15 +152,20 @@ class Addressing:
         return where.host == asker.proxy and where.port in self.ports.listen
 
     def _own(self, uri: str, asker: Asker) -> Endpoint | None:
-        def distance(endpoint: Endpoint) -> tuple[bool, bool]:
-            return endpoint is not asker.endpoint, endpoint.place.address != asker.address
+        """Whom an asker means by an inside URI; several nodes may call themselves the same."""
+        admitted = self.registry.admitted(uri, asker.address)
+
+        def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
+            itself = endpoint is asker.endpoint
+            return not itself, endpoint is not admitted, endpoint.place.address != asker.address
 
         return min(self.registry.by_uri(uri), key=distance, default=None)
 
     def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
+        """A service as its provider gave it, or as it must have done (rebuilt from the master)."""
         known = self.registry.service(service)
-        if known and known[0] is endpoint and known[1].service_api:
-            return known[1].service_api
-        if endpoint.tcpros_port is None:
+        if known is None or known[0] is not endpoint:
             return None
-        return service_uri(HostPort(endpoint.node.host, endpoint.tcpros_port))
+        if known[1].service_api is None and endpoint.tcpros_port:
+            return service_uri(HostPort(endpoint.node.host, endpoint.tcpros_port))
+        return known[1].service_api

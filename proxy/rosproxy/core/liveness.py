@@ -60,6 +60,10 @@ class Health:
             return "failing"
         return "new" if self.answered is None else "ok"
 
+    def suspect(self) -> None:
+        """Have the node probed at once, as if another process could be there by now."""
+        self.checked, self.pid = None, -1
+
     def note(self, probe: Probe, now: float) -> Change:
         """Take in a probe result and tell whether the node went down or came up by it."""
         was_down = self.down

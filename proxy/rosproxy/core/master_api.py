@@ -6,16 +6,14 @@ ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rosproxy.core import xmlrpc
 from rosproxy.core.addressing import Addressing, Asker
 from rosproxy.core.methods import Reply, Row, resolve_name, row
 from rosproxy.core.registry import Endpoint, Registration
 from rosproxy.core.uris import parse_service_uri
-from rosproxy.core.xmlrpc import Call, Edit, Value
-
-MULTICALL = "system.multicall"
+from rosproxy.core.xmlrpc import MULTICALL, Call, Edit, Value
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +28,7 @@ class Refusal:
 
 
 Admission = Endpoint | Refusal | None
-"""What became of a call that registers: its endpoint, or why it has none."""
+"""What became of a call that registers or unregisters: its endpoint, or why it has none."""
 
 
 @dataclass(slots=True)
@@ -102,13 +100,12 @@ class Noted:
 def read_request(body: bytes, asker: Asker) -> Request:
     """Parse a request. Raises XmlRpcError if it is none."""
     call = xmlrpc.parse_call(body)
-    caller_id = _caller_id(call)
     if call.method != MULTICALL:
-        return Request(body, [call], False, _with_caller(asker, caller_id))
+        return Request(body, [call], False, replace(asker, caller_id=_caller_id(call)))
     calls = list(xmlrpc.multicall(call))
-    names = [_caller_id(inner) for inner in calls if inner]
-    asker = _with_caller(asker, names[0] if names else "")
-    return Request(body, calls, True, asker, call.params[0].items if call.params else [])
+    caller_id = next((_caller_id(inner) for inner in calls if inner), "")
+    items = xmlrpc.multicall_items(call)
+    return Request(body, calls, True, replace(asker, caller_id=caller_id), items)
 
 
 def registering_uri(call: Call | None) -> str | None:
@@ -120,8 +117,14 @@ def registering_uri(call: Call | None) -> str | None:
 
 
 def export_request(request: Request, addressing: Addressing) -> bytes:
-    """The request for the master: URIs exported, refused calls left out."""
+    """The request for the master: URIs exported, refused calls left out.
+
+    A call that unregisters gets the endpoint of its registration as its admission.
+    """
     edits: list[Edit] = []
+    for index, call in enumerate(request.calls):
+        if call and row(call.method).unregisters:
+            request.admissions[index] = _holder(call, request.asker, addressing)
     for call, admission in zip(request.calls, request.admissions, strict=True):
         if call and not isinstance(admission, Refusal):
             edits += _export_call(call, admission, request.asker, addressing)
@@ -146,7 +149,8 @@ def import_answer(request: Request, answer: Answer, addressing: Addressing) -> b
     """The reply for the inside node: URIs imported, refused calls answered."""
     edits: list[Edit] = []
     for result in answer.results:
-        edits += _import_result(result, _asker_of(request.asker, result.endpoint), addressing)
+        asker = replace(request.asker, endpoint=result.endpoint or request.asker.endpoint)
+        edits += _import_result(result, asker, addressing)
     if request.multicall and answer.value and answer.value.items:
         edits += xmlrpc.insert_items(answer.value, _refused_results(request))
     return xmlrpc.apply(answer.body, edits)
@@ -163,11 +167,15 @@ def rename_master(answer: Answer, master: str) -> bytes:
 
 
 def noted(answer: Answer, now: float) -> list[Noted]:
-    """What the registry has to learn from the calls that the master accepted."""
+    """What the registry has to learn from the calls that the master accepted.
+
+    The master also accepts what changes nothing: a node that makes room for another of its name
+    unregisters with its own URI, and the other's registrations stay.
+    """
     facts = []
     for result in answer.results:
         held = _registration(result.call, now)
-        if held and result.accepted:
+        if held and result.accepted and result.endpoint:
             made = row(result.call.method).registers is not None
             facts.append(Noted(held, result.endpoint if made else None))
     return facts
@@ -177,14 +185,21 @@ def _caller_id(call: Call) -> str:
     return call.string(0) or ""
 
 
-def _with_caller(asker: Asker, caller_id: str) -> Asker:
-    return Asker(asker.address, asker.proxy, caller_id, asker.master, asker.endpoint)
+def _name(call: Call) -> str:
+    """The topic, service or node that a call's second parameter names."""
+    return resolve_name(call.string(1) or "", _caller_id(call))
 
 
-def _asker_of(asker: Asker, endpoint: Endpoint | None) -> Asker:
-    if endpoint is None:
-        return asker
-    return Asker(asker.address, asker.proxy, asker.caller_id, asker.master, endpoint)
+def _holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None:
+    """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
+    found, holder = row(call.method), addressing.registry.by_caller(_caller_id(call))
+    if holder is None:
+        return None
+    if found.caller_api is not None:
+        uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
+        return holder if uri == addressing.advertised_uri(holder) else None
+    uri = addressing.export_service(call.string(2) or "", _name(call), asker)
+    return holder if uri == addressing.advertised_service(holder) else None
 
 
 def _export_call(
@@ -200,8 +215,7 @@ def _export_call(
     if service_api and isinstance(admission, Endpoint):
         edits += _export_service_api(service_api, admission, addressing)
     elif service_api:
-        name = resolve_name(call.string(1) or "", asker.caller_id)
-        text = addressing.export_service(service_api.text, name, asker)
+        text = addressing.export_service(service_api.text, _name(call), asker)
         edits.append(xmlrpc.replace(service_api, text))
     return edits
 
@@ -259,8 +273,7 @@ def _imported(call: Call, text: str, asker: Asker, addressing: Addressing) -> st
     if kind is Reply.SLAVE_URI:
         return addressing.import_slave(text, asker)
     if kind is Reply.SERVICE_URI:
-        name = resolve_name(call.string(1) or "", asker.caller_id)
-        return addressing.import_service(text, name, asker)
+        return addressing.import_service(text, _name(call), asker)
     return f"http://{asker.master}/" if asker.master else text
 
 
@@ -290,4 +303,3 @@ def _registration(call: Call, now: float) -> Registration | None:
     type_ = (call.string(found.type) if found.type is not None else None) or "*"
     service_api = call.string(found.service_api) if found.service_api is not None else None
     return Registration(kind, resolve_name(name, caller_id), caller_id, type_, service_api, now)
-

@@ -117,11 +117,11 @@ class Registry:
         self.by_port: dict[int, Endpoint] = {}
         self._by_key: dict[tuple[str, int], Endpoint] = {}
         self._by_uri: dict[str, list[Endpoint]] = {}
-        self._by_caller: dict[str, dict[int, Endpoint]] = {}
+        self._by_caller: dict[str, Endpoint] = {}
         self._services: dict[str, tuple[Endpoint, Registration]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[tuple[str, int], int] = {}
-        self._last_key: dict[int, tuple[str, int]] = {}
+        self._former: dict[int, Endpoint] = {}
 
     def __iter__(self) -> Iterator[Endpoint]:
         """All endpoints; safe against changes while iterating."""
@@ -138,12 +138,13 @@ class Registry:
     def admit(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         """The endpoint of a slave URI that ``source`` registers; made if there is none.
 
-        Raises RangeExhausted if it needs a port and none can be had.
+        One that is there already takes on what came from the node's own address: nobody can rename
+        somebody else's. Raises RangeExhausted if it needs a port and none can be had.
         """
         endpoint = self._by_key.get((place.address, node.port))
         if endpoint is None:
             endpoint = self._add(uri, node, place, self._port_for(place, node))
-        elif endpoint.uri != uri:
+        elif place.confirmed or not endpoint.place.confirmed:
             self._rename(endpoint, uri, node, place)
         self._admit(endpoint, uri, source)
         return endpoint
@@ -159,17 +160,22 @@ class Registry:
 
     def remove(self, endpoint: Endpoint) -> None:
         """Forget an endpoint with all its registrations and give its port back."""
-        for held in list(endpoint.registrations.values()):
-            self.unregister(held.kind, held.name, held.caller_id)
+        for key in list(endpoint.registrations):
+            self._drop(endpoint, key)
         del self.by_port[endpoint.port], self._by_key[endpoint.key]
         self._forget_uri(endpoint)
         for admission in endpoint.admissions:
-            self._admitted.pop(admission, None)
+            del self._admitted[admission]
+        self._former[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
 
     def reclaimable(self) -> Endpoint | None:
-        """The endpoint to give up first when the range is short: idle for the longest time."""
-        idle = [e for e in self if e.idle or (e.health.cleaned and not e.connections)]
+        """The endpoint to give up first when the range is short: idle for the longest time.
+
+        One that has just been admitted is not idle: the master's reply is still on its way.
+        """
+        spare = [e for e in self if e.idle_since is not None and not e.connections]
+        idle = [e for e in spare if e.idle or e.health.cleaned]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
     def exhausted(self) -> RangeExhausted:
@@ -186,18 +192,19 @@ class Registry:
         As the master does, a service has one provider, and a name that registers from another
         URI loses all that it had at the old one (rosmaster/registrations.py).
         """
-        for other in list(self._by_caller.get(held.caller_id, {}).values()):
-            if other is not endpoint:
-                self.drop_caller(other, held.caller_id)
+        other = self._by_caller.get(held.caller_id)
+        if other and other is not endpoint:
+            self.drop_caller(other, held.caller_id)
         if held.kind is Kind.SERVICE:
             self._replace_service(endpoint, held)
         endpoint.registrations[held.key] = held
-        self._by_caller.setdefault(held.caller_id, {})[endpoint.port] = endpoint
+        self._by_caller[held.caller_id] = endpoint
         endpoint.idle_since = None
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
         """Note that a registration has ended, whoever ended it."""
-        for endpoint in list(self._by_caller.get(caller_id, {}).values()):
+        endpoint = self._by_caller.get(caller_id)
+        if endpoint:
             self._drop(endpoint, (kind, name, caller_id))
 
     def drop_caller(self, endpoint: Endpoint, caller_id: str) -> None:
@@ -206,12 +213,17 @@ class Registry:
             self._drop(endpoint, key)
 
     def by_uri(self, uri: str) -> list[Endpoint]:
-        """The endpoints that call themselves ``uri``; several only for host names reused."""
-        return self._by_uri.get(uri, [])
+        """The endpoints that call themselves ``uri``; several only for host names reused.
+
+        Those removed come last, until somebody else has their port: a node that was handed their
+        URI may still send it back.
+        """
+        former = [endpoint for endpoint in self._former.values() if endpoint.uri == uri]
+        return self._by_uri.get(uri, []) + former
 
     def by_caller(self, caller_id: str) -> Endpoint | None:
         """The endpoint of a node's name."""
-        return next(iter(self._by_caller.get(caller_id, {}).values()), None)
+        return self._by_caller.get(caller_id)
 
     def service(self, name: str) -> tuple[Endpoint, Registration] | None:
         """Who provides a service."""
@@ -238,18 +250,22 @@ class Registry:
     def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port)
         self.by_port[port] = self._by_key[endpoint.key] = endpoint
-        self._remember(port, endpoint.key)
+        self._remember(endpoint)
         self._by_uri.setdefault(uri, []).append(endpoint)
         return endpoint
 
     def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
+        before = self._admitted.get((uri, source), endpoint)
+        before.admissions.discard((uri, source))
         self._admitted[uri, source] = endpoint
         endpoint.admissions.add((uri, source))
 
-    def _remember(self, port: int, key: tuple[str, int]) -> None:
-        self._last_port.pop(self._last_key.get(port, key), None)
-        self._last_key[port] = key
-        self._last_port[key] = port
+    def _remember(self, endpoint: Endpoint) -> None:
+        """Note who has a port now, in place of who had it last."""
+        former = self._former.pop(endpoint.port, endpoint)
+        if self._last_port.get(former.key) == endpoint.port:
+            del self._last_port[former.key]
+        self._last_port[endpoint.key] = endpoint.port
 
     def _rename(self, endpoint: Endpoint, uri: str, node: HostPort, place: Place) -> None:
         self._forget_uri(endpoint)
@@ -274,6 +290,4 @@ class Registry:
         if kind is Kind.SERVICE:
             self._services.pop(name, None)
         if not any(other[2] == caller_id for other in endpoint.registrations):
-            self._by_caller[caller_id].pop(endpoint.port, None)
-            if not self._by_caller[caller_id]:
-                del self._by_caller[caller_id]
+            del self._by_caller[caller_id]

@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 from typing import Any, Literal
-from urllib.parse import urlsplit
 
 from rosproxy.core.addressing import Network
 from rosproxy.core.ports import PortMap, PortRange
-from rosproxy.core.uris import HostPort, parse_host_port
+from rosproxy.core.uris import HostPort, parse_host_port, parse_slave_uri
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 
@@ -95,12 +94,7 @@ def _master_uri(uri: str | None) -> str:
             "--master-uri",
             "missing; give the real master, e.g. http://robot:11311 (ROS_MASTER_URI)",
         )
-    try:
-        parts = urlsplit(uri)
-        valid = parts.scheme == "http" and bool(parts.hostname) and parts.port is not None
-    except ValueError:
-        valid = False
-    if not valid:
+    if parse_slave_uri(uri) is None:
         raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
     return uri
 
@@ -158,6 +152,7 @@ def _seconds(name: str, value: float) -> float:
 
 
 def _check_overlaps(settings: Settings) -> None:
+    taken: dict[int | None, str] = {}
     for option, port in (
         ("--master-port", settings.master_port),
         ("--publish-master", settings.publish_master),
@@ -168,5 +163,6 @@ def _check_overlaps(settings: Settings) -> None:
                 option,
                 f"port {port} lies in --port-range {settings.ports.listen}; move one of them",
             )
-    if settings.master_port == settings.publish_master:
-        raise SettingError("--publish-master", "must differ from --master-port")
+        if port in taken:
+            raise SettingError(option, f"port {port} is that of {taken[port]}; move one of them")
+        taken[port] = option

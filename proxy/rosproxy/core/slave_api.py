@@ -15,6 +15,7 @@ MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
 """What the master calls at nodes; a policy can refuse it from anybody else."""
 
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
+_REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +41,7 @@ class Visit:
 
 def rewritten(call: Call) -> bool:
     """Whether anything in a call or its reply is rewritten."""
-    return call.method in _URI_REPLIES or call.method in (
-        "publisherUpdate",
-        "requestTopic",
-        "getBusInfo",
-    )
+    return call.method in _REWRITTEN
 
 
 def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -> bytes:
@@ -52,10 +49,11 @@ def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
-    if call.method != "publisherUpdate" or len(call.params) < 3:
+    named = call.params[2] if call.method == "publisherUpdate" and len(call.params) > 2 else None
+    if named is None or named.kind != "array":
         return body
     edits, seen = [], set()
-    for item in (item for item in call.params[2].items if item.kind == "string"):
+    for item in (item for item in named.items if item.kind == "string"):
         uri = addressing.import_slave(item.text, visit.node)
         edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
         seen.add(uri)

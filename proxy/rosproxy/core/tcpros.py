@@ -8,7 +8,8 @@ import struct
 from collections.abc import Mapping
 
 MAX_HEADER = 1_000_000
-"""Longest header in bytes that is read; roscpp refuses longer ones as well (connection.cpp)."""
+"""Longest header in bytes that is read. A header holds a message definition at most; roscpp's own
+bound is 10^9 (connection.cpp), rospy has none."""
 
 _LENGTH = struct.Struct("<I")
 

@@ -40,6 +40,31 @@ def unregister_call(endpoint: Endpoint, held: Registration, addressing: Addressi
             return "unsubscribeParam", [held.caller_id, uri, held.name]
 
 
+def left_over(
+    endpoint: Endpoint, published: frozenset[str], subscribed: frozenset[str], before: float
+) -> list[Registration]:
+    """Which of an endpoint's registrations a process that is gone has left behind.
+
+    A topic is, if the node does not name it; a whole node name is, if another has registered
+    since and none of its topics, apart from everybody's /rosout, holds. Registrations made after
+    ``before`` are not.
+    """
+    topics = {Kind.PUBLISHER: published, Kind.SUBSCRIBER: subscribed}
+    everything = list(endpoint.registrations.values())
+    newest = max(everything, key=lambda held: held.since, default=None)
+    alive = {
+        held.caller_id
+        for held in everything
+        if held is newest or (held.name != "/rosout" and held.name in topics.get(held.kind, ()))
+    }
+    return [
+        held
+        for held in everything
+        if held.since < before
+        and (held.caller_id not in alive or held.name not in topics.get(held.kind, (held.name,)))
+    ]
+
+
 def still_held(
     endpoint: Endpoint, published: frozenset[str], subscribed: frozenset[str], same_process: bool
 ) -> list[Registration]:

@@ -7,9 +7,12 @@ the path and rospy sends it back; the port alone always suffices. The path is wh
 restarted proxy rebuild its table from what the master holds.
 """
 
+import re
 from dataclasses import dataclass
 from ipaddress import ip_address
 from urllib.parse import quote, unquote, urlsplit
+
+_HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +91,14 @@ def is_address(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is a loopback address or ``localhost``."""
-    if is_address(host):
-        return ip_address(host).is_loopback
-    return host == "localhost" or host.endswith(".localhost")
+    """Whether a host is ``localhost``, a loopback address or the unspecified address.
+
+    All of them mean another machine to everybody else.
+    """
+    bare = plain_address(host)
+    if is_address(bare):
+        return ip_address(bare).is_loopback or ip_address(bare).is_unspecified
+    return f".{host}".lower().endswith(".localhost")
 
 
 def plain_address(address: str) -> str:
@@ -111,7 +118,5 @@ def _authority(uri: str) -> HostPort | None:
         port = parts.port
     except ValueError:
         return None
-    if not parts.hostname or port is None or port == 0 or "@" in parts.netloc:
-        return None
-    host = parts.netloc.rpartition(":")[0].strip("[]")
-    return HostPort(host, port)
+    host = parts.netloc.rpartition(":")[0].removeprefix("[").removesuffix("]")
+    return HostPort(host, port) if port and _HOST.fullmatch(host) else None

@@ -238,8 +238,10 @@ def multicall(call: Call) -> Iterator[Call | None]:
         name = method.string() if method else None
         if name == MULTICALL:
             raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} inside {MULTICALL}")
-        known = name and params and params.kind == "array"
-        yield Call(str(name), params.items) if known and params else None
+        if name and params and params.kind == "array":
+            yield Call(name, params.items)
+        else:
+            yield None
 
 
 def multicall_items(call: Call) -> list[Value]:

@@ -85,14 +85,15 @@ async def _interruptible(seconds: float, *, quiet: bool) -> Outcome | None:
     """Run the demo so that the first signal ends it in good order, and further ones don't hurt."""
     work = asyncio.create_task(perform(seconds, detect(), quiet=quiet))
     loop = asyncio.get_running_loop()
+    stopping = asyncio.Event()
 
-    def stop(number: signal.Signals) -> None:
-        loop.remove_signal_handler(number)
-        loop.add_signal_handler(number, lambda: None)
-        work.cancel()
+    def stop() -> None:
+        if not stopping.is_set():
+            stopping.set()
+            work.cancel()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, stop, number)
+        loop.add_signal_handler(number, stop)
     try:
         return await work
     except asyncio.CancelledError:

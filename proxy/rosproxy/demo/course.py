@@ -19,7 +19,7 @@ START_SECONDS = 15.0
 RECOVERY_WAIT = 10.0
 """How long a recovery is waited for: longer than it may take, so that it can be measured."""
 DIRECT_SECONDS = 1.0
-OUTAGE_SECONDS = 0.7
+LONGEST_OUTAGE = 1.5
 SHORTEST_TRAFFIC = 1.0
 ENDING_SECONDS = 0.7
 
@@ -109,13 +109,12 @@ class Course:
 
     async def _kill_and_restart(self) -> None:
         self._board.enter("rosproxy killed (SIGKILL); no node is restarted")
-        if self._proxy is None or not self._proxy.running:
-            raise DemoError("the proxy ended by itself")
+        proxy = self._running_proxy()
         self._killed = time.monotonic()
-        await self._proxy.kill()
+        await proxy.kill()
         self._board.proxy = "killed"
         self._board.tell("rosproxy killed with SIGKILL")
-        await asyncio.sleep(OUTAGE_SECONDS)
+        await asyncio.sleep(min(LONGEST_OUTAGE, self._seconds / 10))
         self._board.enter("rosproxy restarted: same command, no state on disk")
         self._restarted = time.monotonic()
         await self._start_proxy()
@@ -153,9 +152,17 @@ class Course:
         )
         # The nodes first: they unregister through the proxy.
         await asyncio.gather(*(worker.stop() for worker in self._workers.values()))
+        await self._running_proxy().stop()
+        self._board.proxy = "stopped"
         self._board.enter("done")
 
     # Steps
+
+    def _running_proxy(self) -> Supervised:
+        """Return the proxy; raises DemoError if it is gone without having been killed here."""
+        if self._proxy is None or not self._proxy.running:
+            raise DemoError("the proxy ended by itself")
+        return self._proxy
 
     async def _start_nodes(self, roles: tuple[Role, ...], master_uri: str) -> None:
         for role in roles:

@@ -9,7 +9,7 @@ from typing import Any
 RECOVERY_LIMIT = 2.0
 """Seconds that a restarted proxy may take until messages and service calls pass again."""
 IN_FLIGHT_SECONDS = 0.1
-"""A message written this shortly before the proxy was killed may have been inside of it."""
+"""A message written this shortly before the proxy was killed may still have been inside of it."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class StreamCount:
         """Say it in one line."""
         text = f"sent {self.sent}, received {self.received}"
         if self.cut_off:
-            text += f", {self.cut_off} inside the proxy when it was killed"
+            text += f", {self.cut_off} on the way when the proxy was killed"
         if self.unheard_during_outage:
             text += f", {self.unheard_during_outage} published during the outage (nobody connected)"
         return f"{text}; lost {self.lost}, duplicated {self.duplicates}"

@@ -172,4 +172,6 @@ int main(int argc, char** argv) {
   ros::start();
   say("node " + ros::this_node::getName());
   roles.at(argv[1])(Options(words));
+  // Left to static destructors, the shutdown dead-locks with one that SIGINT asks for.
+  ros::shutdown();
 }

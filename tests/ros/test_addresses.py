@@ -1,0 +1,137 @@
+"""Whatever address an inside node gives for itself, it is reached."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from tests.ros.combinations import LIBRARIES, each_direction, each_library, each_pair
+from tests.ros.lab import Lab
+
+INSIDE_TO = {"to-outside": "out", "to-another-inside": "c2"}
+
+each_sink = pytest.mark.parametrize("sink", INSIDE_TO.values(), ids=INSIDE_TO.keys())
+
+NOWHERE = {"ROS_HOSTNAME": "a-name-that-resolves-nowhere"}
+
+
+def exchange_messages(lab: Lab, library: str, sink: str, **options: Any) -> None:
+    """A publisher in c1, started with `options`, is heard in `sink`; and the other way."""
+    there, back = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    lab.node(library, "c1", "pub", topic=there, **options)
+    receiver = lab.node(library, "c1", "sub", topic=back, **options)
+    lab.node("roscpp", sink, "sub", topic=there).wait_for_count("^got hello ", 3)
+    lab.node("rospy", sink, "pub", topic=back)
+    receiver.wait_for_count("^got hello ", 3)
+
+
+def call_both_ways(lab: Lab, library: str, sink: str, **options: Any) -> None:
+    """A server in c1, started with `options`, is called from `sink`; and the other way."""
+    there, back = f"/{lab.unique('there')}", f"/{lab.unique('back')}"
+    lab.node(library, "c1", "serve", service=there, **options)
+    lab.node("roscpp", sink, "call", service=there).wait_for("^reply ask 0 ")
+    lab.node("rospy", sink, "serve", service=back)
+    lab.node(library, "c1", "call", service=back, **options).wait_for("^reply ask 0 ")
+
+
+@each_sink
+@each_library
+def test_topics_with_a_host_name_that_resolves_nowhere(lab: Lab, library: str, sink: str) -> None:
+    exchange_messages(lab, library, sink, env=NOWHERE)
+
+
+@each_sink
+@each_library
+def test_services_with_a_host_name_that_resolves_nowhere(lab: Lab, library: str, sink: str) -> None:
+    call_both_ways(lab, library, sink, env=NOWHERE)
+
+
+@each_sink
+@each_library
+def test_topics_with_ros_ip_set_to_the_inside_address(lab: Lab, library: str, sink: str) -> None:
+    exchange_messages(lab, library, sink, env={"ROS_IP": lab.place("c1").address})
+
+
+@each_sink
+@each_library
+def test_services_with_ros_ip_set_to_the_inside_address(lab: Lab, library: str, sink: str) -> None:
+    call_both_ways(lab, library, sink, env={"ROS_IP": lab.place("c1").address})
+
+
+@each_sink
+def test_roscpp_with_a_loopback_address_is_reached(lab: Lab, sink: str) -> None:
+    """roscpp listens on every interface, whatever ROS_IP says."""
+    exchange_messages(lab, "roscpp", sink, env={"ROS_IP": "127.0.0.1"})
+    call_both_ways(lab, "roscpp", sink, env={"ROS_IP": "127.0.0.1"})
+
+
+@pytest.mark.boundary
+def test_rospy_bound_to_loopback_is_named_in_the_log_with_the_fix(lab: Lab) -> None:
+    name, topic = lab.unique("lonely"), f"/{lab.unique('topic')}"
+    assert lab.proxy is not None
+    since = lab.proxy.mark()
+    lab.node("rospy", "c1", "pub", name=name, topic=topic, env={"ROS_IP": "127.0.0.1"})
+    lab.node("rospy", "out", "sub", topic=topic)
+    line = lab.proxy.wait_for(rf"^.*/{name}\b.*$", since=since)[0]
+    warning = lab.proxy.wait_for(rf"^.*/{name}\b.*ROS_IP.*$", since=since)[0]
+    assert "127.0.0.1" in warning or "loopback" in warning, line
+
+
+@each_direction
+@each_pair("first", "second")
+def test_nodes_in_a_namespace(
+    lab: Lab, first: str, second: str, source: str, sink: str
+) -> None:
+    """The same relative names, pushed into a namespace, meet each other."""
+    space = [f"__ns:=/{lab.unique('robot')}/arm"]
+    receiver = lab.node(second, sink, "sub", remap=space, topic="joint")
+    receiver.wait_for("^ready")
+    sender = lab.node(first, source, "pub", name="talker", remap=space, topic="joint")
+    receiver.wait_for_count("^got hello ", 3)
+    full = sender.wait_for("^node (.*)")[1]
+    assert full == f"{space[0].removeprefix('__ns:=')}/talker"
+    assert lab.registered(full)
+
+
+@each_library
+def test_two_containers_with_the_same_ports(lab: Lab, library: str) -> None:
+    """Both nodes have the same port numbers, each on its own address."""
+    nodes = {where: lab.unique("twin") for where in ("c1", "c2")}
+    fixed = (
+        {"xmlrpc_port": 40001, "tcpros_port": 40002}
+        if library == "rospy"
+        else {"remap": ["__tcpros_server_port:=40002"]}
+    )
+    for where, name in nodes.items():
+        lab.node(library, where, "pub", name=name, topic=f"/{name}", word=name, **fixed)
+    for name in nodes.values():
+        for listener in LIBRARIES:
+            receiver = lab.node(listener, "out", "sub", topic=f"/{name}")
+            words = {match[1] for match in receiver.wait_for_count(r"^got (\w+) ", 3)}
+            assert words == {name}
+    uris = {lab.node_uri(name) for name in nodes.values()}
+    assert len(uris) == 2
+
+
+@pytest.mark.boundary
+def test_outside_sees_one_port_of_the_published_range_per_node(lab: Lab) -> None:
+    name = lab.unique("seen")
+    node = lab.node("roscpp", "c1", "serve", name=name, service=f"/{name}/s")
+    node.wait_for("^ready")
+    uri = lab.node_uri(name)
+    service = lab.ask_master("lookupService", f"/{name}/s")
+    assert uri is not None
+    host, port = re.findall(r"^http://([^:/]+):(\d+)/", uri)[0]
+    assert host == lab.place("host").address
+    assert int(port) in range(45000, 45100)
+    assert service == f"rosrpc://{host}:{port}"
+
+
+@pytest.mark.boundary
+def test_a_node_sees_its_own_uri_as_it_registered_it(lab: Lab) -> None:
+    name = lab.unique("self")
+    lab.node("roscpp", "c1", "serve", name=name, service=f"/{name}/s").wait_for("^ready")
+    uri = lab.run("c1", "rosnode", "list", "-a").output
+    assert re.search(rf"^http://c1box:\d+/\s+/{name}$", uri, re.MULTILINE), uri
