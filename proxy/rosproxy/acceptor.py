@@ -18,6 +18,8 @@ log = logging.getLogger(__name__)
 FIRST_BYTES_TIMEOUT = 30.0
 """Seconds that a connection may stay silent before it is closed."""
 
+ACCEPTS_PER_TURN = 64
+
 Handler = Callable[[socket.socket, str], Awaitable[None]]
 """Takes over an accepted socket; the second argument is the peer's address."""
 
@@ -28,23 +30,29 @@ class Acceptor:
     def __init__(self, tasks: Tasks, sock: socket.socket, handler: Handler) -> None:
         self.sock = sock
         self._tasks, self._handler = tasks, handler
-        self._task = tasks.spawn(self._run(), f"accept on port {sock.getsockname()[1]}")
+        self._loop = asyncio.get_running_loop()
+        self._pause: asyncio.TimerHandle | None = None
+        self._listen()
 
-    async def stop(self) -> None:
+    def stop(self) -> None:
         """Stop accepting; the socket stays open."""
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+        self._loop.remove_reader(self.sock)
+        if self._pause is not None:
+            self._pause.cancel()
 
-    async def _run(self) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                conn, peer = await loop.sock_accept(self.sock)
-            except OSError as error:
-                await self._pause(error)
-                continue
-            conn.setblocking(False)
-            self._tasks.spawn(self._serve(conn, peer[0]), f"connection from {peer[0]}")
+    def _listen(self) -> None:
+        self._loop.add_reader(self.sock, self._accept)
+
+    def _accept(self) -> None:
+        try:
+            for _ in range(ACCEPTS_PER_TURN):
+                conn, peer = self.sock.accept()
+                conn.setblocking(False)
+                self._tasks.spawn(self._serve(conn, peer[0]), f"connection from {peer[0]}")
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._wait(error)
 
     async def _serve(self, conn: socket.socket, peer: str) -> None:
         try:
@@ -57,10 +65,12 @@ class Acceptor:
             conn.close()
             raise
 
-    async def _pause(self, error: OSError) -> None:
+    def _wait(self, error: OSError) -> None:
+        """Without a file descriptor left the socket would stay readable: look again later."""
         if error.errno in (errno.EMFILE, errno.ENFILE):
             log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
-        await asyncio.sleep(0.1)
+        self._loop.remove_reader(self.sock)
+        self._pause = self._loop.call_later(0.1, self._listen)
 
 
 async def first_bytes(conn: socket.socket) -> bytes:

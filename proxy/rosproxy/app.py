@@ -28,6 +28,9 @@ from rosproxy.upkeep import Upkeep
 
 log = logging.getLogger(__name__)
 
+RETRY_BLOCKED = 30.0
+"""Seconds between looks whether ports that other programs held have become free."""
+
 
 class App:
     """One proxy. `start` it in a running event loop, `stop` it in the same."""
@@ -63,6 +66,7 @@ class App:
         repeat = self.context.tasks.repeat
         repeat(self._watch.look, settings.master_interval, "watching the master")
         repeat(self._keeper.look, TICK, "looking after nodes")
+        repeat(self._leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
@@ -73,7 +77,7 @@ class App:
         for server in self._servers:
             await server.close()
         for endpoint in self.context.registry:
-            await self._leases.close(endpoint)
+            self._leases.close(endpoint)
         for sock in self._sockets:
             sock.close()
         self.context.bank.close_all()

@@ -8,6 +8,7 @@ import asyncio
 import logging
 import socket
 from collections.abc import Awaitable, Callable
+from copy import copy
 from typing import Any
 
 from aiohttp import web
@@ -34,6 +35,12 @@ class Call:
         self.local = here
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
+
+    def with_body(self, body: bytes) -> "Call":
+        """The same call with another body."""
+        other = copy(self)
+        other.body = body
+        return other
 
     @property
     def reached_locally(self) -> bool:

@@ -5,8 +5,9 @@ import logging
 
 from rosproxy.context import Context
 from rosproxy.core.liveness import Change, Probe
-from rosproxy.core.recovery import confirmed_by
+from rosproxy.core.recovery import Claim, allowed, confirmed_by
 from rosproxy.core.registry import Endpoint, Place
+from rosproxy.core.uris import HostPort
 from rosproxy.leases import Leases
 from rosproxy.network import resolve
 from rosproxy.node_client import NodeClient
@@ -34,7 +35,14 @@ class Keeper:
         """Look after all endpoints once."""
         for endpoint in self._context.registry:
             self._probe_if_due(endpoint)
-            await self._maybe_end(endpoint)
+            self._maybe_end(endpoint)
+
+    async def topics_at(self, claim: Claim) -> frozenset[str] | None:
+        """The topics that the node at a claimed address names; None if there is no answer."""
+        if not allowed(claim.address, self._context.addressing.networks):
+            return None
+        said = await self._nodes.describe(HostPort(*claim.key))
+        return frozenset(said.topics) if said else None
 
     async def verify(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears out what the master says of it."""
@@ -44,7 +52,7 @@ class Keeper:
         if not confirmed_by(endpoint, said.topics):
             log.warning("%s: the node there has none of its topics; not served", endpoint.label)
             await self._upkeep.clean_up(endpoint)
-            await self._leases.end(endpoint)
+            self._leases.end(endpoint)
             return
         endpoint.tcpros_port, endpoint.trusted = said.tcpros_port, True
         await self._name(endpoint)
@@ -58,7 +66,7 @@ class Keeper:
             await self._answered(endpoint, answer.pid)
         elif change is Change.DOWN:
             self._report_down(endpoint, answer.reason)
-            await self._leases.close(endpoint)
+            self._leases.close(endpoint)
         if endpoint.health.clean_up(self._context.now(), self._context.settings.cleanup_after):
             await self._upkeep.clean_up(endpoint)
 
@@ -102,12 +110,10 @@ class Keeper:
         named = place.address in await resolve(endpoint.node.host)
         endpoint.place = Place(place.address, named, place.confirmed)
 
-    async def _maybe_end(self, endpoint: Endpoint) -> None:
+    def _maybe_end(self, endpoint: Endpoint) -> None:
         now, health = self._context.now(), endpoint.health
-        if endpoint.connections:
+        if endpoint.connections or not (endpoint.idle or health.cleaned):
             endpoint.idle_since = None
-            return
-        if not (endpoint.idle or health.cleaned):
             return
         if endpoint.idle_since is None:
             endpoint.idle_since = now
@@ -116,4 +122,4 @@ class Keeper:
             linger = FORGET_AFTER
         if now - endpoint.idle_since >= linger:
             log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
-            await self._leases.end(endpoint)
+            self._leases.end(endpoint)

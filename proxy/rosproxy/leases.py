@@ -30,7 +30,17 @@ class Leases:
         self._acceptors: dict[int, Acceptor] = {}
 
     async def admit(self, call: Call, asker: Asker) -> Admission:
-        """The endpoint of a call that registers, or why there is none; None for other calls."""
+        """The endpoint of a call that registers, or why there is none; None for other calls.
+
+        The endpoint is marked as ``pending``, so that its lease does not end while the call is on
+        its way; whoever admits takes the mark back.
+        """
+        admission = await self._admit(call, asker)
+        if isinstance(admission, Endpoint):
+            admission.pending += 1
+        return admission
+
+    async def _admit(self, call: Call, asker: Asker) -> Admission:
         uri = registering_uri(call)
         if uri is None:
             return None
@@ -61,19 +71,28 @@ class Leases:
             self._context.tasks, sock, lambda conn, peer: self._on_connection(endpoint, conn, peer)
         )
 
-    async def close(self, endpoint: Endpoint) -> None:
+    def close(self, endpoint: Endpoint) -> None:
         """Let an endpoint's port refuse; the lease and open connections stay."""
         acceptor = self._acceptors.pop(endpoint.port, None)
         if acceptor is not None:
-            await acceptor.stop()
+            acceptor.stop()
             self._context.bank.close(endpoint.port, acceptor.sock)
 
-    async def end(self, endpoint: Endpoint) -> None:
+    def end(self, endpoint: Endpoint) -> None:
         """End a lease: close its port and forget its endpoint."""
         registry = self._context.registry
         if registry.by_port.get(endpoint.port) is endpoint:
+            self.close(endpoint)
             registry.remove(endpoint)
-            await self.close(endpoint)
+
+    async def retry_blocked(self) -> None:
+        """Take in ports of the range that other programs have let go."""
+        pool = self._context.registry.pool
+        before = pool.blocked_ports
+        still = self._context.bank.reserve(before)
+        for port in set(before) - set(still):
+            pool.unblock(port)
+            log.info("port %d of the range is free now", port)
 
     def is_open(self, endpoint: Endpoint) -> bool:
         """Whether an endpoint's port listens."""
@@ -82,7 +101,7 @@ class Leases:
     async def _admit_new(self, uri: str, node: HostPort, asker: Asker) -> Admission:
         place = await self._place(node, asker.address)
         try:
-            endpoint = await self._lease(uri, node, place, asker.address)
+            endpoint = self._lease(uri, node, place, asker.address)
         except RangeExhausted as error:
             self._context.metrics.exhausted.inc()
             self._context.problems.add(asker.caller_id, str(error))
@@ -103,7 +122,7 @@ class Leases:
         if endpoint.health.down or (known and asker.caller_id not in known):
             endpoint.health.suspect()
 
-    async def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+    def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         registry = self._context.registry
         try:
             return registry.admit(uri, node, place, source)
@@ -111,7 +130,7 @@ class Leases:
             oldest = registry.reclaimable()
             if oldest is None:
                 raise
-            await self.end(oldest)
+            self.end(oldest)
             return registry.admit(uri, node, place, source)
 
     async def _place(self, node: HostPort, source: str) -> Place:

@@ -6,7 +6,8 @@ from collections.abc import Awaitable, Callable
 from rosproxy.context import Context
 from rosproxy.core import master_api, xmlrpc
 from rosproxy.core.addressing import Asker
-from rosproxy.core.master_api import Admission, Answer, Request
+from rosproxy.core.master_api import Answer, Request
+from rosproxy.core.registry import Endpoint
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
 from rosproxy.upstream import Unreachable
@@ -44,7 +45,17 @@ class MasterService:
             return await self._context.upstream.master(request.body)
         await self._recovered()
         self._context.refresh_networks()
-        request.admissions = await self._admit_all(request)
+        try:
+            return await self._admit_and_forward(request)
+        finally:
+            for admission in request.admissions:
+                if isinstance(admission, Endpoint):
+                    admission.pending -= 1
+
+    async def _admit_and_forward(self, request: Request) -> bytes:
+        for call in request.calls:  # one after the other: they may register the same new node
+            admission = await self._leases.admit(call, request.asker) if call else None
+            request.admissions.append(admission)
         local = master_api.local_reply(request)
         if local is not None:
             return local
@@ -53,13 +64,6 @@ class MasterService:
         answer = master_api.read_answer(request, reply)
         self._note(answer)
         return master_api.import_answer(request, answer, self._context.addressing)
-
-    async def _admit_all(self, request: Request) -> list[Admission]:
-        """One after the other: several calls may register the same new node."""
-        return [
-            await self._leases.admit(call, request.asker) if call else None
-            for call in request.calls
-        ]
 
     def _note(self, answer: Answer) -> None:
         registry, now = self._context.registry, self._context.now()

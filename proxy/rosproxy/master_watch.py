@@ -73,11 +73,20 @@ class MasterWatch:
     async def _recover(self) -> None:
         self._context.refresh_networks()
         held, uris = await self._snapshot()
-        claims = recovery.claims(held, uris, self._context.addressing)
+        claims = await self._settled(recovery.claims(held, uris, self._context.addressing))
         endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
+
+    async def _settled(self, found: list[recovery.Claim]) -> list[recovery.Claim]:
+        """One claim per port: where several are made, the nodes themselves are asked first."""
+        asked = recovery.contested(found)
+        answers = await asyncio.gather(*(self._keeper.topics_at(claim) for claim in asked))
+        said = {found.index(c): topics for c, topics in zip(asked, answers, strict=True)}
+        for claim in asked:
+            log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
+        return recovery.settle(found, said)
 
     def _restore(self, claim: recovery.Claim) -> Endpoint | None:
         address = claim.address

@@ -73,7 +73,8 @@ class NodeClient:
     async def _topics(self, where: HostPort, method: str) -> frozenset[str]:
         rows = await self._upstream.ask_node(where, self._within, method)
         rows = rows if isinstance(rows, list) else []
-        return frozenset(row[0] for row in rows if isinstance(row, list) and row)
+        names = [row[0] for row in rows if isinstance(row, list) and row]
+        return frozenset(name for name in names if isinstance(name, str))
 
     async def _tcpros_port(self, where: HostPort, topics: list[str]) -> int | None:
         for topic in topics[:3]:

@@ -40,7 +40,7 @@ async def _probe(context: Context, port: int, host: str, advertised: int) -> str
     try:
         return await _dial(host, advertised, nonce)
     finally:
-        await acceptor.stop()
+        acceptor.stop()
         context.bank.close(port, acceptor.sock)
 
 

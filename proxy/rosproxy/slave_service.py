@@ -6,8 +6,10 @@ from urllib.parse import urlsplit
 from rosproxy.context import Context
 from rosproxy.core import slave_api, xmlrpc
 from rosproxy.core.liveness import Change, Probe
+from rosproxy.core.master_api import MULTICALL
+from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
-from rosproxy.core.slave_api import Visit
+from rosproxy.core.slave_api import TopicPort, Visit
 from rosproxy.core.uris import HostPort
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
@@ -29,6 +31,20 @@ class SlaveService:
         if endpoint is None:
             raise Unreachable(f"port {call.local.port} has no node any more")
         parsed = xmlrpc.parse_call(call.body)
+        if parsed.method != MULTICALL:
+            return await self._one(endpoint, parsed, call)
+        results = [await self._result(endpoint, inner, call) for inner in xmlrpc.multicall(parsed)]
+        return xmlrpc.multicall_reply(results)
+
+    async def _result(self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: Call) -> bytes:
+        """One result of a multicall, which is taken apart here: nodes get single calls only."""
+        if inner is None:
+            return xmlrpc.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
+        single = call.with_body(xmlrpc.single_call(inner))
+        reply = await self._one(endpoint, xmlrpc.parse_call(single.body), single)
+        return xmlrpc.multicall_result(reply)
+
+    async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
         if not await self._may(parsed.method, call.source):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
@@ -49,10 +65,18 @@ class SlaveService:
         reply = await self._ask(
             endpoint, slave_api.import_call(call.body, parsed, visit, addressing)
         )
-        topic = slave_api.topic_port(parsed, reply)
-        if topic is not None:
-            endpoint.topic_ports[topic.topic] = endpoint.tcpros_port = topic.port
+        self._note_port(endpoint, slave_api.topic_port(parsed, reply))
         return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    def _note_port(self, endpoint: Endpoint, said: TopicPort | None) -> None:
+        """Note a TCPROS port; by topic only for topics that the node has registered.
+
+        roscpp names its port for any topic, so anybody could have names remembered without end.
+        """
+        if said is not None:
+            endpoint.tcpros_port = said.port
+            if said.topic in endpoint.names(Kind.PUBLISHER):
+                endpoint.topic_ports[said.topic] = said.port
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         try:
@@ -68,7 +92,7 @@ class SlaveService:
         health, now = endpoint.health, self._context.now()
         if error.refused and health.note(error.probe, now) is Change.DOWN:
             log.info("%s is gone: %s", endpoint.label, error)
-            await self._leases.close(endpoint)
+            self._leases.close(endpoint)
 
     def _visit(self, endpoint: Endpoint, call: Call) -> Visit:
         reached = self._context.addressing.outside(endpoint.port)

@@ -6,16 +6,22 @@ import subprocess
 import sys
 
 import pytest
+
 from rosproxy.demo import cast
 from rosproxy.demo.__main__ import perform
 from rosproxy.demo.layout import detect, names_only
-from rosproxy.demo.screen import frame, summary
+from rosproxy.demo.screen import summary
 
 DEMO = [sys.executable, "-m", "rosproxy.demo", "--seconds", "4"]
 
 
+def finish(timeout, *options):
+    command = [*DEMO, *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+
 def test_the_short_demo_meets_every_expectation():
-    run = subprocess.run([*DEMO, "--json"], capture_output=True, text=True, timeout=60)
+    run = finish(60, "--json")
     outcome = json.loads(run.stdout)
     failed = [item for item in outcome["expectations"] if not item["met"]]
     assert (failed, outcome["log"]) == ([], [])
@@ -61,6 +67,6 @@ def _commands():
 
 
 def test_wrong_options_are_refused():
-    run = subprocess.run([*DEMO, "--seconds", "0"], capture_output=True, text=True, timeout=20)
+    run = finish(20, "--seconds", "0")
     assert run.returncode == 2
     assert "--seconds" in run.stderr

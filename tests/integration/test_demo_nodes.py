@@ -6,14 +6,17 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import pytest
+
 from rosproxy.demo import cast, layout, service, wire
 from rosproxy.demo.boundary import Boundary, within
 from rosproxy.demo.master import Master
 from rosproxy.demo.node import Node
-from rosproxy.demo.rpc import RosError, ask, call
+from rosproxy.demo.publisher import Publisher
+from rosproxy.demo.rpc import RosError, ask, call, split_address
+from rosproxy.demo.subscriber import Subscription
 
 FREE = Boundary()
 HERE = "127.0.0.1"
@@ -30,19 +33,16 @@ def eventually(condition, seconds=5.0):
 
 
 @pytest.fixture
-def closing():
+def master():
+    with closing(Master(HERE, FREE)) as running:
+        yield running
+
+
+@pytest.fixture
+def make_node(master):
+    """Make nodes that are closed after the test, which has to start each of them."""
     with ExitStack() as stack:
-        yield lambda thing: (stack.callback(thing.close), thing)[1]
-
-
-@pytest.fixture
-def master(closing):
-    return closing(Master(HERE, FREE))
-
-
-@pytest.fixture
-def make_node(closing, master):
-    return lambda name: closing(Node(name, master.uri, HERE, HERE, FREE))
+        yield lambda name: stack.enter_context(closing(Node(name, master.uri, HERE, HERE, FREE)))
 
 
 @pytest.fixture
@@ -75,8 +75,8 @@ def test_messages_arrive_in_order_and_are_counted_alike(talking):
     assert (session["peer"], session["first"], session["last"]) == ("/listener", 1, 200)
 
 
-def test_messages_without_a_subscriber_are_unheard(make_node):
-    publisher = make_node("/alone").advertise("/t")
+def test_messages_without_a_subscriber_are_unheard():
+    publisher = Publisher("/alone", "/t", wire.STRING)
     publish(publisher, 3)
     counts = publisher.to_json()
     assert (counts["published"], counts["unheard"], counts["sessions"]) == (3, 3, [])
@@ -98,32 +98,26 @@ def test_a_subscriber_retries_by_itself_when_its_connection_breaks(talking):
     assert [link["closed"] is None for link in links] == [False, True]
 
 
-def test_a_subscriber_follows_a_publisher_that_restarts(make_node):
+def test_a_subscriber_follows_a_publisher_that_restarts(make_node, master):
     listener = make_node("/listener")
     subscription = listener.subscribe("/t")
     listener.start()
     for _ in range(2):
-        talker = make_node("/talker")
-        publisher = talker.advertise("/t")
-        talker.start()
-        eventually(publisher.peers)
-        publish(publisher, 2)
-        eventually(lambda: subscription.to_json()["runs"][-1:] == [[1, 2]])
-        talker.close = talker.stopping.set if False else _once(talker.close)
-        talker.close()
+        talker = Node("/talker", master.uri, HERE, HERE, FREE)
+        with closing(talker):
+            publisher = talker.advertise("/t")
+            talker.start()
+            eventually(publisher.peers)
+            publish(publisher, 2)
+            eventually(lambda: subscription.to_json()["runs"][-1:] == [[1, 2]])
         eventually(lambda: not subscription.connected_to())
     assert subscription.to_json()["count"] == 4
 
 
-def _once(function):
-    done = []
-    return lambda: done or done.append(function())
-
-
-def test_a_publisher_out_of_reach_is_named_as_the_problem(make_node, master):
-    subscription = make_node("/listener").subscribe("/t")
-    subscription.update(["http://127.0.0.1:1/"])
-    eventually(lambda: "refused" in subscription.to_json()["problem"])
+def test_a_publisher_out_of_reach_is_named_as_the_problem():
+    with closing(Subscription("/listener", "/t", FREE)) as subscription:
+        subscription.update(["http://127.0.0.1:1/"])
+        eventually(lambda: "refused" in subscription.to_json()["problem"])
 
 
 def test_services_are_called_across_the_master(make_node, master):
@@ -184,7 +178,9 @@ def test_the_slave_api_answers(talking, master):
     _, _, talker = talking
     assert call(FREE, talker.uri, "getMasterUri", "/x")[2] == master.uri
     assert ["/t", "std_msgs/String"] in ask(FREE, talker.uri, "getPublications", "/x")
-    assert ask(FREE, talker.uri, "getBusInfo", "/x") == [[0, "/listener", "o", "TCPROS", "/t", True]]
+    assert ask(FREE, talker.uri, "getBusInfo", "/x") == [
+        [0, "/listener", "o", "TCPROS", "/t", True]
+    ]
     assert call(FREE, talker.uri, "requestTopic", "/x", "/no", [["TCPROS"]])[0] == -1
     assert call(FREE, talker.uri, "requestTopic", "/x", "/t", [["UDPROS"]])[0] == 0
     assert call(FREE, talker.uri, "getPid")[0] == -1
@@ -238,9 +234,10 @@ def connect_behind_the_wall(host, port):
 
 @separated
 def test_outside_reaches_outside_and_nothing_else():
-    with socket.create_server((layout.ROBOT, 0)) as near, socket.create_server(
-        (layout.INSIDE["talker"], 0)
-    ) as far:
+    with (
+        socket.create_server((layout.ROBOT, 0)) as near,
+        socket.create_server((layout.INSIDE["talker"], 0)) as far,
+    ):
         assert connect_behind_the_wall(layout.ROBOT, near.getsockname()[1]) == 0
         far_port = far.getsockname()[1]
         assert connect_behind_the_wall(layout.INSIDE["talker"], far_port) == errno.EHOSTUNREACH
@@ -249,17 +246,16 @@ def test_outside_reaches_outside_and_nothing_else():
 
 
 @separated
-def test_inside_turns_outside_away_and_takes_the_rest(closing, master):
+def test_inside_turns_outside_away_and_takes_the_rest(master):
     place = layout.separate().inside["talker"]
     free_to_leave = Boundary(accept_from=place.boundary.accept_from)
-    node = closing(Node("/t", master.uri, place.address, place.host, free_to_leave))
-    node.start()
-    port = int(node.uri.rpartition(":")[2].strip("/"))
     answers = {}
-    for source in (layout.ROBOT, layout.HOST, layout.INSIDE["listener"], HERE):
-        peer = (place.address, port)
-        with socket.create_connection(peer, 5, (source, 0)) as connection:
-            answers[source] = _answers(connection)
+    with closing(Node("/t", master.uri, place.address, place.host, free_to_leave)) as node:
+        node.start()
+        peer = (place.address, split_address(node.uri)[1])
+        for source in (layout.ROBOT, layout.HOST, layout.INSIDE["listener"], HERE):
+            with socket.create_connection(peer, 5, (source, 0)) as connection:
+                answers[source] = _answers(connection)
     assert answers == {
         layout.ROBOT: False,
         layout.HOST: False,

@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+
 from rosproxy.demo.tally import Evidence, count_stream, first_message_after, judge
 
 KILLED = 100.0

@@ -94,7 +94,13 @@ class Process:
             os.killpg(self.pid, number)
 
     def kill(self) -> None:
-        """SIGKILL, to the whole group, and reaps it."""
+        """SIGKILL, to it and to all that it has started, and reaps it.
+
+        roscore and roslaunch put every child into a process group of its own.
+        """
+        for pid in (self.pid, *descendants(self.pid)):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
         self.send(signal.SIGKILL)
         self._popen.wait()
 
@@ -111,6 +117,16 @@ class Process:
             self._popen.wait(patience)
         self.kill()
         return self._popen.wait()
+
+
+def descendants(pid: int) -> list[int]:
+    """The children of a process, their children, and so on."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            for child in map(int, task.read_text().split()):
+                found += [child, *descendants(child)]
+    return found
 
 
 def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> None:

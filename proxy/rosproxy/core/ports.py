@@ -68,6 +68,11 @@ class PortPool:
         """How many ports another program holds."""
         return len(self._blocked)
 
+    @property
+    def blocked_ports(self) -> list[int]:
+        """The ports that another program holds."""
+        return sorted(self._blocked)
+
     def take(self, prefer: int | None = None) -> int | None:
         """Take ``prefer`` if it is free, else the port that was free longest; None if none is."""
         if prefer is not None and prefer in self._free:
@@ -87,6 +92,11 @@ class PortPool:
         """Return a port that was taken."""
         if port not in self._blocked:
             self._free[port] = None
+
+    def unblock(self, port: int) -> None:
+        """Take a port back that another program has let go."""
+        self._blocked.discard(port)
+        self._free[port] = None
 
     def block(self, port: int) -> None:
         """Never hand out this port: another program on this machine holds it."""

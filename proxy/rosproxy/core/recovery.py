@@ -5,6 +5,7 @@ master, so what is found there is only a claim: the shell asks the node itself b
 (see `confirmed_by`).
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address
@@ -15,6 +16,7 @@ from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
 from rosproxy.core.uris import InsidePath, is_address, slave_uri
 
+NO_MERIT = -(10**9)
 _EVERYBODYS = frozenset({"/rosout"})
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
@@ -36,6 +38,11 @@ class Claim:
     def key(self) -> tuple[str, int]:
         """What the endpoint would be keyed by."""
         return self.address, self.inside.node.port
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics that the master has for it."""
+        return {held.name for held in self.registrations if held.kind is not Kind.SERVICE}
 
     @property
     def uri(self) -> str:
@@ -60,19 +67,38 @@ def registrations(state: Sequence[Any], types: Mapping[str, str]) -> dict[str, l
 def claims(
     held: Mapping[str, list[Registration]], uris: Mapping[str, str], addressing: Addressing
 ) -> list[Claim]:
-    """The endpoints of this proxy among the nodes of a master.
-
-    ``uris`` are the nodes' slave URIs. Of two claims to one port or one inside address the one
-    with the most registrations is kept; the other is a left-over.
-    """
+    """The endpoints of this proxy among the nodes of a master; ``uris`` are their slave URIs."""
     found: dict[str, Claim] = {}
     for node, uri in uris.items():
         ours = addressing.identify(uri)
         if ours:
             found.setdefault(uri, Claim(*ours)).registrations += held.get(node, [])
+    return list(found.values())
+
+
+def contested(found: Sequence[Claim]) -> list[Claim]:
+    """The claims that share their port or their inside address with another."""
+    ports, keys = Counter(c.port for c in found), Counter(c.key for c in found)
+    return [claim for claim in found if ports[claim.port] > 1 or keys[claim.key] > 1]
+
+
+def settle(found: Sequence[Claim], said: Mapping[int, frozenset[str] | None]) -> list[Claim]:
+    """One claim per port and inside address: the one that its node bears out best.
+
+    ``said`` gives, by index, the topics that the node there names; nothing or None where it was
+    not asked or gave no answer.
+    """
+
+    def merit(index: int) -> tuple[int, int]:
+        claim, topics = found[index], said.get(index)
+        if topics is None:
+            return NO_MERIT, len(claim.registrations)
+        return len(claim.topics & topics) - len(claim.topics - topics), len(claim.registrations)
+
     ports: dict[int, Claim] = {}
     keys: set[tuple[str, int]] = set()
-    for claim in sorted(found.values(), key=lambda claim: -len(claim.registrations)):
+    for index in sorted(range(len(found)), key=merit, reverse=True):
+        claim = found[index]
         if claim.port not in ports and claim.key not in keys:
             ports[claim.port] = claim
             keys.add(claim.key)

@@ -69,6 +69,7 @@ class Endpoint:
     topic_ports: dict[str, int] = field(default_factory=dict)
     tcpros_port: int | None = None
     connections: int = 0
+    pending: int = 0
     idle_since: float | None = None
     trusted: bool = True
     health: Health = field(default_factory=Health)
@@ -105,8 +106,8 @@ class Endpoint:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is registered and nobody is connected."""
-        return not self.registrations and not self.connections
+        """Whether nothing is registered, nobody is connected and no call is under way."""
+        return not (self.registrations or self.connections or self.pending)
 
 
 class Registry:

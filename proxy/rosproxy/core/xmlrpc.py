@@ -251,6 +251,42 @@ def multicall_items(call: Call) -> list[Value]:
     return call.params[0].items
 
 
+def single_call(call: Call) -> bytes:
+    """One call of a multicall as a document of its own, its parameters as they were sent."""
+    params = b"".join(b"<param>" + value.raw + b"</param>" for value in call.params)
+    name = escape(call.method).encode()
+    return (
+        b"<?xml version='1.0'?><methodCall><methodName>" + name + b"</methodName>"
+        b"<params>" + params + b"</params></methodCall>"
+    )
+
+
+def multicall_result(reply: bytes) -> bytes:
+    """A reply as ``system.multicall`` returns it: a one-element array, or a bare fault struct.
+
+    Raises XmlRpcError if it is no XML-RPC response.
+    """
+    parser = _Parser(reply, DEFAULT_LIMITS)
+    if parser.root != "methodResponse" or len(parser.values) != 1:
+        raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
+    raw = parser.values[0].raw
+    return raw if parser.fault else array_value([raw])
+
+
+def array_value(items: Iterable[bytes]) -> bytes:
+    """An array of raw values."""
+    return b"<value><array><data>" + b"".join(items) + b"</data></array></value>"
+
+
+def multicall_reply(results: Iterable[bytes]) -> bytes:
+    """The ``methodResponse`` of a multicall from its results, each a raw value."""
+    return (
+        b"<?xml version='1.0'?><methodResponse><params><param>"
+        + array_value(results)
+        + b"</param></params></methodResponse>"
+    )
+
+
 def insert_items(reply: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edit]:
     """Edits that insert raw values into an array of at least one item.
 

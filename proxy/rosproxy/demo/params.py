@@ -52,7 +52,8 @@ class ParamTree:
         return True
 
     def set(self, key: str, value: Any) -> None:
-        """Set `key`, and replace whatever was at or below it; raises TypeError for the root."""
+        """Set `key` to a copy of `value`, replacing all below it; raises TypeError for the root."""
+        value = copy.deepcopy(value)
         parts = _parts(key)
         if not parts:
             self._set_root(value)

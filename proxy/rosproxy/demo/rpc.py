@@ -33,6 +33,9 @@ class _Handler(SimpleXMLRPCRequestHandler):
     # One segment for header and body: unbuffered, they would go out as several.
     wbufsize = -1
 
+    def log_message(self, *_: object) -> None:
+        """Keep malformed requests off the terminal: the table is there."""
+
 
 class RpcServer(ThreadingMixIn, SimpleXMLRPCServer):
     """An XML-RPC server, one thread for each connection, on a free port of one address."""

@@ -1,0 +1,180 @@
+"""Nodes end, die, hang and come back; the master and the ports always tell the truth."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+
+from tests.ros.combinations import LIBRARIES, each_library, each_pair
+from tests.ros.lab import Lab
+from tests.ros.processes import Process, wait_until
+
+PROXY_OPTIONS = (
+    *("--probe-interval", "0.5", "--probe-timeout", "1"),
+    *("--cleanup-after", "3", "--linger", "2", "--master-interval", "0.5"),
+)
+
+ROLES = {"publisher": "pub", "subscriber": "sub", "server": "serve"}
+each_role = pytest.mark.parametrize("role", ROLES.values(), ids=ROLES.keys())
+
+
+def start(lab: Lab, library: str, role: str, where: str = "c1", name: str = "") -> tuple[Process, str]:
+    """A registered node of that role, and its name."""
+    name = name or lab.unique("mortal")
+    names = {"serve": {"service": f"/{name}/service"}}.get(role, {"topic": f"/{name}/topic"})
+    node = lab.node(library, where, role, name=name, **names)
+    node.wait_for("^ready")
+    lab.wait_registered(name)
+    return node, name
+
+
+def port_of(lab: Lab, name: str) -> int:
+    """The port under which outside sees the node."""
+    uri = lab.node_uri(name)
+    assert uri is not None
+    return int(uri.split(":")[2].split("/")[0])
+
+
+def refuses(lab: Lab, port: int) -> bool:
+    """Whether a connection from outside to that port of the host is refused."""
+    address = (lab.place("host").address, port)
+    with lab.place("out").entered():
+        try:
+            socket.create_connection(address, timeout=1).close()
+        except ConnectionRefusedError:
+            return True
+    return False
+
+
+@each_role
+@each_library
+def test_a_node_ended_by_sigint_leaves_nothing(lab: Lab, library: str, role: str) -> None:
+    node, name = start(lab, library, role)
+    port = None if lab.flat else port_of(lab, name)
+    assert node.stop(signal.SIGINT) == 0
+    lab.wait_unregistered(name, timeout=2)
+    if port:
+        wait_until("the port refuses", lambda: refuses(lab, port), timeout=6)
+
+
+@pytest.mark.boundary
+@each_role
+@each_library
+def test_a_node_ended_by_sigkill_is_cleaned_up(
+    lab: Lab, library: str, role: str, measure
+) -> None:
+    node, name = start(lab, library, role)
+    port = port_of(lab, name)
+    node.kill()
+    wait_until("the port refuses", lambda: refuses(lab, port), timeout=4)
+    lab.wait_unregistered(name, timeout=10)
+    assert lab.node_uri(name) is None
+
+
+@pytest.mark.boundary
+@each_library
+def test_a_stopped_node_that_goes_on_is_registered_and_served_again(
+    lab: Lab, library: str
+) -> None:
+    node, name = start(lab, library, "pub")
+    node.send(signal.SIGSTOP)
+    lab.wait_unregistered(name, timeout=12)
+    node.send(signal.SIGCONT)
+    lab.wait_registered(name, timeout=8)
+    for listener in LIBRARIES:
+        lab.node(listener, "out", "sub", topic=f"/{name}/topic").wait_for_count("^got ", 3)
+    assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
+
+
+@pytest.mark.boundary
+@each_library
+def test_a_stopped_subscriber_and_server_are_served_again(lab: Lab, library: str) -> None:
+    subscriber, sub_name = start(lab, library, "sub")
+    server, srv_name = start(lab, library, "serve")
+    for node in (subscriber, server):
+        node.send(signal.SIGSTOP)
+    for name in (sub_name, srv_name):
+        lab.wait_unregistered(name, timeout=12)
+    for node in (subscriber, server):
+        node.send(signal.SIGCONT)
+    lab.wait_registered(srv_name, timeout=8)
+    lab.node(library, "out", "call", service=f"/{srv_name}/service").wait_for("^reply ask 0 ")
+    lab.wait_registered(sub_name, timeout=8)
+    lab.node(library, "out", "pub", topic=f"/{sub_name}/topic")
+    subscriber.wait_for_count("^got ", 3)
+
+
+@pytest.mark.boundary
+@each_library
+def test_a_short_hang_is_nobodys_loss(lab: Lab, library: str) -> None:
+    """Shorter than the clean-up time: no registration and no connection is lost."""
+    node, name = start(lab, library, "pub")
+    port = port_of(lab, name)
+    receiver = lab.node(library, "out", "sub", topic=f"/{name}/topic")
+    receiver.wait_for_count("^got ", 3)
+    node.send(signal.SIGSTOP)
+    with pytest.raises(AssertionError):
+        lab.wait_unregistered(name, timeout=1.5)
+    node.send(signal.SIGCONT)
+    receiver.wait_for_count("^got ", 3, since=receiver.mark())
+    assert port_of(lab, name) == port
+
+
+WAYS_TO_END = {"after-sigint": signal.SIGINT, "after-sigkill": signal.SIGKILL, "while-it-lives": None}
+
+
+@pytest.mark.parametrize("way", WAYS_TO_END.values(), ids=WAYS_TO_END.keys())
+@pytest.mark.parametrize("where", ["c1", "c2"], ids=["same-address", "another-address"])
+@each_pair("library", "peer")
+def test_a_restart_under_the_same_name(
+    lab: Lab, library: str, peer: str, where: str, way: signal.Signals | None
+) -> None:
+    """Peers outside that were connected before hear the new node, and can call it."""
+    name = lab.unique("phoenix")
+    topic = f"/{name}/topic"
+    old = lab.node(library, "c1", "pub", name=name, topic=topic, word="old")
+    receiver = lab.node(peer, "out", "sub", topic=topic)
+    receiver.wait_for("^got old ")
+    if way is signal.SIGINT:
+        assert old.stop() == 0
+    elif way is signal.SIGKILL:
+        old.kill()
+    new = lab.node(library, where, "pub", name=name, topic=topic, word="new")
+    receiver.wait_for_count("^got new ", 3)
+    if way is None:
+        old.wait(timeout=8)
+    assert f"Pid: {new.pid}" in lab.run("out", "rosnode", "info", name).output
+
+
+@each_library
+@pytest.mark.parametrize("where", ["c1", "c2"], ids=["same-address", "another-address"])
+def test_a_server_killed_and_restarted_under_the_same_name(
+    lab: Lab, library: str, where: str
+) -> None:
+    old, name = start(lab, library, "serve")
+    lab.node("roscpp", "out", "call", service=f"/{name}/service").wait_for("^reply ask 0 ")
+    old.kill()
+    new, _ = start(lab, library, "serve", where, name)
+    for caller in ("out", "c2"):
+        client = lab.node(library, caller, "call", service=f"/{name}/service", size=999)
+        client.wait_for("^reply ask 0 size 999 ")
+    new.wait_for_count("^request ask 0 size 999 ", 2)
+
+
+@pytest.mark.boundary
+def test_twenty_nodes_leave_no_descriptor_in_the_proxy(lab: Lab) -> None:
+    assert lab.proxy is not None
+    descriptors = Path(f"/proc/{lab.proxy.pid}/fd")
+    before = len(list(descriptors.iterdir()))
+    nodes = [start(lab, "roscpp", "pub") for _ in range(20)]
+    receivers = [lab.node("roscpp", "out", "sub", topic=f"/{name}/topic") for _, name in nodes]
+    for receiver in receivers:
+        receiver.wait_for("^got ")
+    assert len(list(descriptors.iterdir())) > before + 40
+    lab.stop_nodes()
+    wait_until(
+        "as few descriptors as before", lambda: len(list(descriptors.iterdir())) <= before, 15
+    )

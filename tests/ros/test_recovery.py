@@ -1,0 +1,213 @@
+"""Proxy killed and restarted, roscore killed and restarted: the nodes just go on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import pytest
+
+from tests.ros.combinations import LIBRARIES, each_direction, each_library, each_pair
+from tests.ros.lab import Lab
+from tests.ros.processes import Process
+
+pytestmark = pytest.mark.boundary
+
+HARD_LIMIT = 10.0
+"""Seconds; what was measured is in the report, far below."""
+
+Measure = Callable[[str, float], None]
+
+
+def restart_proxy(lab: Lab) -> float:
+    """Kills the proxy with SIGKILL and starts it again; gives the time of the start."""
+    assert lab.proxy is not None
+    lab.proxy.kill()
+    started = time.time()
+    lab.start_proxy()
+    return started
+
+
+def restart_master(lab: Lab) -> float:
+    """Kills roscore with SIGKILL and starts it again; gives the time when it served."""
+    assert lab.master is not None
+    lab.master.kill()
+    lab.start_master()
+    return time.time()
+
+
+def next_time(process: Process, pattern: str, started: float) -> float:
+    """Seconds from `started` to the first matching line that was printed after it."""
+    deadline = time.monotonic() + HARD_LIMIT
+    while time.monotonic() < deadline:
+        lines = process.wait_for_count(rf"{pattern}.* at ([\d.]+)$", 1, HARD_LIMIT)
+        later = [float(line[1]) for line in lines if float(line[1]) > started]
+        if later:
+            return later[0] - started
+        time.sleep(0.02)
+    raise AssertionError(f"{process.title} has printed nothing since:\n{process.output()[-3000:]}")
+
+
+@each_direction
+@each_pair("publisher", "subscriber")
+def test_messages_flow_again_after_the_proxy_was_killed(
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, measure: Measure
+) -> None:
+    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    sender = lab.node(publisher, source, "pub", name=name, topic=topic, rate=100)
+    receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    receiver.wait_for_count("^got ", 5)
+    uri = lab.node_uri(name)
+    started = restart_proxy(lab)
+    measure("topic, proxy restarted", next_time(receiver, "^got ", started))
+    assert lab.node_uri(name) == uri
+    late = lab.node(subscriber, sink, "sub", topic=topic)
+    late.wait_for_count("^got ", 5, HARD_LIMIT)
+    assert sender.returncode is None
+
+
+@each_direction
+@each_pair("server", "client")
+def test_calls_are_answered_again_after_the_proxy_was_killed(
+    lab: Lab, server: str, client: str, source: str, sink: str, measure: Measure
+) -> None:
+    service = f"/{lab.unique('service')}"
+    lab.node(server, source, "serve", service=service)
+    caller = lab.node(client, sink, "call", service=service, rate=50, count=100000)
+    caller.wait_for_count("^reply ", 5)
+    started = restart_proxy(lab)
+    measure("service, proxy restarted", next_time(caller, "^reply ", started))
+    late = lab.node(client, sink, "call", service=service)
+    late.wait_for("^reply ", HARD_LIMIT)
+
+
+@each_pair("publisher", "subscriber")
+def test_subscribers_from_before_hear_publishers_from_after(
+    lab: Lab, publisher: str, subscriber: str
+) -> None:
+    """The master's publisherUpdate reaches inside nodes through the restarted proxy."""
+    topic = f"/{lab.unique('topic')}"
+    receivers = [lab.node(subscriber, role, "sub", topic=topic) for role in ("c1", "out")]
+    for receiver in receivers:
+        receiver.wait_for("^ready")
+    restart_proxy(lab)
+    for role in ("c1", "out"):
+        lab.node(publisher, role, "pub", topic=topic, word=f"from-{role}")
+    for receiver in receivers:
+        for role in ("c1", "out"):
+            receiver.wait_for_count(f"^got from-{role} ", 3, HARD_LIMIT)
+
+
+@each_library
+def test_nodes_keep_their_ports_and_can_be_ended_after_a_restart(lab: Lab, library: str) -> None:
+    names = [lab.unique("kept") for _ in range(4)]
+    nodes = [
+        lab.node(library, where, "pub", name=name, topic=f"/{name}/topic")
+        for name, where in zip(names, ("c1", "c1", "c2", "c2"), strict=True)
+    ]
+    for name in names:
+        lab.wait_registered(name)
+    before = {name: lab.node_uri(name) for name in names}
+    restart_proxy(lab)
+    assert {name: lab.node_uri(name) for name in names} == before
+    for name, node in zip(names, nodes, strict=True):
+        assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
+    lab.run("out", "rosnode", "kill", *names[:2])
+    for node in nodes[:2]:
+        node.wait(timeout=5)
+    for node in nodes[2:]:
+        assert node.stop() == 0
+    for name in names:
+        lab.wait_unregistered(name, timeout=5)
+
+
+def test_a_new_node_after_a_restart_gets_a_port_of_its_own(lab: Lab) -> None:
+    names = [lab.unique("port") for _ in range(3)]
+    for name in names[:2]:
+        lab.node("roscpp", "c1", "pub", name=name, topic=f"/{name}/topic", word=name)
+        lab.wait_registered(name)
+    restart_proxy(lab)
+    lab.node("roscpp", "c1", "pub", name=names[2], topic=f"/{names[2]}/topic", word=names[2])
+    lab.wait_registered(names[2])
+    assert len({lab.node_uri(name) for name in names}) == 3
+    for name in names:
+        receiver = lab.node("roscpp", "out", "sub", topic=f"/{name}/topic")
+        receiver.wait_for_count(f"^got {name} ", 3)
+
+
+def test_a_node_that_died_while_the_proxy_was_away_is_not_served(lab: Lab) -> None:
+    name = lab.unique("gone")
+    node = lab.node("roscpp", "c1", "pub", name=name, topic=f"/{name}/topic")
+    lab.wait_registered(name)
+    assert lab.proxy is not None
+    lab.proxy.kill()
+    node.kill()
+    lab.start_proxy()
+    output = lab.run("out", "sh", "-c", "yes | rosnode cleanup").output
+    assert f" * /{name}\n" in output
+    assert not lab.registered(name)
+
+
+@each_library
+def test_inside_nodes_are_registered_again_after_roscore_was_killed(
+    lab: Lab, library: str, measure: Measure
+) -> None:
+    word = lab.unique("again")
+    names = {role: f"{word}_{role}" for role in ("pub", "sub", "serve")}
+    lab.node(library, "c1", "pub", name=names["pub"], topic=f"/{word}/from")
+    receiver = lab.node(library, "c1", "sub", name=names["sub"], topic=f"/{word}/to")
+    lab.node(library, "c2", "serve", name=names["serve"], service=f"/{word}/s")
+    for name in names.values():
+        lab.wait_registered(name)
+    before = {name: lab.node_uri(name) for name in names.values()}
+    served = restart_master(lab)
+    for name in names.values():
+        lab.wait_registered(name, HARD_LIMIT)
+    measure("registered again, roscore restarted", time.time() - served)
+    assert {name: lab.node_uri(name) for name in names.values()} == before
+    for peer in LIBRARIES:
+        lab.node(peer, "out", "sub", topic=f"/{word}/from").wait_for_count("^got ", 3)
+        lab.node(peer, "out", "call", service=f"/{word}/s").wait_for("^reply ")
+        lab.node(peer, "out", "pub", topic=f"/{word}/to", word=f"new-{peer}")
+        receiver.wait_for_count(f"^got new-{peer} ", 3)
+
+
+@each_library
+def test_inside_nodes_hear_each_other_all_the_time_while_roscore_is_away(
+    lab: Lab, library: str
+) -> None:
+    topic = f"/{lab.unique('topic')}"
+    lab.node(library, "c1", "pub", topic=topic)
+    receiver = lab.node(library, "c2", "sub", topic=topic)
+    receiver.wait_for_count("^got ", 3)
+    assert lab.master is not None
+    lab.master.kill()
+    receiver.wait_for_count("^got ", 10, since=receiver.mark())
+    lab.start_master()
+    receiver.wait_for_count("^got ", 10, since=receiver.mark())
+
+
+@each_library
+def test_roscore_and_proxy_restarted_one_after_the_other(lab: Lab, library: str) -> None:
+    name = lab.unique("survivor")
+    lab.node(library, "c1", "pub", name=name, topic=f"/{name}/topic")
+    lab.wait_registered(name)
+    restart_master(lab)
+    lab.wait_registered(name, HARD_LIMIT)
+    restart_proxy(lab)
+    lab.node(library, "out", "sub", topic=f"/{name}/topic").wait_for_count("^got ", 3)
+
+
+@each_library
+def test_everything_started_before_roscore(lab: Lab, library: str) -> None:
+    """The proxy starts without a master; nodes wait for it, as they do without a proxy."""
+    assert lab.master is not None
+    assert lab.proxy is not None
+    lab.proxy.kill()
+    lab.master.kill()
+    lab.start_proxy()
+    topic = f"/{lab.unique('early')}"
+    lab.node(library, "c1", "pub", topic=topic)
+    receiver = lab.node(library, "out", "sub", topic=topic)
+    lab.start_master()
+    receiver.wait_for_count("^got ", 3, timeout=20)

@@ -1,0 +1,204 @@
+"""Documents as rospy and XmlRpc++ write them, and small inside worlds to rewrite them for."""
+
+import xmlrpc.client
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from ipaddress import ip_network
+from typing import Any
+from xml.sax.saxutils import escape
+
+from rosproxy.core import master_api
+from rosproxy.core.addressing import Addressing, Asker
+from rosproxy.core.master_api import Admission, Noted, Refusal
+from rosproxy.core.methods import Kind
+from rosproxy.core.ports import PortMap, PortRange
+from rosproxy.core.registry import Endpoint, Place, Registration, Registry
+from rosproxy.core.uris import HostPort, parse_slave_uri, slave_uri
+
+HOST = "robot-host"
+PROXY = "10.0.0.1"
+MASTER = f"{PROXY}:11311"
+
+
+def py_call(method: str, *params: Any) -> bytes:
+    """A call as rospy and the tools send it."""
+    return xmlrpc.client.dumps(params, method).encode()
+
+
+def py_reply(value: Any) -> bytes:
+    """A reply as rosmaster and rospy send it."""
+    return xmlrpc.client.dumps((value,), methodresponse=True).encode()
+
+
+def cpp_value(value: Any) -> str:
+    """XmlRpcValue::toXml: untyped strings, <i4>, no white space."""
+    if isinstance(value, bool):
+        return f"<value><boolean>{value:d}</boolean></value>"
+    if isinstance(value, int):
+        return f"<value><i4>{value}</i4></value>"
+    if isinstance(value, float):
+        return f"<value><double>{value!r}</double></value>"
+    if isinstance(value, str):
+        text = escape(value, {"'": "&apos;", '"': "&quot;"})
+        return f"<value>{text}</value>"
+    if isinstance(value, list | tuple):
+        items = "".join(map(cpp_value, value))
+        return f"<value><array><data>{items}</data></array></value>"
+    members = (f"<member><name>{name}</name>{cpp_value(v)}</member>" for name, v in value.items())
+    return f"<value><struct>{''.join(members)}</struct></value>"
+
+
+def cpp_call(method: str, *params: Any) -> bytes:
+    """A call as roscpp sends it (XmlRpcClient::generateRequest)."""
+    inside = "".join(f"<param>{cpp_value(param)}</param>" for param in params)
+    return (
+        f'<?xml version="1.0"?>\r\n<methodCall><methodName>{method}</methodName>\r\n'
+        f"<params>{inside}</params></methodCall>\r\n"
+    ).encode()
+
+
+def cpp_reply(value: Any) -> bytes:
+    """A reply as roscpp sends it (XmlRpcServerConnection::generateResponse)."""
+    return (
+        '<?xml version="1.0"?>\r\n<methodResponse><params><param>\r\n\t'
+        f"{cpp_value(value)}\r\n</param></params></methodResponse>\r\n"
+    ).encode()
+
+
+def raw_call(*values: str, method: str = "m", encoding: str = "utf-8") -> bytes:
+    """A call around ``<value>`` elements given as text."""
+    params = "".join(f"<param>{value}</param>" for value in values)
+    return (
+        f"<?xml version='1.0' encoding='{encoding}'?><methodCall><methodName>{method}</methodName>"
+        f"<params>{params}</params></methodCall>"
+    ).encode(encoding)
+
+
+DIALECTS = {"rospy": (py_call, py_reply), "roscpp": (cpp_call, cpp_reply)}
+"""How each client library writes calls and replies."""
+
+
+def decoded(body: bytes) -> tuple[Any, str | None]:
+    """What Python's own decoder makes of a document: its values and the method's name."""
+    values, method = xmlrpc.client.loads(body)
+    return values, method
+
+
+def python_values(body: bytes) -> Any:
+    """The same without the method's name, dates and binaries made comparable."""
+    return comparable(decoded(body)[0])
+
+
+def comparable(value: Any) -> Any:
+    """A value with xmlrpc.client's DateTime and Binary turned into types that compare."""
+    if isinstance(value, list | tuple):
+        return [comparable(item) for item in value]
+    if isinstance(value, dict):
+        return {name: comparable(item) for name, item in value.items()}
+    if isinstance(value, xmlrpc.client.Binary):
+        return value.data
+    if isinstance(value, xmlrpc.client.DateTime):
+        return datetime.strptime(value.value, "%Y%m%dT%H:%M:%S")  # noqa: DTZ007 - has no zone
+    return value
+
+
+def make_addressing(
+    host: str = HOST,
+    listen: tuple[int, int] = (45000, 45009),
+    advertise: tuple[int, int] | None = None,
+    networks: Sequence[str] = ("10.0.0.0/24",),
+) -> Addressing:
+    """The addressing of a proxy that knows no node yet."""
+    ports = PortMap(PortRange(*listen), PortRange(*(advertise or listen)))
+    return Addressing(Registry(ports.listen), host, ports, tuple(map(ip_network, networks)))
+
+
+def make_asker(address: str, proxy: str = PROXY, **more: Any) -> Asker:
+    """A caller at an inside address."""
+    return Asker(address, proxy, **more)
+
+
+def add_node(
+    addressing: Addressing,
+    uri: str = "http://10.0.0.5:40001/",
+    address: str | None = None,
+    named: bool | None = None,
+    confirmed: bool = True,
+) -> Endpoint:
+    """Admit a node; its ``address`` is the host in its URI unless given."""
+    node = parse_slave_uri(uri)
+    assert node
+    place = Place(address or node.host, named if named is not None else address is None, confirmed)
+    return addressing.registry.admit(uri, node, place, place.address)
+
+
+def add_registration(
+    addressing: Addressing, endpoint: Endpoint, kind: Kind, name: str, caller_id: str = "/talker"
+) -> Registration:
+    """Register something for an endpoint; a service at port 50001 of the node's host."""
+    api = f"rosrpc://{HostPort(endpoint.node.host, 50001)}" if kind is Kind.SERVICE else None
+    held = Registration(kind, name, caller_id, "std_msgs/String", api, 1.0)
+    addressing.registry.register(endpoint, held)
+    return held
+
+
+@dataclass
+class Exchange:
+    """A call of an inside node: what the master got, what the node got back, what was learned."""
+
+    sent: bytes
+    received: bytes
+    facts: list[Noted] = field(default_factory=list)
+
+
+Refuse = Callable[[str], bool]
+
+
+def exchange(
+    addressing: Addressing,
+    asker: Asker,
+    body: bytes,
+    reply: bytes,
+    refuse: Refuse = lambda uri: False,
+) -> Exchange:
+    """What the shell does with a call: admit, export, ask the master, note, import."""
+    request = master_api.read_request(body, asker)
+    request.admissions = [
+        _admit(addressing, master_api.registering_uri(call), asker, refuse)
+        for call in request.calls
+    ]
+    local = master_api.local_reply(request)
+    if local is not None:
+        return Exchange(b"", local)
+    sent = master_api.export_request(request, addressing)
+    answer = master_api.read_answer(request, reply)
+    facts = master_api.noted(answer, 7.0)
+    for fact in facts:
+        note(addressing.registry, fact)
+    return Exchange(sent, master_api.import_answer(request, answer, addressing), facts)
+
+
+def note(registry: Registry, fact: Noted) -> None:
+    """Take a fact into the registry."""
+    held = fact.registration
+    if fact.endpoint:
+        registry.register(fact.endpoint, held)
+    else:
+        registry.unregister(held.kind, held.name, held.caller_id)
+
+
+def _admit(addressing: Addressing, uri: str | None, asker: Asker, refuse: Refuse) -> Admission:
+    node = parse_slave_uri(uri) if uri else None
+    if uri is None or node is None:
+        return None
+    if refuse(uri):
+        return Refusal("rosproxy: no port is left")
+    named = node.host.startswith("10.")
+    place = Place(node.host if named else asker.address, named)
+    return addressing.registry.admit(uri, node, place, asker.address)
+
+
+def own_uri(address: str, port: int = 40001) -> str:
+    """The slave URI of a node that gives its address."""
+    return slave_uri(HostPort(address, port))
