@@ -1,0 +1,134 @@
+"""Text for a terminal: harmless whatever it holds, and as wide as it looks."""
+
+import textwrap
+import unicodedata
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
+
+GAP = "  "
+_TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
+_UNITS = ("B", "kB", "MB", "GB", "TB")
+
+
+def clean(text: object) -> str:
+    """A text with everything escaped that could move the cursor, hide or reorder other text.
+
+    Node and topic names are whatever a node says they are.
+    """
+    return "".join(c if c.isprintable() else _escaped(c) for c in str(text))
+
+
+def width(text: str) -> int:
+    """How many columns a clean text takes: East Asian characters two, combining marks none."""
+    if text.isascii():
+        return len(text)
+    return sum(_columns(c) for c in text)
+
+
+def shorten(text: str, most: int) -> str:
+    """The text in at most ``most`` columns: its middle left out, since both ends tell names apart."""
+    if width(text) <= most:
+        return text
+    room = max(most - 1, 0)
+    tail = _head(text[::-1], room // 2)[::-1]
+    return f"{_head(text, room - width(tail))}…{tail}"
+
+
+def pad(text: str, columns: int, right: bool = False) -> str:
+    """The text filled up with spaces, on its left if it is to stand ``right``."""
+    space = " " * (columns - width(text))
+    return space + text if right else text + space
+
+
+def wrap(text: str, columns: int, indent: str, first: str = "") -> list[str]:
+    """Lines of at most ``columns``, led by ``indent``; the first one by ``first`` if given.
+
+    Words stay whole, even those that are too long for a line: they may be commands to copy.
+    """
+    return textwrap.wrap(
+        text,
+        max(columns, width(indent) + 20),
+        initial_indent=first or indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def table(rows: Sequence[Sequence[str]], columns: int, flexible: int, least: int = 8) -> list[str]:
+    """Lines of a table with a heading in its first row, fitted into ``columns``.
+
+    The first ``flexible`` cells of a row stand left and are shortened where the table is too
+    wide, down to ``least``; the others stand right and keep their width.
+    """
+    widths = [max(map(width, cells)) for cells in zip_longest(*rows, fillvalue="")]
+    excess = sum(widths) + len(GAP) * (len(widths) - 1) - columns
+    widths[:flexible] = _narrowed(widths[:flexible], excess, least)
+    return [_line(row, widths, flexible) for row in rows]
+
+
+def duration(seconds: float) -> str:
+    """A time in its two largest units: ``0.4 s``, ``12 s``, ``3 min``, ``2 h 5 min``."""
+    if seconds < 10:
+        return f"{max(seconds, 0.0):.1f} s"
+    size, unit = next(row for row in _TIMES if seconds >= row[0])
+    count, rest = divmod(seconds, size)
+    below = dict(zip(_TIMES, _TIMES[1:], strict=False)).get((size, unit))
+    minor = int(rest // below[0]) if below and unit != "min" else 0
+    return f"{count:.0f} {unit}" + (f" {minor} {below[1]}" if below and minor else "")
+
+
+def size(count: float) -> str:
+    """A number of bytes: ``812 B``, ``1.5 kB``."""
+    unit = 0
+    while count >= 999.5 and unit < len(_UNITS) - 1:
+        count, unit = count / 1000, unit + 1
+    return f"{count:.1f} {_UNITS[unit]}" if 0 < count < 99.95 and unit else f"{count:.0f} {_UNITS[unit]}"
+
+
+def plural(count: int, word: str) -> str:
+    """``1 port``, ``2 ports``."""
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def listed(items: Iterable[str], most: int = 5) -> str:
+    """The first few items, and how many more there are."""
+    every = list(items)
+    more = len(every) - most
+    return ", ".join(every[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def _columns(character: str) -> int:
+    if unicodedata.combining(character):
+        return 0
+    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def _head(text: str, room: int) -> str:
+    end = 0
+    for end, character in enumerate(text):
+        room -= _columns(character)
+        if room < 0:
+            return text[:end]
+    return text
+
+
+def _narrowed(widths: list[int], excess: int, least: int) -> list[int]:
+    """Take ``excess`` columns off, each from the widest cell."""
+    widths = list(widths)
+    while excess > 0 and max(widths, default=0) > least:
+        widths[widths.index(max(widths))] -= 1
+        excess -= 1
+    return widths
+
+
+def _line(row: Sequence[str], widths: Sequence[int], flexible: int) -> str:
+    cells = [
+        pad(shorten(cell, columns), columns, right=index >= flexible)
+        for index, (cell, columns) in enumerate(zip(row, widths, strict=False))
+    ]
+    return GAP.join(cells).rstrip()

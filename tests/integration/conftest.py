@@ -1,0 +1,104 @@
+"""Fixtures: a master, nodes and proxies, all closed at the end."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.integration.master import Master
+from tests.integration.net import NODE
+from tests.integration.node import Node
+from tests.integration.process import Process
+from tests.integration.proxy import Proxy, settings_for
+
+MakeProxy = Callable[..., Awaitable[Proxy]]
+MakeNode = Callable[..., Awaitable[Node]]
+
+
+def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Both event loops that users have: uvloop is optional."""
+    factories: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {
+        "asyncio": asyncio.new_event_loop
+    }
+    try:
+        import uvloop
+    except ImportError:
+        return factories
+    return factories | {"uvloop": uvloop.new_event_loop}
+
+
+@pytest.fixture(autouse=True)
+def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
+    """No test may leave a traceback in the log, whatever it did to the proxy."""
+    yield
+    for phase in ("setup", "call", "teardown"):
+        for record in caplog.get_records(phase):  # type: ignore[arg-type]
+            assert not record.exc_info, f"a traceback in the log: {record.getMessage()}"
+            assert record.name.startswith("rosproxy") or record.levelno < logging.ERROR, record
+
+
+@pytest.fixture
+async def master() -> AsyncIterator[Master]:
+    """A ROS master outside."""
+    made = Master()
+    await made.start()
+    yield made
+    await made.stop()
+
+
+@pytest.fixture
+async def make_proxy(master: Master) -> AsyncIterator[MakeProxy]:
+    """Starts proxies in this process, for the master unless told otherwise."""
+    made: list[Proxy] = []
+
+    async def make(**options: Any) -> Proxy:
+        proxy = Proxy(settings_for(**{"master_uri": master.uri, **options}))
+        made.append(proxy)
+        await proxy.start()
+        return proxy
+
+    yield make
+    await asyncio.gather(*(proxy.stop() for proxy in made))
+
+
+@pytest.fixture
+async def proxy(make_proxy: MakeProxy) -> Proxy:
+    """A proxy in this process."""
+    return await make_proxy()
+
+
+@pytest.fixture
+async def make_node() -> AsyncIterator[MakeNode]:
+    """Starts inside nodes."""
+    made: list[Node] = []
+
+    async def make(name: str = "/talker", address: str = NODE, host: str = "") -> Node:
+        node = Node(name, address, host)
+        made.append(node)
+        await node.start()
+        return node
+
+    yield make
+    await asyncio.gather(*(node.stop() for node in made))
+
+
+@pytest.fixture
+async def node(make_node: MakeNode) -> Node:
+    """An inside node that has not registered yet."""
+    return await make_node()
+
+
+@pytest.fixture
+def start_process(master: Master) -> Iterator[Callable[..., Process]]:
+    """Starts proxies as processes of their own, for the master unless told otherwise."""
+    made: list[Process] = []
+
+    def start(**options: Any) -> Process:
+        made.append(Process({"master_uri": master.uri, **options}))
+        return made[-1]
+
+    yield start
+    for process in made:
+        process.close()

@@ -1,0 +1,211 @@
+"""Addresses, free ports, raw connections and XML-RPC for the tests.
+
+All of 127.0.0.0/8 is loopback on Linux: every host of a test gets an address of its own there.
+"""
+
+import asyncio
+import random
+import socket
+import struct
+import xmlrpc.client
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any
+from urllib.parse import urlsplit
+
+MASTER = "127.0.1.1"
+OUTSIDE = "127.0.1.9"
+PROXY = "127.0.2.1"
+NODE, OTHER_NODE, THIRD_NODE = "127.0.2.11", "127.0.2.12", "127.0.2.13"
+HOST = "127.0.3.1"
+"""What outside knows the proxy's machine by."""
+
+PATIENCE = 5.0
+"""Seconds after which something awaited counts as missing."""
+
+Where = tuple[str, int]
+
+
+def free_ports(count: int, address: str = "") -> int:
+    """The first of ``count`` ports in a row that nobody uses; below the ephemeral range."""
+    while True:
+        first = random.randrange(15000, 32000 - count)
+        if all(_is_free(port, address) for port in range(first, first + count)):
+            return first
+
+
+def _is_free(port: int, address: str) -> bool:
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
+
+
+def where(uri: str) -> Where:
+    """Host and port of a URI."""
+    parts = urlsplit(uri)
+    assert parts.hostname
+    assert parts.port
+    return parts.hostname, parts.port
+
+
+async def until(condition: Callable[[], Any], what: str, within: float = PATIENCE) -> None:
+    """Wait until ``condition`` holds; it may be a coroutine function."""
+    end = monotonic() + within
+    while True:
+        result = condition()
+        if await result if isinstance(result, Awaitable) else result:
+            return
+        assert monotonic() < end, f"waited {within:g} s in vain: {what}"
+        await asyncio.sleep(0.01)
+
+
+async def refuses(address: Where, source: str = OUTSIDE) -> bool:
+    """Whether nobody listens there."""
+    try:
+        async with connect(address, source):
+            return False
+    except ConnectionRefusedError:
+        return True
+
+
+@dataclass
+class Reply:
+    """An HTTP response; header names in lower case."""
+
+    status: int
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes = b""
+
+    @property
+    def value(self) -> Any:
+        """What an XML-RPC response holds. Raises Fault."""
+        return xmlrpc.client.loads(self.body)[0][0]
+
+    @property
+    def fault(self) -> int:
+        """The fault code of a fault response."""
+        try:
+            value = self.value
+        except xmlrpc.client.Fault as fault:
+            return fault.faultCode
+        raise AssertionError(f"no fault but {value!r}")
+
+
+class Wire:
+    """A raw TCP connection."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    @property
+    def sock(self) -> socket.socket:
+        """Its socket, for options."""
+        found: socket.socket = self.writer.get_extra_info("socket")
+        return found
+
+    async def send(self, data: bytes, slices: int = 0) -> None:
+        """Send, in slices of so many bytes, each in a segment of its own."""
+        if not slices:
+            self.writer.write(data)
+            await self.writer.drain()
+            return
+        self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for start in range(0, len(data), slices):
+            self.writer.write(data[start : start + slices])
+            await self.writer.drain()
+            await asyncio.sleep(0)
+
+    async def exactly(self, size: int) -> bytes:
+        """The next ``size`` bytes."""
+        async with asyncio.timeout(PATIENCE):
+            return await self.reader.readexactly(size)
+
+    async def reply(self, head: bool = False) -> Reply:
+        """The next HTTP response, which must have a Content-Length; ``head``: it has no body."""
+        async with asyncio.timeout(PATIENCE):
+            raw = await self.reader.readuntil(b"\r\n\r\n")
+            reply = _parse_head(raw)
+            if not head and reply.status != 100:
+                reply.body = await self.reader.readexactly(int(reply.headers["content-length"]))
+        return reply
+
+    async def end(self) -> str:
+        """How the peer ends it, with nothing sent before: ``closed`` or ``reset``."""
+        try:
+            async with asyncio.timeout(PATIENCE):
+                rest = await self.reader.read()
+        except ConnectionResetError:
+            return "reset"
+        assert rest == b"", f"{len(rest)} bytes instead of an end: {rest[:200]!r}"
+        return "closed"
+
+    async def half_close(self) -> None:
+        """End the outgoing direction."""
+        self.writer.write_eof()
+        await asyncio.sleep(0)
+
+    def reset(self) -> None:
+        """Reset the connection."""
+        self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.writer.transport.abort()
+
+
+def _parse_head(raw: bytes) -> Reply:
+    first, *lines = raw.decode("latin-1").split("\r\n")
+    headers = {}
+    for line in filter(None, lines):
+        name, _, value = line.partition(":")
+        assert name.lower() not in headers, f"{name} twice"
+        headers[name.lower()] = value.strip()
+    return Reply(int(first.split(" ")[1]), headers)
+
+
+@asynccontextmanager
+async def connect(address: Where, source: str = OUTSIDE) -> AsyncIterator[Wire]:
+    """A connection from an address of this machine; closed at the end."""
+    local = None if ":" in address[0] else (source, 0)
+    async with asyncio.timeout(PATIENCE):
+        reader, writer = await asyncio.open_connection(*address, local_addr=local)
+    try:
+        yield Wire(reader, writer)
+    finally:
+        writer.close()
+        try:
+            await writer.wait_closed()
+        except OSError:
+            pass  # a reset, which the test has seen or meant
+
+
+def xml(method: str, *params: Any) -> bytes:
+    """A method call."""
+    return xmlrpc.client.dumps(params, method).encode()
+
+
+def post(body: bytes, *headers: str, path: str = "/", version: str = "1.1") -> bytes:
+    """An HTTP POST; ``headers`` are whole lines, Content-Length is added where it is missing."""
+    lines = [f"POST {path} HTTP/{version}", "Host: somewhere", "Content-Type: text/xml", *headers]
+    if not any(line.lower().startswith(("content-length:", "transfer-enc")) for line in headers):
+        lines.append(f"Content-Length: {len(body)}")
+    return "\r\n".join([*lines, "", ""]).encode() + body
+
+
+async def exchange(address: Where, request: bytes, source: str = OUTSIDE, slices: int = 0) -> Reply:
+    """The response to one raw request."""
+    async with connect(address, source) as wire:
+        await wire.send(request, slices)
+        return await wire.reply()
+
+
+async def rpc(address: Where | str, method: str, *params: Any, source: str = OUTSIDE) -> Any:
+    """The value of an XML-RPC call. Raises Fault, OSError, EOFError."""
+    target = where(address) if isinstance(address, str) else address
+    host = f"[{target[0]}]" if ":" in target[0] else target[0]
+    body = xml(method, *params)
+    lines = ["POST / HTTP/1.1", f"Host: {host}:{target[1]}", f"Content-Length: {len(body)}"]
+    request = "\r\n".join([*lines, "", ""]).encode() + body
+    return (await exchange(target, request, source)).value

@@ -1,0 +1,109 @@
+"""The proxy of a test as a process of its own, for what can be seen only from outside of it."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+from tests.integration.net import PROXY, Where
+from tests.integration.proxy import options_for
+
+
+def command_line(options: dict[str, Any]) -> list[str]:
+    """The command that runs a proxy with these options; True stands for a flag."""
+    command = [sys.executable, "-m", "rosproxy", "run"]
+    for name, held in options.items():
+        option = "--" + name.replace("_", "-")
+        values = held if isinstance(held, tuple) else (held,)
+        for one in values:
+            command += [option] if one is True else [option, str(one)]
+    return command
+
+
+def clean_environment(**more: str) -> dict[str, str]:
+    """The environment without anything that is meant for a proxy or for ROS."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "ROSPROXY_"))}
+    return kept | more
+
+
+class Process:
+    """A running ``rosproxy run``; ``log`` is what it has written to standard error so far."""
+
+    def __init__(self, options: dict[str, Any], **popen: Any) -> None:
+        self.options = options_for(**options)
+        self.master: Where = (PROXY, int(self.options["master_port"]))
+        self._popen = popen
+        self.log: list[str] = []
+        self.start()
+
+    def start(self) -> None:
+        """Start it, the first time or again with the same options, and wait until it is ready."""
+        self._process = subprocess.Popen(
+            command_line(self.options),
+            stderr=subprocess.PIPE,
+            text=True,
+            env=clean_environment(),
+            **self._popen,
+        )
+        self._reader = threading.Thread(target=self._read, args=(self._process,))
+        self._reader.start()
+        self.wait_for_log("ready: ")
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    @property
+    def text(self) -> str:
+        """The whole log."""
+        return "".join(self.log)
+
+    def wait_for_log(self, text: str, within: float = 10.0) -> None:
+        """Wait until a line of the log holds ``text``."""
+        end = monotonic() + within
+        while text not in self.text:
+            assert monotonic() < end, f"no {text!r} in the log:\n{self.text}"
+            assert self._process.poll() is None, f"the proxy ended:\n{self.text}"
+            sleep(0.01)
+
+    def resident(self) -> int:
+        """Its memory in bytes: what it holds now, without what is shared with others."""
+        lines = Path(f"/proc/{self.pid}/smaps_rollup").read_text().splitlines()
+        return 1024 * sum(int(line.split()[1]) for line in lines if line.startswith("Private_"))
+
+    def descriptors(self) -> int:
+        """How many file descriptors it has open."""
+        return len(os.listdir(f"/proc/{self.pid}/fd"))
+
+    def threads(self) -> int:
+        """How many threads it has."""
+        return len(os.listdir(f"/proc/{self.pid}/task"))
+
+    def terminate(self, number: int = signal.SIGTERM) -> tuple[int, float]:
+        """Send a signal; the exit code and the seconds that it took."""
+        started = monotonic()
+        self._process.send_signal(number)
+        code = self._process.wait(10)
+        took = monotonic() - started
+        self._reader.join()
+        return code, took
+
+    def kill(self) -> None:
+        """SIGKILL it."""
+        self.terminate(signal.SIGKILL)
+
+    def close(self) -> None:
+        """End it if it still runs; a traceback in its log fails the test."""
+        if self._process.poll() is None:
+            self.kill()
+        assert "Traceback" not in self.text, self.text
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr
+        with process.stderr as lines:
+            self.log += lines

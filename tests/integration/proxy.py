@@ -1,0 +1,72 @@
+"""The proxy of a test, in the test's own event loop."""
+
+import asyncio
+from typing import Any
+
+from rosproxy.app import App
+from rosproxy.core.registry import Endpoint
+from rosproxy.core.settings import Settings, parse_settings
+from tests.integration.net import HOST, PROXY, Where, free_ports, where
+from tests.integration.node import Node
+
+PORTS = 8
+"""How many ports a proxy of the tests has for nodes, unless told otherwise."""
+
+
+def options_for(**options: Any) -> dict[str, Any]:
+    """Command-line options for a test: free ports, and patience measured in tenths of seconds."""
+    count = options.pop("ports", PORTS)
+    first = free_ports(count + 2)
+    return {
+        "advertise_host": HOST,
+        "master_port": first + count,
+        "admin_bind": f"127.0.0.1:{first + count + 1}",
+        "port_range": f"{first}-{first + count - 1}",
+        "inside_network": ("127.0.2.0/24",),
+        "probe_interval": 0.3,
+        "probe_timeout": 0.5,
+        "cleanup_after": 1.0,
+        "linger": 0.5,
+        "master_interval": 0.2,
+        **options,
+    }
+
+
+def settings_for(**options: Any) -> Settings:
+    """The same as settings."""
+    return parse_settings({"bind": "0.0.0.0", "slave_control": "any", **options_for(**options)})
+
+
+class Proxy:
+    """A running proxy and where to reach it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.app = App(settings)
+        self.master: Where = (PROXY, settings.master_port)
+        self._stopped = False
+
+    async def start(self) -> None:
+        """Begin."""
+        await self.app.start()
+
+    async def stop(self) -> None:
+        """End; the second time nothing."""
+        if not self._stopped:
+            self._stopped = True
+            async with asyncio.timeout(5):
+                await self.app.stop()
+
+    def endpoint(self, node: Node) -> Endpoint:
+        """What the proxy knows of a node."""
+        key = node.address, node.slave.address[1]
+        return next(e for e in self.app.context.registry if e.key == key)
+
+    def lease(self, node: Node) -> Where:
+        """Where outside reaches a node."""
+        endpoint = self.endpoint(node)
+        return where(self.app.context.addressing.advertised_uri(endpoint))
+
+    def uri(self, node: Node) -> str:
+        """A node's slave URI as outside sees it."""
+        return self.app.context.addressing.advertised_uri(self.endpoint(node))
