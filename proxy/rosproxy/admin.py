@@ -1,6 +1,6 @@
 """The admin endpoint: health, readiness, metrics and status, on loopback by default."""
 
-import logging
+import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -10,7 +10,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.core.uris import HostPort
 
-log = logging.getLogger(__name__)
+GREETING = "rosproxy: /healthz /readyz /metrics /status\n"
 
 
 class Admin:
@@ -28,10 +28,12 @@ class Admin:
     ) -> None:
         self._metrics, self._status, self._ready, self._probe = metrics, status, ready, probe
         self._runner: web.AppRunner | None = None
+        self._probing = asyncio.Lock()
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
         app = web.Application()
+        app.router.add_get("/", self._greet)
         app.router.add_get("/healthz", self._healthz)
         app.router.add_get("/readyz", self._readyz)
         app.router.add_get("/metrics", self._get_metrics)
@@ -45,6 +47,9 @@ class Admin:
         """Stop listening."""
         if self._runner is not None:
             await self._runner.cleanup()
+
+    async def _greet(self, request: web.Request) -> web.Response:
+        return web.Response(text=GREETING)
 
     async def _healthz(self, request: web.Request) -> web.Response:
         return web.Response(text="ok\n")
@@ -61,4 +66,6 @@ class Admin:
         return web.json_response(self._status())
 
     async def _post_probe(self, request: web.Request) -> web.Response:
-        return web.json_response(await self._probe())
+        """One probe at a time: each takes ports of the range."""
+        async with self._probing:
+            return web.json_response(await self._probe())

@@ -8,13 +8,13 @@ import http.client
 import json
 import os
 from typing import Any
-from urllib.parse import urlsplit
 
-from rosproxy.core.uris import HostPort, is_unspecified, parse_host_port
+from rosproxy.core.uris import HostPort, parse_host_port
 
 DEFAULT_URL = "http://127.0.0.1:11312"
 MAX_REPLY = 64 * 1024 * 1024
 """Longest reply in bytes that is read."""
+_EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}
 
 
 class AdminError(Exception):
@@ -87,6 +87,4 @@ def default_url() -> str:
     bound = parse_host_port(os.environ.get("ROSPROXY_ADMIN_BIND", ""))
     if bound is None:
         return DEFAULT_URL
-    everywhere = is_unspecified(bound.host)
-    loopback = "::1" if ":" in bound.host else "127.0.0.1"
-    return f"http://{HostPort(loopback if everywhere else bound.host, bound.port)}"
+    return f"http://{HostPort(_EVERYWHERE.get(bound.host, bound.host), bound.port)}"

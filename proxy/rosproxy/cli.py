@@ -1,15 +1,14 @@
 """The command line."""
 
-import asyncio
-import contextlib
-import signal
 import sys
-from collections.abc import Callable, Coroutine
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any
 
 import click
 
 from rosproxy import __version__
+
+Command = Callable[..., Any]
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -109,38 +108,102 @@ def run(check: bool, log_format: str, log_level: str, **options: Any) -> None:
     Every option has an environment variable: ROSPROXY_ and its name (ROSPROXY_PORT_RANGE); the
     master's is ROS_MASTER_URI, the inside networks' ROSPROXY_INSIDE_NETWORKS.
     """
-    from rosproxy import logs
-    from rosproxy.app import serve
-    from rosproxy.core.settings import SettingError, parse_settings
+    from rosproxy.core.settings import SettingError
+    from rosproxy.run import run as run_proxy
 
-    logs.set_up(log_format, log_level)
     try:
-        settings = parse_settings(options)
-        if not check:
-            _run_until_signal(lambda stopped: serve(settings, stopped))
+        run_proxy(options, log_format, log_level, check)
     except SettingError as error:
         click.echo(f"rosproxy: {error}", err=True)
         sys.exit(2)
 
 
-Serve = Callable[[asyncio.Event], Coroutine[Any, Any, None]]
+def _admin_option(command: Command) -> Command:
+    return click.option(
+        "--admin",
+        envvar="ROSPROXY_ADMIN",
+        callback=_admin_client,
+        metavar="URL",
+        help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
+        "http://127.0.0.1:11312.",
+    )(command)
 
 
-def _run_until_signal(serve: Serve) -> None:
-    with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-        runner.run(_with_signals(serve))
+def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
+    from rosproxy.admin_client import AdminClient, default_url
+
+    try:
+        return AdminClient(url or default_url())
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
 
 
-async def _with_signals(serve: Serve) -> None:
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    await serve(stopped)
+@main.command()
+@_admin_option
+@click.option("--json", "as_json", is_flag=True, help="Print the state as JSON.")
+@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
+def status(admin: Any, as_json: bool, watch: bool) -> None:
+    """Show the master, the ports, and the nodes behind the proxy."""
+    if as_json and watch:
+        raise click.UsageError("--json or --watch, not both")
+    from rosproxy import console
+
+    if watch:
+        console.watch_status(admin)
+    else:
+        _or_exit(lambda: console.show_status(admin, as_json))
 
 
-def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    with contextlib.suppress(ImportError):
-        import uvloop
+@main.command()
+@_admin_option
+def health(admin: Any) -> None:
+    """Exit with 0 if the proxy is alive, with 1 if not; for container health checks."""
+    _or_exit(lambda: admin.get("/healthz", within=3.0))
 
-        return cast(Callable[[], asyncio.AbstractEventLoop], uvloop.new_event_loop)
-    return None
+
+@main.command()
+@click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
+@_admin_option
+@click.option(
+    "--master-uri",
+    envvar="ROS_MASTER_URI",
+    default="",
+    metavar="URI",
+    help="The master to look at if the proxy can't be asked for its own.",
+)
+@click.option(
+    "--advertise-host",
+    envvar="ROSPROXY_ADVERTISE_HOST",
+    default="",
+    metavar="HOST",
+    help="The advertised host if the proxy can't be asked for it.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
+def doctor(
+    names: tuple[str, ...], admin: Any, master_uri: str, advertise_host: str, as_json: bool
+) -> None:
+    """Find out why A can't hear B, and say what mends it.
+
+    Looks at the proxy, its ports, the master and all nodes. With names: who publishes and who
+    subscribes to that topic; that node's topics; or what two nodes have to say to each other,
+    and which of them are not connected, and why.
+
+    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. Exits with 0 if nothing is
+    wrong, with 1 if something is.
+    """
+    from rosproxy.doctor import examine
+    from rosproxy.survey import Patient
+
+    absolute = tuple(f"/{name.strip('/')}" for name in names)
+    sys.exit(examine(Patient(admin, master_uri, advertise_host, absolute), as_json))
+
+
+def _or_exit(ask: Callable[[], object]) -> None:
+    """Do something that may find the proxy absent, and say so in one line."""
+    from rosproxy.admin_client import AdminError
+
+    try:
+        ask()
+    except AdminError as error:
+        click.echo(f"rosproxy: {error}", err=True)
+        sys.exit(1)

@@ -2,7 +2,6 @@
 
 import time
 import uuid
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -12,41 +11,12 @@ from rosproxy.core.settings import Settings
 from rosproxy.listeners import PortBank
 from rosproxy.metrics import Metrics
 from rosproxy.network import address_towards, interface_networks
+from rosproxy.problems import Problems
 from rosproxy.tasks import Tasks
 from rosproxy.upstream import Upstream
 
 NETWORKS_TTL = 5.0
 """Seconds for which the list of the machine's own networks is taken as current."""
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Something the user should know: when (Unix time), about which node, port or label, what."""
-
-    when: float
-    subject: str
-    text: str
-
-
-class Problems:
-    """The most recent problems, newest last; the same one again replaces the older entry."""
-
-    def __init__(self, most: int = 50) -> None:
-        self._items: deque[Problem] = deque(maxlen=most)
-
-    def add(self, subject: str, text: str) -> None:
-        """Note a problem."""
-        self.clear(subject, text)
-        self._items.append(Problem(time.time(), subject, text))
-
-    def clear(self, subject: str, text: str | None = None) -> None:
-        """Forget a subject's problems, or one of them."""
-        kept = [p for p in self._items if p.subject != subject or text not in (None, p.text)]
-        self._items = deque(kept, maxlen=self._items.maxlen)
-
-    def list(self, subject: str | None = None) -> list[Problem]:
-        """All problems, or those of one subject."""
-        return [p for p in self._items if subject in (None, p.subject)]
 
 
 @dataclass(slots=True)

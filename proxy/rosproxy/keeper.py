@@ -61,9 +61,12 @@ class Keeper:
     async def probe(self, endpoint: Endpoint) -> None:
         """Probe an endpoint and act on the result."""
         answer = await self._nodes.probe(endpoint.slave)
+        failing = endpoint.health.failures > 0
         change = endpoint.health.note(answer.probe, self._context.now())
         if answer.probe is Probe.ANSWERED:
             await self._answered(endpoint, answer.pid)
+            if failing:
+                self._context.problems.solved_at(endpoint.port)
         elif change is Change.DOWN:
             self._report_down(endpoint, answer.reason)
             self._leases.close(endpoint)
@@ -88,21 +91,22 @@ class Keeper:
     async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
         if not endpoint.trusted:
             await self.verify(endpoint)
+            if endpoint.trusted:
+                await self._upkeep.announce([endpoint])
             return
         if endpoint.health.cleaned:
             await self._upkeep.come_back(endpoint)
         elif endpoint.health.pid not in (None, pid):
             await self._upkeep.audit(endpoint)
         endpoint.health.pid = pid
-        if not self._leases.is_open(endpoint) and endpoint.port in self._context.registry.by_port:
+        if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label)
-            self._context.problems.clear(endpoint.label)
             self._leases.open(endpoint)
 
     def _report_down(self, endpoint: Endpoint, reason: str) -> None:
         if endpoint.registrations:
             log.warning("%s does not answer: %s", endpoint.label, reason)
-            self._context.problems.add(endpoint.label, f"does not answer: {reason}")
+            self._context.problems.add(endpoint.label, f"does not answer: {reason}", endpoint.port)
 
     async def _name(self, endpoint: Endpoint) -> None:
         """Find out whether neighbours can use a recovered node's host name."""

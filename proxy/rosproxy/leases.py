@@ -58,13 +58,15 @@ class Leases:
         return await self._admit_new(uri, node, asker)
 
     def open(self, endpoint: Endpoint) -> None:
-        """Let an endpoint's port listen."""
-        if endpoint.port in self._acceptors:
+        """Let an endpoint's port listen, if it still holds the lease."""
+        held = self._context.registry.by_port.get(endpoint.port) is endpoint
+        if not held or endpoint.port in self._acceptors:
             return
         try:
             sock = self._context.bank.open(endpoint.port)
         except OSError as error:
-            self._context.problems.add(endpoint.label, f"port {endpoint.port} is taken: {error}")
+            text = f"port {endpoint.port} is taken: {error}"
+            self._context.problems.add(endpoint.label, text, endpoint.port)
             log.error("port %d of %s can't be opened: %s", endpoint.port, endpoint.label, error)
             return
         self._acceptors[endpoint.port] = Acceptor(
@@ -83,6 +85,7 @@ class Leases:
         registry = self._context.registry
         if registry.by_port.get(endpoint.port) is endpoint:
             self.close(endpoint)
+            self._context.problems.solved_at(endpoint.port)
             registry.remove(endpoint)
 
     async def retry_blocked(self) -> None:
@@ -93,6 +96,8 @@ class Leases:
         for port in set(before) - set(still):
             pool.unblock(port)
             log.info("port %d of the range is free now", port)
+        if before and not still:
+            self._context.problems.solved("--port-range")
 
     def is_open(self, endpoint: Endpoint) -> bool:
         """Whether an endpoint's port listens."""
@@ -155,7 +160,7 @@ class Leases:
         if answer.probe is Probe.ANSWERED:
             return
         text = _unreachable_text(endpoint, answer.reason)
-        self._context.problems.add(caller_id, text)
+        self._context.problems.add(caller_id, text, endpoint.port)
         log.warning("%s: %s", caller_id, text)
 
     def _advertised(self, endpoint: Endpoint) -> str:

@@ -45,17 +45,19 @@ class MasterService:
             return await self._context.upstream.master(request.body)
         await self._recovered()
         self._context.refresh_networks()
+        pending: list[Endpoint] = []
         try:
-            return await self._admit_and_forward(request)
-        finally:
-            for admission in request.admissions:
+            for call in request.calls:  # one after the other: they may register the same new node
+                admission = await self._leases.admit(call, request.asker) if call else None
+                request.admissions.append(admission)
                 if isinstance(admission, Endpoint):
-                    admission.pending -= 1
+                    pending.append(admission)
+            return await self._forward(request)
+        finally:
+            for endpoint in pending:
+                endpoint.pending -= 1
 
-    async def _admit_and_forward(self, request: Request) -> bytes:
-        for call in request.calls:  # one after the other: they may register the same new node
-            admission = await self._leases.admit(call, request.asker) if call else None
-            request.admissions.append(admission)
+    async def _forward(self, request: Request) -> bytes:
         local = master_api.local_reply(request)
         if local is not None:
             return local

@@ -36,7 +36,10 @@ class MasterWatch:
         """Wait until the registry is rebuilt from the master. Raises Unreachable."""
         async with self._recovering:
             if not self._recovered:
-                await self._recover()
+                try:
+                    await self._recover()
+                except MasterError as error:
+                    raise Unreachable(f"the master can't be asked for its state: {error}") from None
                 self._recovered = True
 
     async def look(self) -> None:
@@ -64,7 +67,7 @@ class MasterWatch:
             self.since = self._context.now()
             if up:
                 log.info("master %s answers (pid %s)", uri, self.pid)
-                self._context.problems.clear("master")
+                self._context.problems.solved("master")
             else:
                 log.warning("%s; waiting for it", error)
                 self._context.problems.add("master", error)
@@ -129,6 +132,8 @@ class MasterWatch:
             self._context.upstream.ask_master("getSystemState"),
             self._context.upstream.ask_master("getTopicTypes"),
         )
+        if not _is_state(state):
+            raise MasterError("getSystemState: not of the form [[[name, [node, ...]], ...], ...]")
         return recovery.registrations(state, _types(types))
 
     async def _restore_lost(self) -> None:
@@ -145,5 +150,24 @@ class MasterWatch:
             await self._upkeep.register([(ours[held], held) for held in lost])
 
 
+def _is_state(state: Any) -> bool:
+    """Whether a master's answer to getSystemState has the form that it should have."""
+    if not (isinstance(state, list) and len(state) == 3):
+        return False
+    return all(isinstance(entries, list) and all(map(_is_entry, entries)) for entries in state)
+
+
+def _is_entry(entry: Any) -> bool:
+    match entry:
+        case [str(), list(nodes)]:
+            return all(isinstance(node, str) for node in nodes)
+    return False
+
+
 def _types(rows: Any) -> dict[str, str]:
-    return {row[0]: row[1] for row in rows if isinstance(row, list) and len(row) == 2}
+    held: dict[str, str] = {}
+    for row in rows if isinstance(rows, list) else ():
+        match row:
+            case [str(name), str(type_)]:
+                held[name] = type_
+    return held

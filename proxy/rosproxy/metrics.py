@@ -1,13 +1,15 @@
 """Prometheus metrics: counters that the proxy keeps, and gauges read off its state when scraped."""
 
+import time
 from collections.abc import Callable, Iterable
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from rosproxy import __version__
 from rosproxy.core.methods import MASTER_METHODS
-from rosproxy.core.registry import Registry
+from rosproxy.core.registry import Endpoint, Registry
 
 _SLAVE_METHODS = frozenset(
     {
@@ -39,13 +41,23 @@ _OTHER_MASTER_METHODS = frozenset(
         "system.multicall",
     }
 )
+STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "unverified")
+MOST_NAMES = 1000
+"""Topics and services with byte counters of their own; the bytes of all others are summed up."""
+
 _KNOWN_METHODS = _SLAVE_METHODS | _OTHER_MASTER_METHODS | frozenset(MASTER_METHODS)
+
+
+def state_of(endpoint: Endpoint) -> str:
+    """One word for an endpoint's state: one of STATES."""
+    return endpoint.health.state if endpoint.trusted else "unverified"
 
 
 class Traffic:
     """Bytes relayed per topic or service, summed over ended connections.
 
-    ``sent`` went outside, ``received`` came from there.
+    ``sent`` went outside, ``received`` came from there. Anonymous nodes bring new names for ever,
+    so that only the first MOST_NAMES are kept apart.
     """
 
     def __init__(self) -> None:
@@ -54,15 +66,22 @@ class Traffic:
 
     def add(self, kind: str, name: str, sent: int, received: int) -> None:
         """Add the bytes of a connection that ended."""
-        self.sent[kind, name] = self.sent.get((kind, name), 0) + sent
-        self.received[kind, name] = self.received.get((kind, name), 0) + received
+        key = kind, name
+        if key not in self.sent and len(self.sent) >= MOST_NAMES:
+            key = kind, "other"
+        self.sent[key] = self.sent.get(key, 0) + sent
+        self.received[key] = self.received.get(key, 0) + received
 
 
 class Metrics:
     """All metrics of a proxy, in a registry of their own."""
 
     def __init__(self) -> None:
+        self.started = time.monotonic()
         self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        build = Info("rosproxy_build", "The proxy's version.", registry=self.registry)
+        build.info({"version": __version__})
         self.calls = Counter(
             "rosproxy_xmlrpc_calls",
             "XML-RPC calls by API (master, slave), method and outcome.",
@@ -124,8 +143,8 @@ class StateCollector(Collector):
 
     def _endpoints(self) -> Metric:
         family = GaugeMetricFamily("rosproxy_endpoints", "Inside nodes by state.", labels=["state"])
-        states = [endpoint.health.state for endpoint in self._registry]
-        for state in sorted(set(states)):
+        states = [state_of(endpoint) for endpoint in self._registry]
+        for state in STATES:
             family.add_metric([state], states.count(state))
         return family
 

@@ -1,65 +1,170 @@
-"""Can the advertised ports be reached? A probe over a free port of the range."""
+"""Can the advertised ports be reached? Tried over free ports of the range, from two places.
+
+The proxy dials its own advertised address; where NAT has no way back for that (no hairpin), it
+fails although outside gets through. So the master is made to try as well: it calls paramUpdate at
+a subscriber of a parameter, which here is the port under test. That leaves no trace in the graph
+and none among the parameters.
+"""
 
 import asyncio
+import logging
 import secrets
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 from rosproxy.acceptor import Acceptor
 from rosproxy.context import Context
+from rosproxy.core import xmlrpc
+from rosproxy.core.uris import HostPort, slave_uri
+from rosproxy.upstream import CALLER_ID, Unreachable
+
+log = logging.getLogger(__name__)
 
 TIMEOUT = 3.0
+MASTER_WAIT = 4.0
+"""Seconds that the master gets to call back; rosmaster does so from three threads."""
+MAX_REQUEST = 65536
+
+
+@dataclass(slots=True, eq=False)
+class _Trial:
+    """One port under test.
+
+    ``mine`` and ``masters`` are the secrets by which the two callers are told from strangers.
+    """
+
+    port: int
+    where: HostPort
+    mine: str = field(default_factory=lambda: secrets.token_hex(16))
+    masters: str = field(default_factory=lambda: secrets.token_hex(16))
+    reached: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def greet(self, conn: socket.socket, peer: str) -> None:
+        """Answer a caller, in the way of a node, if it knows one of the secrets."""
+        loop, seen = asyncio.get_running_loop(), b""
+        async with asyncio.timeout(TIMEOUT):
+            while not self._known(seen) and len(seen) < MAX_REQUEST:
+                part = await loop.sock_recv(conn, 4096)
+                if not part:
+                    break
+                seen += part
+            if self._known(seen):
+                await loop.sock_sendall(conn, _reply(self.mine))
+        conn.close()
+
+    def _known(self, seen: bytes) -> bool:
+        if self.masters.encode() in seen:
+            self.reached.set()
+        return self.masters.encode() in seen or self.mine.encode() in seen
 
 
 async def probe_range(context: Context) -> dict[str, Any]:
-    """Connect to a free port through the advertised host and port and see who answers.
+    """Try the lowest and the highest free port of the range.
 
-    The result has ``outcome`` (ok, refused, silent, stranger, unresolvable or full), the ``port``
-    that listened and the ``advertised`` address that was dialled. Whether outside gets through
-    as well is more than a probe from the proxy itself can tell.
+    ``probes`` holds for each its ``port``, the ``advertised`` address and two outcomes.
+    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
+    on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
+    master's call did not arrive) or unknown (the master could not be asked).
     """
-    port = context.registry.pool.peek()
-    if port is None:
-        return {"outcome": "full", "port": None, "advertised": None}
-    where = context.addressing.outside(port)
-    result = {"port": port, "advertised": str(where)}
-    context.registry.pool.claim(port)
+    trials = [_Trial(port, context.addressing.outside(port)) for port in _claim(context)]
     try:
-        return {**result, "outcome": await _probe(context, port, where.host, where.port)}
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(_try(context, trial)) for trial in trials]
     finally:
-        context.registry.pool.give_back(port)
+        for trial in trials:
+            context.registry.pool.give_back(trial.port)
+    return {"probes": [task.result() for task in tasks]}
 
 
-async def _probe(context: Context, port: int, host: str, advertised: int) -> str:
-    nonce = secrets.token_hex(16).encode()
+def _claim(context: Context) -> list[int]:
+    """Take the lowest and the highest free port, if there are any."""
+    pool, ports = context.registry.pool, context.settings.ports.listen.ports()
+    lowest = next(filter(pool.claim, ports), None)
+    highest = next(filter(pool.claim, reversed(ports)), None)
+    return [port for port in (lowest, highest) if port is not None]
 
-    async def greet(conn: Any, peer: str) -> None:
-        await asyncio.get_running_loop().sock_sendall(conn, nonce)
-        conn.close()
 
-    acceptor = Acceptor(context.tasks, context.bank.open(port), greet)
+async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
+    result = {"port": trial.port, "advertised": str(trial.where)}
+    acceptor = Acceptor(context.tasks, context.bank.open(trial.port), trial.greet)
     try:
-        return await _dial(host, advertised, nonce)
+        mine, masters = await asyncio.gather(_dial(trial), _ask_master(context, trial))
     finally:
         acceptor.stop()
-        context.bank.close(port, acceptor.sock)
+        context.bank.close(trial.port, acceptor.sock)
+    return {**result, "from_proxy": mine, "from_master": masters}
 
 
-async def _dial(host: str, port: int, nonce: bytes) -> str:
+async def _dial(trial: _Trial) -> str:
+    """Connect through the advertised address and see who answers."""
     try:
         async with asyncio.timeout(TIMEOUT):
-            reader, writer = await asyncio.open_connection(host, port)
-            try:
-                answer = await reader.read(len(nonce))
-            finally:
-                writer.close()
+            reader, writer = await asyncio.open_connection(trial.where.host, trial.where.port)
     except TimeoutError:
         return "silent"
     except ConnectionRefusedError:
         return "refused"
+    except (socket.gaierror, UnicodeError):
+        return "unresolvable"
+    except OSError:
+        return "unreachable"
+    return await _greeted(trial, reader, writer)
+
+
+async def _greeted(
+    trial: _Trial, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+) -> str:
+    answer = b""
+    try:
+        async with asyncio.timeout(TIMEOUT):
+            writer.write(f"GET /{trial.mine} HTTP/1.0\r\n\r\n".encode())
+            while len(answer) < MAX_REQUEST and (part := await reader.read(4096)):
+                answer += part
+    except TimeoutError:
+        return "stranger"
     except OSError as error:
-        return (
-            "unresolvable"
-            if "getaddrinfo" in str(error) or error.errno in (-2, -3, -5)
-            else "silent"
+        log.debug("%s ended the connection: %s", trial.where, error)
+    finally:
+        writer.close()
+    if trial.mine.encode() in answer:
+        return "ok"
+    return "stranger" if answer else "closed"
+
+
+async def _ask_master(context: Context, trial: _Trial) -> str:
+    """Have the master call the port, as it calls a node whose parameter has changed."""
+    try:
+        async with _subscribed(context, trial):
+            async with asyncio.timeout(MASTER_WAIT):
+                await trial.reached.wait()
+    except TimeoutError:
+        return "missed"
+    except Unreachable as error:
+        log.debug("the master can't try port %d: %s", trial.port, error)
+        return "unknown"
+    return "ok"
+
+
+@asynccontextmanager
+async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
+    """A parameter with the port under test as its subscriber, for as long as it takes."""
+    name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(trial.where)
+    batch = context.upstream.batch
+    try:
+        done = await batch(
+            [("subscribeParam", [name, uri, name]), ("setParam", [CALLER_ID, name, True])]
         )
-    return "ok" if answer == nonce else "stranger"
+        if None in done:
+            raise Unreachable("the master refused a call")
+        yield
+    finally:
+        await batch([("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])])
+
+
+def _reply(secret: str) -> bytes:
+    body = xmlrpc.dump_reply([1, secret, 0])
+    head = f"HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
+    return head.encode() + body

@@ -6,7 +6,7 @@ from urllib.parse import urlsplit
 from rosproxy.context import Context
 from rosproxy.core import slave_api, xmlrpc
 from rosproxy.core.liveness import Change, Probe
-from rosproxy.core.master_api import MULTICALL
+from rosproxy.core.xmlrpc import MULTICALL
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.slave_api import TopicPort, Visit

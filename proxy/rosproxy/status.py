@@ -5,10 +5,12 @@ import time
 from typing import Any
 
 from rosproxy import __version__
-from rosproxy.context import Context, Problem
+from rosproxy.context import Context
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.master_watch import MasterWatch
+from rosproxy.metrics import state_of
+from rosproxy.problems import Problem
 from rosproxy.relay import Relay
 from rosproxy.tcpros_service import TcprosService
 
@@ -25,11 +27,13 @@ def describe(context: Context, watch: MasterWatch, tcpros: TcprosService) -> dic
     return {
         "version": __version__,
         "pid": os.getpid(),
+        "instance": context.instance,
+        "uptime": round(context.now() - context.metrics.started, 1),
         "settings": _settings(context),
         "master": _master(context, watch),
         "ports": _ports(context),
         "nodes": [_node(context, e, relays.get(e.port, [])) for e in endpoints],
-        "problems": [_problem(problem) for problem in context.problems.list()],
+        "problems": [_problem(problem) for problem in context.problems.all()],
     }
 
 
@@ -75,17 +79,13 @@ def _node(context: Context, endpoint: Endpoint, relays: list[Relay]) -> dict[str
         "address": str(endpoint.slave),
         "advertised_uri": context.addressing.advertised_uri(endpoint),
         "port": endpoint.port,
-        "state": endpoint.health.state if endpoint.trusted else "unverified",
+        "state": state_of(endpoint),
         "publishes": endpoint.names(Kind.PUBLISHER),
         "subscribes": endpoint.names(Kind.SUBSCRIBER),
         "services": endpoint.names(Kind.SERVICE),
         "parameters": endpoint.names(Kind.PARAM),
         "connections": [_connection(relay) for relay in relays],
-        "problems": [
-            problem.text
-            for subject in (endpoint.label, *endpoint.caller_ids)
-            for problem in context.problems.list(subject)
-        ],
+        "problems": [problem.text for problem in context.problems.at(endpoint.port)],
     }
 
 

@@ -121,7 +121,7 @@ class TcprosService:
                 f"where it runs, or set ROS_IP={endpoint.place.address}"
             )
         log.warning("%s: %s", endpoint.label, text)
-        self._context.problems.add(endpoint.label, text)
+        self._context.problems.add(endpoint.label, text, endpoint.port)
         reset_on_close(conn)
         conn.close()
 

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rosproxy.context import Context
 from rosproxy.core import upkeep, xmlrpc
@@ -117,14 +118,15 @@ class Upkeep:
                 self._context.registry.drop_caller(endpoint, one.caller_id)
         return kept
 
-    async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
+    async def _tell_publishers(self, updates: Sequence[tuple[Held, list[Any]]]) -> None:
         limit = asyncio.Semaphore(PARALLEL_CALLS)
         await asyncio.gather(*(self._tell(limit, item, uris) for item, uris in updates))
 
-    async def _tell(self, limit: asyncio.Semaphore, item: Held, uris: list[str]) -> None:
+    async def _tell(self, limit: asyncio.Semaphore, item: Held, uris: list[Any]) -> None:
         endpoint, held = item
         asker = self._context.node_asker(endpoint)
-        publishers = self._context.addressing.import_slaves(uris, asker)
+        known = [uri for uri in uris if isinstance(uri, str)]
+        publishers = self._context.addressing.import_slaves(known, asker)
         body = xmlrpc.dump_call("publisherUpdate", "/master", held.name, publishers)
         async with limit:
             try:

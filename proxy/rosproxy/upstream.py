@@ -93,7 +93,9 @@ class Upstream:
             part = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in part]
             reply = _parsed(await self.master(xmlrpc.dump_call("system.multicall", body)))
-            results = xmlrpc.python_value(reply) if reply else []
+            results = xmlrpc.python_value(reply) if reply else None
+            if not isinstance(results, list) or len(results) != len(part):
+                raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_batched(result) for result in results]
         return values
 

@@ -77,15 +77,18 @@ class HttpFake:
         if self._server is None:
             return
         self._server.close()
+        self._server = None
         tasks = list(self._open.values())
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        self._server = None
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task
+        if self._server is None:  # accepted while it was stopped
+            writer.transport.abort()
+            return
         self._open[writer] = task
         self.connections += 1
         try:
@@ -102,6 +105,8 @@ class HttpFake:
         if isinstance(answer, bytes):
             writer.write(answer)
             await writer.drain()
+            if b"Connection: close\r\n" in answer:
+                raise ConnectionAbortedError
             return
         if answer is End.HANG:
             await asyncio.Event().wait()

@@ -144,6 +144,14 @@ class Wire:
         assert rest == b"", f"{len(rest)} bytes instead of an end: {rest[:200]!r}"
         return "closed"
 
+    async def outcome(self) -> str:
+        """What becomes of a request: ``answered``, ``closed`` or ``reset``."""
+        try:
+            async with asyncio.timeout(PATIENCE):
+                return "answered" if await self.reader.read(1) else "closed"
+        except ConnectionResetError:
+            return "reset"
+
     async def half_close(self) -> None:
         """End the outgoing direction."""
         self.writer.write_eof()

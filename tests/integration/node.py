@@ -74,10 +74,10 @@ class Node:
         if self._tcpros is None:
             return
         self._tcpros.close()
+        self._tcpros = None
         for task in self._streams:
             task.cancel()
         await asyncio.gather(*self._streams, return_exceptions=True)
-        self._tcpros = None
 
     async def call(self, master: Where, method: str, *params: Any) -> Any:
         """Call its master, under its own name and from its own address."""
@@ -132,6 +132,9 @@ class Node:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task
+        if self._tcpros is None:  # accepted while it was stopped
+            writer.transport.abort()
+            return
         self._streams.add(task)
         try:
             size = int.from_bytes(await reader.readexactly(4), "little")

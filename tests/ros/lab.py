@@ -193,6 +193,11 @@ class Lab:
         state = self.ask_master("getSystemState")
         return any(_absolute(name) in names for part in state for _, names in part)
 
+    def users(self, topic: str) -> tuple[list[str], list[str]]:
+        """The names of the publishers and of the subscribers of a topic."""
+        publishers, subscribers, _ = self.ask_master("getSystemState")
+        return dict(publishers).get(topic, []), dict(subscribers).get(topic, [])
+
     def wait_registered(self, name: str, timeout: float = 10) -> None:
         wait_until(f"{name} is registered", lambda: self.registered(name), timeout)
 

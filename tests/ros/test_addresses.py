@@ -36,12 +36,14 @@ def call_both_ways(lab: Lab, library: str, sink: str, **options: Any) -> None:
     lab.node(library, "c1", "call", service=back, **options).wait_for("^reply ask 0 ")
 
 
+@pytest.mark.boundary
 @each_sink
 @each_library
 def test_topics_with_a_host_name_that_resolves_nowhere(lab: Lab, library: str, sink: str) -> None:
     exchange_messages(lab, library, sink, env=NOWHERE)
 
 
+@pytest.mark.boundary
 @each_sink
 @each_library
 def test_services_with_a_host_name_that_resolves_nowhere(lab: Lab, library: str, sink: str) -> None:
@@ -60,6 +62,7 @@ def test_services_with_ros_ip_set_to_the_inside_address(lab: Lab, library: str, 
     call_both_ways(lab, library, sink, env={"ROS_IP": lab.place("c1").address})
 
 
+@pytest.mark.boundary
 @each_sink
 def test_roscpp_with_a_loopback_address_is_reached(lab: Lab, sink: str) -> None:
     """roscpp listens on every interface, whatever ROS_IP says."""
@@ -100,9 +103,9 @@ def test_two_containers_with_the_same_ports(lab: Lab, library: str) -> None:
     """Both nodes have the same port numbers, each on its own address."""
     nodes = {where: lab.unique("twin") for where in ("c1", "c2")}
     fixed = (
-        {"xmlrpc_port": 40001, "tcpros_port": 40002}
+        {"xmlrpc_port": 20001, "tcpros_port": 20002}
         if library == "rospy"
-        else {"remap": ["__tcpros_server_port:=40002"]}
+        else {"remap": ["__tcpros_server_port:=20003"]}
     )
     for where, name in nodes.items():
         lab.node(library, where, "pub", name=name, topic=f"/{name}", word=name, **fixed)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
 
 from tests.ros.combinations import each_library
 from tests.ros.lab import Lab
+from tests.ros.processes import wait_until
 from tests.ros.topology import SHARED, PortMap
 
 pytestmark = pytest.mark.boundary
 
 PLAN = replace(SHARED, name="r", ports=PortMap(45000, 45002, 45000))
-PROXY_OPTIONS = ("--linger", "1", "--probe-interval", "0.5")
+LINGER = 1.0
+PROXY_OPTIONS = ("--linger", str(LINGER), "--probe-interval", "0.5")
 
 
 @each_library
@@ -33,13 +36,9 @@ def test_the_fourth_node_is_told_and_a_later_one_gets_a_free_port(lab: Lab, libr
     for name in names:
         lab.node("roscpp", "out", "sub", topic=f"/{name}/topic").wait_for(f"^got {name} ")
     nodes[0].stop()
+    wait_until("the port is free", lambda: lab.node_uri(names[0]) is None)
+    time.sleep(LINGER + 1)
     late = lab.unique("late")
-
-    def starts() -> bool:
-        lab.node(library, "c2", "pub", name=late, topic=f"/{late}/topic").wait_for("^ready")
-        return lab.registered(late)
-
-    for _ in range(5):
-        if starts():
-            break
+    lab.node(library, "c2", "pub", name=late, topic=f"/{late}/topic")
+    lab.wait_registered(late)
     lab.node("roscpp", "out", "sub", topic=f"/{late}/topic").wait_for("^got ")

@@ -10,6 +10,7 @@ import pytest
 from tests.ros.combinations import each_direction, each_library, each_side
 from tests.ros.cpp import compiled_node
 from tests.ros.lab import Lab
+from tests.ros.processes import wait_until
 
 OTHER = {"c1": "out", "out": "c1"}
 
@@ -17,14 +18,14 @@ OTHER = {"c1": "out", "out": "c1"}
 @each_side
 def test_rosparam_set_get_list_and_delete(lab: Lab, side: str) -> None:
     key = f"/{lab.unique('tree')}"
-    lab.run(side, "rosparam", "set", f"{key}/gains", "{p: 1.5, i: 2, name: '', on: true}")
+    lab.run(side, "rosparam", "set", f"{key}/gains", "{p: 1.5, i: 2, name: '', flag: true}")
     lab.run(side, "rosparam", "set", f"{key}/text", "two words")
     assert lab.run(OTHER[side], "rosparam", "get", f"{key}/text").output == "two words\n"
     listed = lab.run(OTHER[side], "rosparam", "list", key).output.split()
     assert set(listed) == {f"{key}/{leaf}" for leaf in
-                           ("gains/p", "gains/i", "gains/name", "gains/on", "text")}
+                           ("gains/p", "gains/i", "gains/name", "gains/flag", "text")}
     got = lab.run(OTHER[side], "rosparam", "get", f"{key}/gains").output
-    assert sorted(got.split("\n")) == sorted(["i: 2", "name: ''", "'on': true", "p: 1.5", ""])
+    assert sorted(got.split("\n")) == sorted(["i: 2", "name: ''", "flag: true", "p: 1.5", ""])
     lab.run(OTHER[side], "rosparam", "delete", key)
     assert lab.run(side, "rosparam", "get", key, check=False).returncode != 0
 
@@ -48,8 +49,9 @@ def test_rosbag_records_and_plays(
     topic, bag = f"/{lab.unique('recorded')}", tmp_path / "test.bag"
     lab.node(library, source, "pub", topic=topic, rate=50)
     recorder = lab.start(sink, "rosbag", "record", "-O", str(bag), topic)
-    recorder.wait_for(f"Subscribing to {topic}")
+    wait_until("the recorder has subscribed", lambda: lab.users(topic)[1])
     lab.node("roscpp", sink, "sub", topic=topic).wait_for_count("^got ", 20)
+    assert recorder.stop() == 0
     lab.stop_nodes()
     info = lab.run(sink, "rosbag", "info", str(bag)).output
     assert int(re.findall(r"messages:\s+(\d+)", info)[0]) >= 10
@@ -130,7 +132,7 @@ def test_roslaunch_sees_that_a_required_node_died(lab: Lab, side: str, tmp_path:
     space = lab.unique("required")
     launch_package(tmp_path)
     file = tmp_path / "test.launch"
-    file.write_text(LAUNCH.format(ns=space).replace('name="talker"', 'name="talker" required="1"'))
+    file.write_text(LAUNCH.format(ns=space).replace('name="talker"', 'name="talker" required="true"'))
     path = {"ROS_PACKAGE_PATH": f"{tmp_path}:/usr/share"}
     launched = lab.start(side, "roslaunch", str(file), env=path)
     lab.wait_registered(f"/{space}/talker", timeout=30)

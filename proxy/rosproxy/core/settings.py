@@ -1,5 +1,6 @@
 """The settings of a proxy, validated."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
@@ -73,16 +74,17 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
     return settings
 
 
+_RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TIMES = ("probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval")
 _MAY_BE_ZERO = ("cleanup_after", "linger")
 
 
 def parse_range(option: str, text: str) -> PortRange:
     """Parse ``first-last``. Raises SettingError that names ``option``."""
-    first, _, last = text.partition("-")
-    if not (first.strip().isdecimal() and last.strip().isdecimal()):
-        raise SettingError(option, f"{text!r} is not a range such as 45000-45099")
-    ports = PortRange(int(first), int(last))
+    found = _RANGE.fullmatch(text)
+    if found is None:
+        raise SettingError(option, f"{text[:40]!r} is not a range such as 45000-45099")
+    ports = PortRange(int(found[1]), int(found[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
         raise SettingError(option, f"{text!r} must rise and lie between 1 and 65535")
     return ports

@@ -51,8 +51,7 @@ def _head(status: Status) -> Iterator[str]:
     yield f"ports    {_ports(status)}"
     networks = listed(map(clean, settings["inside_networks"])) or "none"
     yield (
-        f"inside   ROS_MASTER_URI=http://<this host>:{settings['master_port']}, "
-        f"networks {networks}"
+        f"inside   ROS_MASTER_URI=http://<this host>:{settings['master_port']}, networks {networks}"
     )
     if settings["publish_master"]:
         host = clean(settings["advertise_host"])
@@ -146,9 +145,7 @@ def _names(word: str, names: Sequence[str], columns: int) -> Iterator[str]:
 def _connection(connection: Status) -> str:
     what = f"{clean(connection['kind'])} {clean(connection['name'])}"
     who = f"{clean(connection['caller_id']) or '?'} at {clean(connection['peer'])}"
-    traffic = (
-        f"{size(connection['sent'])} out, {size(connection['received'])} in"
-    )
+    traffic = f"{size(connection['sent'])} out, {size(connection['received'])} in"
     return f"{'connected':<11}{what} with {who}: {traffic}"
 
 

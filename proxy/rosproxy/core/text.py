@@ -3,7 +3,7 @@
 import textwrap
 import unicodedata
 from collections.abc import Iterable, Sequence
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 
 GAP = "  "
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
@@ -26,7 +26,7 @@ def width(text: str) -> int:
 
 
 def shorten(text: str, most: int) -> str:
-    """The text in at most ``most`` columns: its middle left out, since both ends tell names apart."""
+    """The text in ``most`` columns: without its middle, since both ends tell names apart."""
     if width(text) <= most:
         return text
     room = max(most - 1, 0)
@@ -73,7 +73,7 @@ def duration(seconds: float) -> str:
         return f"{max(seconds, 0.0):.1f} s"
     size, unit = next(row for row in _TIMES if seconds >= row[0])
     count, rest = divmod(seconds, size)
-    below = dict(zip(_TIMES, _TIMES[1:], strict=False)).get((size, unit))
+    below = dict(pairwise(_TIMES)).get((size, unit))
     minor = int(rest // below[0]) if below and unit != "min" else 0
     return f"{count:.0f} {unit}" + (f" {minor} {below[1]}" if below and minor else "")
 
@@ -83,7 +83,8 @@ def size(count: float) -> str:
     unit = 0
     while count >= 999.5 and unit < len(_UNITS) - 1:
         count, unit = count / 1000, unit + 1
-    return f"{count:.1f} {_UNITS[unit]}" if 0 < count < 99.95 and unit else f"{count:.0f} {_UNITS[unit]}"
+    digits = 1 if unit and count < 99.95 else 0
+    return f"{count:.{digits}f} {_UNITS[unit]}"
 
 
 def plural(count: int, word: str) -> str:

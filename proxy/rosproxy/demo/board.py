@@ -20,8 +20,7 @@ class Row:
     node: str
     own: str
     seen: str
-    published: str
-    unheard: str
+    sent: str
     received: str
     rate: str
     state: str
@@ -32,9 +31,8 @@ HEADINGS = Row(
     "NODE",
     "CALLS ITSELF",
     "OTHER SIDE USES",
-    "PUBLISHED",
-    "UNHEARD",
-    "RECEIVED",
+    "SENT",
+    "RECV",
     "RATE",
     "STATE",
 )
@@ -54,7 +52,7 @@ class Entry:
     def rate(self, now: float) -> str:
         """Return how often its count went up in the last second."""
         count = _progress(self.worker.state)
-        if count is None:
+        if count is None or not self.worker.running:
             return ""
         self.history.append((now, count))
         while self.history[0][0] < now - RATE_SECONDS:
@@ -66,14 +64,13 @@ class Entry:
     def row(self, now: float) -> Row:
         """Return the node's row."""
         state = self.worker.state
-        publisher, subscription = state.get("publisher") or {}, state.get("subscription") or {}
+        subscription = state.get("subscription") or {}
         return Row(
             self.side,
             self.node,
             _address(state.get("uri", "")),
             self.seen,
-            _text(publisher.get("published")),
-            _text(publisher.get("unheard")),
+            _text(_sent(state)),
             _text(subscription.get("count")),
             self.rate(now),
             self._condition(),
@@ -84,17 +81,23 @@ class Entry:
         if not self.worker.running:
             return "stopped"
         if not state.get("registered"):
-            return "waits for its master"
+            return "waiting for its master"
         if state["publisher"]:
-            return _plural(state["publisher"]["connected"], "subscriber")
+            return self._talking(state["publisher"])
         if state["subscription"]:
             return self._listening(state["subscription"])
-        return _plural(state["answered"] or 0, "call") + " answered"
+        return _plural(state["answered"] or 0, "call")
+
+    def _talking(self, publisher: dict[str, Any]) -> str:
+        condition = "connected" if publisher["connected"] else "nobody listens"
+        unheard = publisher["unheard"]
+        return f"{condition}, {unheard} unheard" if unheard else condition
 
     def _listening(self, subscription: dict[str, Any]) -> str:
         if subscription["connected"]:
             return "connected"
-        return subscription["problem"] or "no publisher"
+        # The number of the error says nothing that its text doesn't.
+        return subscription["problem"].rpartition("] ")[2] or "no publisher"
 
 
 @dataclass
@@ -124,6 +127,12 @@ class Board:
         now = time.monotonic()
         entries = sorted(self.entries.values(), key=lambda entry: entry.side)
         return [entry.row(now) for entry in entries]
+
+
+def _sent(state: dict[str, Any]) -> int | None:
+    """Return how many messages went to a subscriber; None for a node that doesn't publish."""
+    publisher = state.get("publisher")
+    return publisher["published"] - publisher["unheard"] if publisher else None
 
 
 def _progress(state: dict[str, Any]) -> int | None:

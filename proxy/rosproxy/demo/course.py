@@ -66,7 +66,7 @@ class Course:
         await self._start_nodes(cast.OUTSIDE, self._master_uri)
 
     async def _try_without_proxy(self) -> None:
-        self._board.enter("without rosproxy: the inside talker uses the real master")
+        self._board.enter("without rosproxy: inside registers at the master")
         await self._start_nodes((cast.INSIDE_TALKER,), self._master_uri)
         listener = self._workers[cast.OUTSIDE_LISTENER]
         await until(lambda: _heard(listener)["problem"], START_SECONDS, "the direct attempt")
@@ -108,14 +108,14 @@ class Course:
         await asyncio.sleep(max(SHORTEST_TRAFFIC, moment - self._board.clock()))
 
     async def _kill_and_restart(self) -> None:
-        self._board.enter("rosproxy killed (SIGKILL); no node is restarted")
+        self._board.enter("SIGKILL; no node is restarted")
         proxy = self._running_proxy()
         self._killed = time.monotonic()
         await proxy.kill()
         self._board.proxy = "killed"
         self._board.tell("rosproxy killed with SIGKILL")
         await asyncio.sleep(min(LONGEST_OUTAGE, self._seconds / 10))
-        self._board.enter("rosproxy restarted: same command, no state on disk")
+        self._board.enter("restart: same command, no state on disk")
         self._restarted = time.monotonic()
         await self._start_proxy()
 
@@ -211,24 +211,28 @@ class Course:
         self.evidence.message_recovery = first - self._restarted
         self.evidence.service_recovery = answered - self._restarted
         self._board.tell(
-            f"recovered: first message {first - self._restarted:.2f} s after the restart,"
-            f" first service call {answered - self._restarted:.2f} s"
-            f" (outage in all: {max(first, answered) - self._killed:.2f} s)"
+            f"first message {first - self._restarted:.2f} s after the restart,"
+            f" first service call {answered - self._restarted:.2f} s;"
+            f" the whole outage took {max(first, answered) - self._killed:.2f} s"
         )
 
     async def _call_both_ways(self) -> tuple[str, ...]:
         """Call each side's service from the other; return the two problems, empty if none."""
-        ways = (
-            ("outside calls inside", cast.OUTSIDE_LISTENER, ADD_INSIDE),
-            ("inside calls outside", cast.INSIDE_LISTENER, ADD_OUTSIDE),
+        ways = {
+            "outside calls inside": (cast.OUTSIDE_LISTENER, ADD_INSIDE),
+            "inside calls outside": (cast.INSIDE_LISTENER, ADD_OUTSIDE),
+        }
+        results = {way: await self._call(*who) for way, who in ways.items()}
+        told = ", ".join(f"{way}: {result}" for way, result in results.items())
+        self._board.tell(f"service calls, {told}")
+        right = "2 + 3 = 5"
+        return tuple(
+            "" if result == right else f"{way}: {result}" for way, result in results.items()
         )
-        return tuple([await self._call(*way) for way in ways])
 
-    async def _call(self, way: str, caller: Role, service: str) -> str:
+    async def _call(self, caller: Role, service: str) -> str:
         answer = await self._workers[caller].request("call", service=service, a=2, b=3)
-        result = f"2 + 3 = {answer['sum']}" if "sum" in answer else answer["error"]
-        self._board.tell(f"service call, {way}: {result}")
-        return "" if answer.get("sum") == 5 else f"{way}: {result}"
+        return f"2 + 3 = {answer['sum']}" if "sum" in answer else str(answer["error"])
 
     async def _inside_addresses(self) -> dict[str, str]:
         """Return where outside finds each inside node.

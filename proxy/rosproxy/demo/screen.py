@@ -15,7 +15,7 @@ BOLD, DIM, GREEN, RED, PLAIN = "\x1b[1m", "\x1b[2m", "\x1b[32m", "\x1b[31m", "\x
 CLEAR_LINE, CLEAR_BELOW = "\x1b[K", "\x1b[J"
 EVENTS_SHOWN = 8
 # The counts stand to the right, everything else to the left.
-RIGHT = (False, False, False, False, True, True, True, True, False)
+RIGHT = (False, False, False, False, True, True, True, False)
 
 
 def _widths(rows: list[Row]) -> list[int]:
@@ -23,18 +23,19 @@ def _widths(rows: list[Row]) -> list[int]:
     return [max(len(cell) for cell in column) for column in columns]
 
 
-def _line(row: Row, widths: list[int]) -> str:
+def _line(row: Row, widths: list[int], gap: str) -> str:
     cells = zip(astuple(row), widths, RIGHT, strict=True)
-    return "  ".join(
+    return gap.join(
         cell.rjust(width) if right else cell.ljust(width) for cell, width, right in cells
     ).rstrip()
 
 
-def table(rows: list[Row]) -> list[str]:
-    """Return the table's lines, headings first."""
+def table(rows: list[Row], width: int) -> list[str]:
+    """Return the table's lines, headings first; closer together where `width` is short."""
     everything = [HEADINGS, *rows]
     widths = _widths(everything)
-    return [_line(row, widths) for row in everything]
+    gap = "  " if sum(widths) + 2 * len(widths) <= width else " "
+    return [_line(row, widths, gap) for row in everything]
 
 
 def event_lines(board: Board) -> list[str]:
@@ -42,10 +43,10 @@ def event_lines(board: Board) -> list[str]:
     return [f"{moment:5.1f} s  {text}" for moment, text in board.events]
 
 
-def frame(board: Board) -> list[tuple[str, str]]:
+def frame(board: Board, width: int) -> list[tuple[str, str]]:
     """Return the whole screen as pairs (style, line)."""
-    title = f"rosproxy demo   {board.clock():5.1f} s   {board.phase}   [proxy: {board.proxy}]"
-    headings, *rows = table(board.rows())
+    title = f"{board.clock():5.1f} s  [rosproxy {board.proxy}]  {board.phase}"
+    headings, *rows = table(board.rows(), width)
     events = event_lines(board)[-EVENTS_SHOWN:]
     return [
         (BOLD, title),
@@ -69,7 +70,8 @@ class LiveScreen:
     def draw(self, board: Board) -> None:
         """Draw over the frame that was drawn last."""
         width = shutil.get_terminal_size().columns
-        lines = [f"{style}{text[: width - 1]}{PLAIN}{CLEAR_LINE}" for style, text in frame(board)]
+        shown = frame(board, width)
+        lines = [f"{style}{text[: width - 1]}{PLAIN}{CLEAR_LINE}" for style, text in shown]
         up = f"\x1b[{self._height}A" if self._height else ""
         self._out.write(up + "\n".join(lines) + "\n" + CLEAR_BELOW)
         self._out.flush()
@@ -95,9 +97,9 @@ class LineScreen:
 
 
 def _counts(board: Board) -> str:
-    rows = [row for row in board.rows() if row.published or row.received]
+    rows = [row for row in board.rows() if row.sent or row.received]
     return "  ".join(
-        f"{row.side} {row.node}: {row.published or row.received} ({row.state})" for row in rows
+        f"{row.side} {row.node}: {row.sent or row.received} ({row.state})" for row in rows
     )
 
 

@@ -137,6 +137,8 @@ def judge(evidence: Evidence) -> list[Verdict]:
 def _direct(evidence: Evidence) -> Verdict:
     failed = evidence.direct_received == 0 and bool(evidence.direct_problem)
     detail = f"outside received {evidence.direct_received} messages: {evidence.direct_problem}"
+    if evidence.direct_received is None:
+        detail = "not tried"
     return Verdict("without the proxy nothing crosses", failed, detail)
 
 
@@ -146,16 +148,22 @@ def _stream(count: StreamCount) -> Verdict:
 
 def _services(expectation: str, problems: tuple[str, ...]) -> Verdict:
     failures = [problem for problem in problems if problem]
-    detail = "; ".join(failures) or f"{len(problems)} of {len(problems)} answered"
+    answered = f"{len(problems)} answered" if problems else "none was made"
+    detail = "; ".join(failures) or answered
     return Verdict(expectation, bool(problems) and not failures, detail)
 
 
 def _addresses(evidence: Evidence) -> Verdict:
-    before, after = evidence.addresses_before or {}, evidence.addresses_after or {}
-    same = bool(before) and before == after
-    shown = ", ".join(f"{name} {address}" for name, address in after.items())
-    detail = shown if same else f"before: {before}, after: {after}"
+    before, after = _listed(evidence.addresses_before), _listed(evidence.addresses_after)
+    same = bool(evidence.addresses_before) and before == after
+    detail = after if same else f"before the kill: {before}; after the restart: {after}"
     return Verdict("the same ports serve the same nodes", same, detail)
+
+
+def _listed(addresses: dict[str, str] | None) -> str:
+    if addresses is None:
+        return "not looked up"
+    return ", ".join(f"{name} {address}" for name, address in addresses.items())
 
 
 def _recovery(evidence: Evidence) -> Verdict:

@@ -171,6 +171,9 @@ int main(int argc, char** argv) {
   std::vector<std::string> words(argv + 2, argv + argc);
   ros::start();
   say("node " + ros::this_node::getName());
+  // The first line for rosout makes roscpp subscribe to a parameter. If that happens only when
+  // a node of the same name has it shut down, the master takes it for the newer of the two.
+  ROS_INFO("started");
   roles.at(argv[1])(Options(words));
   // Left to static destructors, the shutdown dead-locks with one that SIGINT asks for.
   ros::shutdown();

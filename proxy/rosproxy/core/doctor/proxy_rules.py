@@ -1,0 +1,244 @@
+"""The proxy itself: its admin endpoint, its master, its advertised address and its ports."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from rosproxy.core.doctor.facts import Attempt, Facts, Master, Reach
+from rosproxy.core.doctor.findings import Finding, Severity
+from rosproxy.core.text import duration, plural
+from rosproxy.core.uris import is_loopback
+
+FEW_FREE = 0.1
+"""Share of the range that should be free at least."""
+
+_TRIES = {
+    "refused": "nothing listens there: the range is not published, or the host is another machine",
+    "silent": "no answer: a firewall drops it, or the host is not this one",
+    "unreachable": "no way leads there",
+    "unresolvable": "the host name is unknown here",
+    "closed": "something takes the connection and drops it: published to another port or container",
+    "stranger": "something else answers there, not this proxy",
+}
+
+
+def check(facts: Facts) -> Iterator[Finding]:
+    """All findings about the proxy."""
+    for rule in (_admin, _master, _advertised_host, _range, _ports, _published_master):
+        yield from rule(facts)
+
+
+def _admin(facts: Facts) -> Iterator[Finding]:
+    if facts.status is None:
+        yield Finding(
+            Severity.ERROR,
+            "admin",
+            "",
+            facts.admin_error,
+            "docker exec CONTAINER rosproxy doctor; what follows is only what can be told "
+            "without the proxy",
+        )
+        return
+    status = facts.status
+    up = duration(status["uptime"])
+    text = f"rosproxy {status['version']} at {facts.admin}, up {up}"
+    yield Finding(Severity.OK, "admin", "proxy", text)
+
+
+def _master(facts: Facts) -> Iterator[Finding]:
+    master = facts.master
+    if master is None:
+        text = "not checked: no address is known"
+        yield Finding(Severity.INFO, "master", "master", text, "give --master-uri (ROS_MASTER_URI)")
+        return
+    if master.looped:
+        text = f"{master.uri} leads back to this proxy itself"
+        yield _error_of_master(text, _other_uri())
+    elif master.attempt.reach is Reach.ANSWERED:
+        trip = f" in {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
+        by = ", through another rosproxy" if master.proxied else ""
+        yield Finding(Severity.OK, "master", "master", f"{master.uri} answers{trip}{by}")
+        yield from _master_elsewhere(facts, master)
+    else:
+        yield _error_of_master(*_unanswered(master))
+
+
+def _master_elsewhere(facts: Facts, master: Master) -> Iterator[Finding]:
+    """The master answers the doctor: does it answer the proxy as well?"""
+    seen = facts.status["master"] if facts.status else {"up": True}
+    if not seen["up"] and seen["error"]:
+        text = f"{master.uri} answers here, but the proxy says: {seen['error']}"
+        fix = "wait some seconds; if it stays, run this where the proxy runs"
+        yield Finding(Severity.WARNING, "master", "master", text, fix)
+
+
+def _unanswered(master: Master) -> tuple[str, str]:
+    parts = urlsplit(master.uri)
+    host, port = parts.hostname or "", parts.port
+    match master.attempt.reach:
+        case Reach.UNRESOLVABLE:
+            return (
+                f"{master.uri}: the host name {host} can't be resolved here",
+                f"docker run --add-host {host}:ADDRESS, in Kubernetes hostAliases; or "
+                f"--master-uri http://ADDRESS:{port}",
+            )
+        case Reach.STRANGER if master.at_root:
+            return (
+                f"{master.uri}: a master answers there, but not at the path {parts.path} (it "
+                "knows only / and /RPC2)",
+                f"--master-uri http://{parts.netloc}/",
+            )
+        case Reach.STRANGER:
+            return (
+                f"{master.uri}: what answers there is no ROS master ({master.attempt.reason})",
+                _other_uri(),
+            )
+        case Reach.REFUSED if is_loopback(host):
+            return (
+                f"{master.uri} refuses connections. In a container {host} is the container itself",
+                f"--master-uri http://ADDRESS:{port} with an address of the master's machine",
+            )
+        case Reach.REFUSED:
+            return (
+                f"{master.uri} refuses connections: no roscore runs there",
+                f"on {host}: roscore -p {port}; or {_other_uri()}",
+            )
+    return (
+        f"{master.uri} does not answer ({master.attempt.reason}): its machine is down or cut "
+        "off, or a firewall drops it",
+        f"from here: nc -vz {host} {port}; on {host}: rosnode list",
+    )
+
+
+def _other_uri() -> str:
+    return "give the real master's address: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
+
+
+def _error_of_master(text: str, fix: str) -> Finding:
+    return Finding(Severity.ERROR, "master", "master", text, fix)
+
+
+def _advertised_host(facts: Facts) -> Iterator[Finding]:
+    host = facts.advertise_host
+    if not host:
+        text = "not checked: it is not known"
+        fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
+        yield Finding(Severity.INFO, "advertised host", "advertised host", text, fix)
+    elif is_loopback(host) and not local_master(facts):
+        yield Finding(
+            Severity.ERROR,
+            "advertised host",
+            "advertised host",
+            f"{host} is a loopback address: to every other machine it means that machine itself",
+            "--advertise-host ADDRESS, the address of this host in the network of the robots "
+            "(ROSPROXY_ADVERTISE_HOST)",
+        )
+
+
+def local_master(facts: Facts) -> bool:
+    """Whether the master is on loopback, so that all of ROS is on this machine."""
+    if facts.master is None:
+        return False
+    host = urlsplit(facts.master.uri).hostname or ""
+    return is_loopback(host) or any(map(is_loopback, facts.master.addresses))
+
+
+def _range(facts: Facts) -> Iterator[Finding]:
+    if facts.status is None:
+        return
+    if facts.probe is None:
+        text = f"not tried: {facts.probe_error}"
+        yield Finding(Severity.WARNING, "published range", "published range", text)
+        return
+    outcomes: dict[tuple[str, str], list[str]] = {}
+    for probe in facts.probe["probes"]:
+        key = probe["from_proxy"], probe["from_master"]
+        outcomes.setdefault(key, []).append(probe["advertised"])
+    for (mine, masters), addresses in outcomes.items():
+        whole = len(outcomes) == 1
+        yield _tried(facts.status, mine, masters, " and ".join(dict.fromkeys(addresses)), whole)
+
+
+def _tried(
+    status: Mapping[str, Any], mine: str, masters: str, addresses: str, whole: bool
+) -> Finding:
+    """What two tries at free ports mean: by the proxy itself and by the master."""
+    check = "published range"
+    if masters == "ok":
+        text = f"the master reaches {addresses}"
+        if mine != "ok":
+            text += f"; the proxy itself does not ({mine}), which does no harm"
+        return Finding(Severity.OK, check, check, text)
+    if mine == "ok" and masters == "unknown":
+        text = f"the proxy reaches {addresses}; the master could not be asked to try"
+        return Finding(Severity.OK, check, check, text)
+    if mine == "ok":
+        text = (
+            f"{addresses} leads here from here, but not from the master: there it is another "
+            "machine, an address that only this side has, or behind a firewall"
+        )
+        return Finding(Severity.ERROR, check, check, text, _fix_host(addresses))
+    text = f"{addresses}: {_TRIES.get(mine, mine)}"
+    if masters == "missed":
+        text += ". The master does not get through either"
+    return Finding(Severity.ERROR, check, check, text, _fix_range(status, mine, addresses, whole))
+
+
+def _fix_host(addresses: str) -> str:
+    where = addresses.split(" ", maxsplit=1)[0].rpartition(":")
+    return (
+        "--advertise-host ADDRESS, this host's address as the master's machine knows it; to try "
+        f"on that machine: nc -vz {where[0]} {where[2]}"
+    )
+
+
+def _fix_range(status: Mapping[str, Any], mine: str, addresses: str, whole: bool) -> str:
+    if mine == "unresolvable":
+        return "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
+    ports = status["ports"]
+    publish = f"docker run -p {ports['advertise']}:{ports['listen']}"
+    if not whole:
+        return f"publish the whole range: {publish}"
+    return f"{publish}; or another --advertise-host than {addresses.rpartition(':')[0]}"
+
+
+def _ports(facts: Facts) -> Iterator[Finding]:
+    if facts.status is None:
+        return
+    ports = facts.status["ports"]
+    used, free, blocked = ports["used"], ports["free"], ports["blocked"]
+    larger = "a larger --port-range (ROSPROXY_PORT_RANGE), published as well"
+    if blocked:
+        first, last = ports["listen"].split("-")
+        text = f"{plural(blocked, 'port')} of the range {ports['listen']} held by other programs"
+        look = f"ss -ltnp 'sport >= {first} and sport <= {last}'"
+        yield _of_ports(Severity.WARNING, text, f"{look}; or another --port-range")
+    if not free:
+        yield _of_ports(
+            Severity.ERROR, f"none is free, {used} used: no further node gets in", larger
+        )
+    elif free < FEW_FREE * (used + free + blocked):
+        yield _of_ports(Severity.WARNING, f"only {free} left, {used} used", larger)
+    else:
+        mapped = f"{ports['listen']} as {ports['advertise']}"
+        yield _of_ports(Severity.OK, f"{mapped}, {used} used, {free} free")
+
+
+def _of_ports(severity: Severity, text: str, fix: str = "") -> Finding:
+    return Finding(severity, "ports", "ports", text, fix)
+
+
+def _published_master(facts: Facts) -> Iterator[Finding]:
+    port = facts.status["settings"]["publish_master"] if facts.status else None
+    if port is None:
+        return
+    uri = f"http://{facts.advertise_host}:{port}"
+    yield _published(uri, port, facts.published_master)
+
+
+def _published(uri: str, port: int, attempt: Attempt) -> Finding:
+    check = "published master"
+    if not attempt.failed:
+        return Finding(Severity.OK, check, check, f"{uri} {attempt.reach.value}")
+    text = f"{uri} for nodes outside: {attempt.reach.value}"
+    return Finding(Severity.ERROR, check, check, text, f"docker run -p {port}:{port}")

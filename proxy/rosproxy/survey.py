@@ -1,0 +1,361 @@
+"""Gathering the facts for ``rosproxy doctor``: asks the proxy, the master and the nodes.
+
+It changes nothing, apart from the short-lived parameter by which the proxy has the master try its
+ports (see `range_probe`). Names and addresses are tried from where it runs; that should be where
+the proxy runs.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+from xmlrpc.client import Fault, loads
+
+from rosproxy.admin_client import AdminClient, AdminError
+from rosproxy.core import xmlrpc
+from rosproxy.core.doctor.facts import (
+    Attempt,
+    Facts,
+    Graph,
+    Master,
+    Node,
+    Reach,
+    Words,
+    scope,
+)
+from rosproxy.core.doctor.pair_rules import connected
+from rosproxy.core.tcpros import decode_header, encode_header, header_length
+from rosproxy.core.uris import HostPort, parse_host_port, parse_service_uri, parse_slave_uri
+from rosproxy.metrics import Metrics
+from rosproxy.network import resolve
+from rosproxy.upstream import CALLER_ID, MasterError, Unreachable, Upstream
+
+PARALLEL = 64
+WITHIN = 3.0
+"""Seconds that a node has to answer."""
+
+Key = TypeVar("Key")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Patient:
+    """What to look at: the admin endpoint, and what is known in case that it doesn't answer."""
+
+    admin: AdminClient
+    master_uri: str = ""
+    advertise_host: str = ""
+    names: tuple[str, ...] = ()
+
+
+async def survey(patient: Patient) -> Facts:
+    """Gather all facts."""
+    asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(PARALLEL))
+    facts = Facts(
+        admin=patient.admin.url, advertise_host=patient.advertise_host, names=patient.names
+    )
+    try:
+        status = await asyncio.to_thread(patient.admin.status)
+    except AdminError as error:
+        facts = replace(facts, admin_error=str(error))
+        return await _beyond(facts, patient.master_uri, "")
+    facts = replace(facts, status=status, advertise_host=status["settings"]["advertise_host"])
+    beyond = asyncio.create_task(_beyond(facts, status["master"]["uri"], status["instance"]))
+    probe, reason = await _probe(patient.admin)
+    return replace(await beyond, probe=probe, probe_error=reason)
+
+
+async def _probe(admin: AdminClient) -> tuple[dict[str, Any] | None, str]:
+    """What the proxy finds out about its range, or why it could not be asked."""
+    try:
+        return await asyncio.to_thread(admin.probe), ""
+    except AdminError as error:
+        return None, str(error)
+
+
+async def _beyond(facts: Facts, master_uri: str, instance: str) -> Facts:
+    """What the master and the nodes say."""
+    if not master_uri:
+        return facts
+    async with _upstream(master_uri, instance) as upstream:
+        survey = _Survey(upstream)
+        facts = replace(
+            facts,
+            master=await survey.master(),
+            published_master=await survey.published_master(facts),
+        )
+        if facts.master and facts.master.attempt.reach is Reach.ANSWERED:
+            with contextlib.suppress(Unreachable, MasterError):
+                facts = await survey.graph(facts)
+    return facts
+
+
+@contextlib.asynccontextmanager
+async def _upstream(master_uri: str, instance: str) -> AsyncIterator[Upstream]:
+    upstream = Upstream(master_uri, instance, Metrics())
+    try:
+        yield upstream
+    finally:
+        await upstream.close()
+
+
+class _Survey:
+    """Questions to the master and to nodes, a bounded number at once."""
+
+    def __init__(self, upstream: Upstream) -> None:
+        self._upstream = upstream
+        self._limit = asyncio.Semaphore(PARALLEL)
+
+    async def master(self) -> Master:
+        """Look at the master: its name, its answer, its path, and whether it is the proxy."""
+        uri = self._upstream.master_uri
+        host = urlsplit(uri).hostname or ""
+        found = Master(uri, addresses=tuple(await resolve(host)))
+        if not found.addresses:
+            return replace(found, attempt=Attempt(Reach.UNRESOLVABLE))
+        started = time.monotonic()
+        attempt, looped = await self._ask_master()
+        found = replace(
+            found,
+            attempt=attempt,
+            looped=looped,
+            proxied=await self._is_proxy(uri),
+            round_trip=time.monotonic() - started,
+        )
+        if attempt.reach is Reach.STRANGER and urlsplit(uri).path not in ("", "/"):
+            found = replace(found, at_root=await self._answers_at_root(uri))
+        return found
+
+    async def published_master(self, facts: Facts) -> Attempt:
+        """Try the master as outside is offered it (``--publish-master``)."""
+        port = facts.status["settings"]["publish_master"] if facts.status else None
+        return await self._pid(HostPort(facts.advertise_host, port)) if port else Attempt()
+
+    async def graph(self, facts: Facts) -> Facts:
+        """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
+        ask = self._upstream.ask_master
+        graph = Graph(*[dict(rows) for rows in await ask("getSystemState")])
+        names, services = sorted(graph.names()), sorted(graph.services)
+        uris = await self._look_up("lookupNode", names)
+        facts = replace(
+            facts,
+            graph=graph,
+            clock=await self._simulated_time(),
+            service_uris=await self._look_up("lookupService", services),
+        )
+        nodes = {name: Node(name, uris.get(name, "")) for name in names}
+        involved = scope(graph, facts.names)
+        tried = {n: nodes[n] for n in (involved.nodes if facts.names else names)}
+        nodes |= await _each(tried, lambda node: self._node(facts, node))
+        facts = replace(facts, nodes=nodes)
+        if facts.names:
+            facts = await self._closer(facts)
+        return facts
+
+    async def _closer(self, facts: Facts) -> Facts:
+        """Ask the nodes and services that the user named."""
+        asked = {name: facts.nodes[name] for name in facts.scope.nodes}
+        described = {**facts.nodes, **await _each(asked, lambda n: self._describe(facts, n))}
+        apart = {
+            (giver, topic): (described[giver], topic)
+            for topic, giver, taker in facts.scope.pairs
+            if not connected(topic, described[giver], described[taker])
+        }
+        ports = await _each(apart, lambda item: self._data_port(facts, *item))
+        services = {name: name for name in facts.scope.services}
+        return replace(
+            facts,
+            nodes=described,
+            data_ports=ports,
+            services=await _each(services, lambda name: self._service(facts, name)),
+        )
+
+    async def _ask_master(self) -> tuple[Attempt, bool]:
+        """How the master answers ``getPid``, and whether it is the proxy that refuses a loop."""
+        try:
+            reply = await self._upstream.master(xmlrpc.dump_call("getPid", CALLER_ID))
+            xmlrpc.parse_reply(reply)
+            loads(reply)
+        except Unreachable as error:
+            return _attempt(error), False
+        except Fault as fault:
+            looped = "leads back to the proxy itself" in str(fault.faultString)
+            return Attempt(Reach.STRANGER, str(fault.faultString)[:200]), looped
+        except xmlrpc.XmlRpcError as error:
+            return Attempt(Reach.STRANGER, str(error)), False
+        return Attempt(Reach.ANSWERED), False
+
+    async def _is_proxy(self, uri: str) -> bool:
+        """Whether a GET is answered as a rosproxy does; a ROS master refuses it."""
+        where = parse_slave_uri(uri)
+        if where is None:
+            return False
+        reply = await _exchange(where, b"GET / HTTP/1.0\r\n\r\n")
+        return b"\r\n\r\nrosproxy: " in reply
+
+    async def _answers_at_root(self, uri: str) -> bool:
+        where = parse_slave_uri(uri)
+        return where is not None and (await self._pid(where)).reach is Reach.ANSWERED
+
+    async def _simulated_time(self) -> bool:
+        try:
+            said = await self._upstream.ask_master("getParam", "/use_sim_time")
+        except MasterError:
+            return False
+        return said in ("1", "true", 1)
+
+    async def _look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
+        wanted = list(names)
+        found = await self._upstream.batch([(method, [CALLER_ID, name]) for name in wanted])
+        pairs = zip(wanted, found, strict=False)
+        return {name: uri for name, uri in pairs if isinstance(uri, str)}
+
+    async def _node(self, facts: Facts, node: Node) -> Node:
+        """Try a node at its address; one behind this proxy is the proxy's to judge."""
+        where = node.where
+        if where is None or facts.ours(where):
+            return node
+        addresses = tuple(await resolve(where.host))
+        if not addresses:
+            return replace(node, attempt=Attempt(Reach.UNRESOLVABLE))
+        async with self._limit:
+            return replace(node, addresses=addresses, attempt=await self._pid(where))
+
+    async def _pid(self, where: HostPort) -> Attempt:
+        try:
+            pid = await self._upstream.ask_node(where, WITHIN, "getPid")
+        except (Unreachable, MasterError) as error:
+            return _attempt(error)
+        if isinstance(pid, int):
+            return Attempt(Reach.ANSWERED)
+        return Attempt(Reach.STRANGER, "its answer is not a node's")
+
+    async def _describe(self, facts: Facts, node: Node) -> Node:
+        """What a node says of itself, asked through the proxy if it is behind it."""
+        where = _door(facts, node)
+        if where is None or node.attempt.failed:
+            return node
+        try:
+            async with self._limit:
+                words = await self._words(where)
+        except (Unreachable, MasterError):
+            return node
+        return replace(node, words=words)
+
+    async def _words(self, where: HostPort) -> Words:
+        publishes, subscribes, bus = await asyncio.gather(
+            *(
+                self._upstream.ask_node(where, WITHIN, method)
+                for method in ("getPublications", "getSubscriptions", "getBusInfo")
+            )
+        )
+        peers = {(row[2], row[4], row[1]) for row in bus if len(row) > 5 and row[5]}
+        return Words(dict(publishes), dict(subscribes), frozenset(peers))
+
+    async def _data_port(self, facts: Facts, node: Node, topic: str) -> tuple[str, Attempt]:
+        """Where a publisher serves a topic, and whether a subscriber gets through to there."""
+        where = _door(facts, node)
+        if where is None or node.words is None:
+            return "", Attempt()
+        try:
+            answer = await self._upstream.ask_node(
+                where, WITHIN, "requestTopic", topic, [["TCPROS"]]
+            )
+            target = HostPort(str(answer[1]), int(answer[2]))
+        except (Unreachable, MasterError) as error:
+            return "", _attempt(error)
+        except (LookupError, TypeError, ValueError):
+            return "", Attempt(Reach.STRANGER, "no TCPROS address")
+        if facts.ours(node.where):
+            return str(target), Attempt()
+        probe = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
+        return str(target), await _shake_hands(target, probe)
+
+    async def _service(self, facts: Facts, service: str) -> Attempt:
+        """Ask a service for its type, as rosservice does."""
+        where = parse_service_uri(facts.service_uris.get(service, ""))
+        if where is None:
+            return Attempt(Reach.STRANGER, "no address")
+        if facts.ours(where):
+            where = _proxy_door(facts, where.port)
+        if where is None:
+            return Attempt(Reach.REFUSED, "its port is not held by a node")
+        header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
+        return await _shake_hands(where, header)
+
+
+def _door(facts: Facts, node: Node) -> HostPort | None:
+    """Where to ask a node: behind this proxy at its port of the proxy, else at its own address."""
+    if node.where and facts.ours(node.where):
+        return _proxy_door(facts, node.where.port)
+    return node.where
+
+
+def _proxy_door(facts: Facts, advertised: int) -> HostPort | None:
+    """The port of the proxy behind an advertised one, as it is reached without the host's NAT."""
+    lease = facts.leases.get(advertised)
+    admin = parse_host_port(facts.admin.removeprefix("http://"))
+    if lease is None or facts.status is None or admin is None:
+        return None
+    bound = facts.status["settings"]["bind"]
+    host = admin.host if bound in ("0.0.0.0", "::") else bound
+    return HostPort(host, lease["port"])
+
+
+async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
+    """Exchange TCPROS connection headers."""
+    if not await resolve(where.host):
+        return Attempt(Reach.UNRESOLVABLE, where.host)
+    try:
+        async with asyncio.timeout(WITHIN):
+            reply = await _exchange_header(where, encode_header(header))
+    except ConnectionRefusedError:
+        return Attempt(Reach.REFUSED)
+    except (OSError, EOFError, ValueError) as error:
+        return Attempt(Reach.SILENT, str(error))
+    if "error" in reply:
+        return Attempt(Reach.STRANGER, reply["error"])
+    return Attempt(Reach.ANSWERED)
+
+
+async def _exchange_header(where: HostPort, header: bytes) -> dict[str, str]:
+    reader, writer = await asyncio.open_connection(where.host, where.port)
+    try:
+        writer.write(header)
+        return decode_header(await reader.readexactly(header_length(await reader.readexactly(4))))
+    finally:
+        writer.close()
+
+
+async def _exchange(where: HostPort, request: bytes) -> bytes:
+    """The start of the answer to a request; nothing if there is none."""
+    try:
+        async with asyncio.timeout(WITHIN):
+            reader, writer = await asyncio.open_connection(where.host, where.port)
+            try:
+                writer.write(request)
+                return await reader.read(4096)
+            finally:
+                writer.close()
+    except OSError:
+        return b""
+
+
+def _attempt(error: Unreachable | MasterError) -> Attempt:
+    reason = str(error)
+    if isinstance(error, MasterError) or "HTTP status" in reason or "XML-RPC" in reason:
+        return Attempt(Reach.STRANGER, reason)
+    return Attempt(Reach.REFUSED if error.refused else Reach.SILENT, reason)
+
+
+async def _each(
+    items: Mapping[Key, Item], work: Callable[[Item], Awaitable[Result]]
+) -> dict[Key, Result]:
+    """The results of ``work`` on each item, by the same keys, all at the same time."""
+    results = await asyncio.gather(*(work(item) for item in items.values()))
+    return dict(zip(items, results, strict=True))

@@ -1,0 +1,173 @@
+"""Settings: what is accepted, and that each bad value names its option."""
+
+from ipaddress import ip_network
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosproxy.core.ports import PortMap, PortRange
+from rosproxy.core.settings import SettingError, parse_settings
+from rosproxy.core.uris import HostPort
+
+GIVEN: dict[str, Any] = {
+    # as the command line gives them, with its defaults
+    "master_uri": "http://robot:11311",
+    "advertise_host": "robot-host",
+    "master_port": 11311,
+    "port_range": "45000-45099",
+    "advertise_port_range": None,
+    "publish_master": None,
+    "bind": "0.0.0.0",
+    "admin_bind": "127.0.0.1:11312",
+    "inside_network": (),
+    "probe_interval": 5.0,
+    "probe_timeout": 3.0,
+    "cleanup_after": 30.0,
+    "linger": 30.0,
+    "master_interval": 2.0,
+    "slave_control": "any",
+}
+
+
+def test_the_defaults() -> None:
+    settings = parse_settings(GIVEN)
+    both = PortRange(45000, 45099)
+    assert settings.master_uri == "http://robot:11311"
+    assert settings.ports == PortMap(both, both)
+    assert settings.admin == HostPort("127.0.0.1", 11312)
+    assert (settings.master_port, settings.publish_master) == (11311, None)
+    assert settings.inside_networks == ()
+    assert (settings.probe_interval, settings.cleanup_after, settings.linger) == (5, 30, 30)
+
+
+GOOD = [
+    # option, value given, field, value held
+    ("master_uri", "http://10.0.0.9:11311/", "master_uri", "http://10.0.0.9:11311/"),
+    ("master_uri", "http://[fd00::9]:11311", "master_uri", "http://[fd00::9]:11311"),
+    ("advertise_host", "192.168.1.5", "advertise_host", "192.168.1.5"),
+    ("advertise_host", "fd00::1", "advertise_host", "fd00::1"),
+    ("advertise_host", "[fd00::1]", "advertise_host", "fd00::1"),
+    ("advertise_host", "Robot_1.example.com", "advertise_host", "Robot_1.example.com"),
+    ("master_port", 1, "master_port", 1),
+    ("publish_master", 65535, "publish_master", 65535),
+    ("bind", "::", "bind", "::"),
+    ("admin_bind", "[::1]:80", "admin", HostPort("::1", 80)),
+    ("admin_bind", "0.0.0.0:80", "admin", HostPort("0.0.0.0", 80)),
+    ("cleanup_after", 0.0, "cleanup_after", 0.0),
+    ("linger", 0, "linger", 0.0),
+    ("probe_interval", 0.05, "probe_interval", 0.05),
+    ("probe_timeout", 86400, "probe_timeout", 86400.0),
+    ("slave_control", "master", "slave_control", "master"),
+    (
+        "inside_network",
+        ("10.0.0.0/24", "fd00::/64", "10.1.2.3"),
+        "inside_networks",
+        (ip_network("10.0.0.0/24"), ip_network("fd00::/64"), ip_network("10.1.2.3/32")),
+    ),
+    ("port_range", "1-1", "ports", PortMap(PortRange(1, 1), PortRange(1, 1))),
+    (
+        "port_range",
+        " 45000 - 45001 ",
+        "ports",
+        PortMap(PortRange(45000, 45001), PortRange(45000, 45001)),
+    ),
+    (
+        "advertise_port_range",
+        "30000-30099",
+        "ports",
+        PortMap(PortRange(45000, 45099), PortRange(30000, 30099)),
+    ),
+]
+
+
+@pytest.mark.parametrize(("option", "value", "name", "held"), GOOD)
+def test_a_good_value(option: str, value: Any, name: str, held: Any) -> None:
+    assert getattr(parse_settings({**GIVEN, option: value}), name) == held
+
+
+TIMES = ["probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval"]
+BAD: list[tuple[str, Any, str]] = [
+    # option, value given, part of the complaint
+    ("master_uri", None, "missing"),
+    ("master_uri", "", "missing"),
+    ("master_uri", "robot:11311", "not of the form"),
+    ("master_uri", "http://robot", "not of the form"),
+    ("master_uri", "http://robot:0", "not of the form"),
+    ("master_uri", "http://robot:70000", "not of the form"),
+    ("master_uri", "http://robot:x", "not of the form"),
+    ("master_uri", "http://:11311", "not of the form"),
+    ("master_uri", "https://robot:11311", "not of the form"),
+    ("master_uri", "http://user@robot:11311", "not of the form"),
+    ("master_uri", "http://[fd00::9:11311", "not of the form"),
+    ("advertise_host", None, "missing"),
+    ("advertise_host", "", "missing"),
+    ("advertise_host", "robot:45000", "neither a host name nor an address"),
+    ("advertise_host", "http://robot", "neither a host name nor an address"),
+    ("advertise_host", "ro bot", "neither a host name nor an address"),
+    ("advertise_host", "user@robot", "neither a host name nor an address"),
+    ("advertise_host", "robot/x", "neither a host name nor an address"),
+    ("advertise_host", "fd00::x", "neither a host name nor an address"),
+    ("advertise_host", "[]", "neither a host name nor an address"),
+    ("port_range", "", "not a range"),
+    ("port_range", "45000", "not a range"),
+    ("port_range", "45000-", "not a range"),
+    ("port_range", "-45000", "not a range"),
+    ("port_range", "45000-45010-45020", "not a range"),
+    ("port_range", "45000:45010", "not a range"),
+    ("port_range", "a-b", "not a range"),
+    ("port_range", "9" * 5000 + "-1", "not a range"),
+    ("port_range", "٤-٥", "not a range"),
+    ("port_range", "45010-45000", "must rise"),
+    ("port_range", "0-10", "between 1 and 65535"),
+    ("port_range", "65000-65536", "between 1 and 65535"),
+    ("port_range", "11000-12000", ""),
+    ("advertise_port_range", "30000-30010", "has 11 ports and --port-range 45000-45099 has 100"),
+    ("advertise_port_range", "x", "not a range"),
+    ("advertise_port_range", "65500-65600", "between 1 and 65535"),
+    ("master_port", 0, "not a port"),
+    ("master_port", 65536, "not a port"),
+    ("master_port", -1, "not a port"),
+    ("master_port", 45050, "lies in --port-range 45000-45099"),
+    ("publish_master", 0, "not a port"),
+    ("publish_master", 45099, "lies in --port-range"),
+    ("publish_master", 11311, "that of --master-port"),
+    ("bind", "robot-host", "not an IP address"),
+    ("bind", "", "not an IP address"),
+    ("admin_bind", "11312", "not of the form"),
+    ("admin_bind", "127.0.0.1", "not of the form"),
+    ("admin_bind", ":11312", "not of the form"),
+    ("admin_bind", "127.0.0.1:0", "not of the form"),
+    ("admin_bind", "127.0.0.1:99999", "not of the form"),
+    ("admin_bind", "127.0.0.1:45000", "lies in --port-range"),
+    ("admin_bind", "127.0.0.1:11311", "that of --master-port"),
+    ("inside_network", ("10.0.0.0/33",), "'10.0.0.0/33' is not a network"),
+    ("inside_network", ("10.0.0.0/24", "10.0.0.5/24"), "host bits"),
+    ("inside_network", ("docker0",), "is not a network"),
+    *((name, value, "is not between") for name in TIMES for value in (-1, 86401, float("nan"))),
+    *((name, value, "is not between") for name in TIMES for value in (float("inf"), -0.001)),
+    *((name, 0, "is not between") for name in ("probe_interval", "probe_timeout")),
+    ("master_interval", 0.01, "is not between 0.05 and 86400"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "complaint"), BAD)
+def test_a_bad_value_names_its_option(name: str, value: Any, complaint: str) -> None:
+    with pytest.raises(SettingError) as caught:
+        parse_settings({**GIVEN, name: value})
+    message, option = str(caught.value), "--" + name.replace("_", "-")
+    assert complaint in message
+    assert message.startswith(caught.value.option + ": ")
+    assert "\n" not in message
+    if complaint:
+        assert caught.value.option == option
+    else:  # two options that don't go together: either
+        assert option in message
+
+
+@given(st.sampled_from(["master_uri", "advertise_host", "port_range", "bind", "admin_bind"]), st.text())
+def test_any_text_is_accepted_or_refused_in_one_line(name: str, text: str) -> None:
+    try:
+        parse_settings({**GIVEN, name: text})
+    except SettingError as error:
+        assert len(str(error).splitlines()) == 1
