@@ -11,12 +11,12 @@ from collections.abc import Awaitable, Callable
 from copy import copy
 from typing import Any
 
-from aiohttp import web
+from aiohttp import HttpVersion11, web
 
 from rosproxy.core import xmlrpc
 from rosproxy.core.uris import HostPort, parse_host_port, plain_address
 from rosproxy.relay import reset_on_close
-from rosproxy.upstream import LOOP_HEADER, MAX_BODY, Unreachable, read_bounded
+from rosproxy.upstream import LOOP_HEADER, Unreachable, read_bounded
 
 log = logging.getLogger(__name__)
 
@@ -76,14 +76,8 @@ class XmlRpcServer:
             return web.Response(text=self._greeting)
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
-        try:
-            async with asyncio.timeout(BODY_TIMEOUT):
-                body = await read_bounded(request.content)
-        except TimeoutError:
-            return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
-        except ValueError:
-            return web.Response(status=413, text=f"at most {MAX_BODY} bytes are read\n")
-        return await self._answer(request, body)
+        body = await _body(request)
+        return await self._answer(request, body) if isinstance(body, bytes) else body
 
     async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
         try:
@@ -102,6 +96,29 @@ class XmlRpcServer:
 def _address(request: web.BaseRequest, which: str) -> HostPort:
     found: Any = request.transport.get_extra_info(which) if request.transport else None
     return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
+
+
+async def _body(request: web.BaseRequest) -> bytes | web.StreamResponse:
+    """A request's body, or the response to one that can't be read."""
+    try:
+        async with asyncio.timeout(BODY_TIMEOUT):
+            _invite(request)
+            return await read_bounded(request.content)
+    except TimeoutError:
+        return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
+    except ValueError as error:
+        return web.Response(status=413, text=f"{error}\n")
+    except web.RequestPayloadError as error:
+        return web.Response(status=400, text=f"{error}\n")
+    except ConnectionResetError:
+        return _refuse(request)
+
+
+def _invite(request: web.BaseRequest) -> None:
+    """Ask for the body, if the client waits to be asked."""
+    waits = request.headers.get("Expect", "").lower() == "100-continue"
+    if waits and request.version >= HttpVersion11 and request.transport is not None:
+        request.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
 
 def _refuse(request: web.BaseRequest) -> web.StreamResponse:

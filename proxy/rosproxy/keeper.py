@@ -12,7 +12,7 @@ from rosproxy.leases import Leases
 from rosproxy.network import resolve
 from rosproxy.node_client import NodeClient
 from rosproxy.upkeep import Upkeep
-from rosproxy.upstream import Unreachable
+from rosproxy.upstream import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ class Keeper:
         endpoint.tcpros_port, endpoint.trusted = said.tcpros_port, True
         await self._name(endpoint)
         self._leases.open(endpoint)
+        await self._upkeep.adopt(endpoint, said)
 
     async def probe(self, endpoint: Endpoint) -> None:
         """Probe an endpoint and act on the result."""
@@ -83,7 +84,7 @@ class Keeper:
         try:
             async with self._limit:
                 await self.probe(endpoint)
-        except Unreachable as error:
+        except (Unreachable, MasterError) as error:
             log.debug("upkeep of %s has to wait: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
@@ -91,7 +92,9 @@ class Keeper:
     async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
         if not endpoint.trusted:
             await self.verify(endpoint)
-            if endpoint.trusted:
+            if endpoint.health.pid is None:
+                endpoint.health.pid = pid
+            if self._leases.is_open(endpoint):
                 await self._upkeep.announce([endpoint])
             return
         if endpoint.health.cleaned:

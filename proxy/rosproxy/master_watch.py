@@ -2,15 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Mapping
-from typing import Any
 
 from rosproxy.context import Context
 from rosproxy.core import recovery
-from rosproxy.core.registry import Endpoint, Place, Registration
+from rosproxy.core.registry import Endpoint, Place
 from rosproxy.keeper import Keeper
+from rosproxy.master_graph import read_graph, read_registrations
 from rosproxy.upkeep import Upkeep
-from rosproxy.upstream import CALLER_ID, MasterError, Unreachable
+from rosproxy.upstream import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -75,8 +74,8 @@ class MasterWatch:
 
     async def _recover(self) -> None:
         self._context.refresh_networks()
-        held, uris = await self._snapshot()
-        claims = await self._settled(recovery.claims(held, uris, self._context.addressing))
+        graph = await read_graph(self._context.upstream)
+        claims = await self._settled(recovery.claims(graph, self._context.addressing))
         endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
@@ -112,33 +111,15 @@ class MasterWatch:
 
     async def _resume(self, endpoints: list[Endpoint]) -> None:
         """Serve recovered endpoints, then make up for the calls that were missed."""
-        await asyncio.gather(*(self._keeper.verify(endpoint) for endpoint in endpoints))
         try:
+            await asyncio.gather(*(self._keeper.verify(endpoint) for endpoint in endpoints))
             await self._upkeep.announce(e for e in endpoints if e.trusted)
-        except Unreachable as error:
+        except (Unreachable, MasterError) as error:
             log.warning("recovery is incomplete: %s", error)
-
-    async def _snapshot(self) -> tuple[Mapping[str, list[Registration]], dict[str, str]]:
-        held = await self._held()
-        names = sorted(held)
-        uris = await self._context.upstream.batch(
-            [("lookupNode", [CALLER_ID, name]) for name in names]
-        )
-        found = zip(names, uris, strict=False)
-        return held, {name: uri for name, uri in found if isinstance(uri, str)}
-
-    async def _held(self) -> dict[str, list[Registration]]:
-        state, types = await asyncio.gather(
-            self._context.upstream.ask_master("getSystemState"),
-            self._context.upstream.ask_master("getTopicTypes"),
-        )
-        if not _is_state(state):
-            raise MasterError("getSystemState: not of the form [[[name, [node, ...]], ...], ...]")
-        return recovery.registrations(state, _types(types))
 
     async def _restore_lost(self) -> None:
         started = self._context.now()
-        state = await self._held()
+        state = await read_registrations(self._context.upstream)
         ours = {
             held: endpoint
             for endpoint, held in self._context.registry.registrations()
@@ -148,26 +129,3 @@ class MasterWatch:
         if lost:
             log.warning("the master has lost %d registrations; making them again", len(lost))
             await self._upkeep.register([(ours[held], held) for held in lost])
-
-
-def _is_state(state: Any) -> bool:
-    """Whether a master's answer to getSystemState has the form that it should have."""
-    if not (isinstance(state, list) and len(state) == 3):
-        return False
-    return all(isinstance(entries, list) and all(map(_is_entry, entries)) for entries in state)
-
-
-def _is_entry(entry: Any) -> bool:
-    match entry:
-        case [str(), list(nodes)]:
-            return all(isinstance(node, str) for node in nodes)
-    return False
-
-
-def _types(rows: Any) -> dict[str, str]:
-    held: dict[str, str] = {}
-    for row in rows if isinstance(rows, list) else ():
-        match row:
-            case [str(name), str(type_)]:
-                held[name] = type_
-    return held

@@ -2,8 +2,10 @@
 
 import asyncio
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from rosproxy.core.graph import read_types
 from rosproxy.core.liveness import Probe
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.uris import HostPort
@@ -23,10 +25,10 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class SelfDescription:
-    """What a node says of itself: its topics, and its TCPROS port if it publishes anything."""
+    """What a node says of itself: its topics with their types, and its TCPROS port if known."""
 
-    published: frozenset[str]
-    subscribed: frozenset[str]
+    published: Mapping[str, str]
+    subscribed: Mapping[str, str]
     tcpros_port: int | None
 
     @property
@@ -70,11 +72,8 @@ class NodeClient:
         endpoint.tcpros_port = said.tcpros_port if said else None
         return endpoint.tcpros_port
 
-    async def _topics(self, where: HostPort, method: str) -> frozenset[str]:
-        rows = await self._upstream.ask_node(where, self._within, method)
-        rows = rows if isinstance(rows, list) else []
-        names = [row[0] for row in rows if isinstance(row, list) and row]
-        return frozenset(name for name in names if isinstance(name, str))
+    async def _topics(self, where: HostPort, method: str) -> dict[str, str]:
+        return read_types(await self._upstream.ask_node(where, self._within, method))
 
     async def _tcpros_port(self, where: HostPort, topics: list[str]) -> int | None:
         for topic in topics[:3]:

@@ -6,11 +6,11 @@ from urllib.parse import urlsplit
 from rosproxy.context import Context
 from rosproxy.core import slave_api, xmlrpc
 from rosproxy.core.liveness import Change, Probe
-from rosproxy.core.xmlrpc import MULTICALL
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.slave_api import TopicPort, Visit
 from rosproxy.core.uris import HostPort
+from rosproxy.core.xmlrpc import MULTICALL
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
 from rosproxy.network import resolve

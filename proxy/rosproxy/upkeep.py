@@ -3,19 +3,23 @@
 import asyncio
 import logging
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from rosproxy.context import Context
 from rosproxy.core import upkeep, xmlrpc
+from rosproxy.core.addressing import Asker
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
-from rosproxy.node_client import NodeClient
+from rosproxy.core.uris import HostPort, parse_slave_uri
+from rosproxy.master_graph import read_graph
+from rosproxy.node_client import NodeClient, SelfDescription
 from rosproxy.upstream import CALLER_ID, Unreachable
 
 log = logging.getLogger(__name__)
 
 Held = tuple[Endpoint, Registration]
 PARALLEL_CALLS = 32
+OUTSIDER = Asker("", "")
+"""A subscriber outside, who is given addresses as the master holds them."""
 
 
 class Upkeep:
@@ -41,10 +45,13 @@ class Upkeep:
         await self._tell_publishers(updates)
 
     async def announce(self, endpoints: Iterable[Endpoint]) -> None:
-        """Make up for the master's calls that were missed while the proxy was away.
+        """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError.
 
-        Registering one publisher of a topic makes the master notify all of its subscribers;
-        registering a subscriber again yields its publishers. Raises Unreachable.
+        Subscribers are told first that the relayed publishers have gone and then, by the master,
+        that they are there: roscpp never tries again after a connection that was refused at once
+        (transport_publisher_link.cpp, onRetryTimer), and rospy doesn't try at all. Registering
+        one publisher of a topic makes the master notify all of its subscribers; registering a
+        subscriber again yields its publishers.
         """
         topics: dict[str, Held] = {}
         subscribers: list[Held] = []
@@ -54,7 +61,17 @@ class Upkeep:
                     topics.setdefault(held.name, (endpoint, held))
                 elif held.kind is Kind.SUBSCRIBER:
                     subscribers.append((endpoint, held))
+        await self._withdraw(topics)
         await self.register([*topics.values(), *subscribers])
+
+    async def adopt(self, endpoint: Endpoint, said: SelfDescription) -> None:
+        """Register what a node has and the master does not know of. Raises Unreachable."""
+        found = upkeep.unregistered(endpoint, said.published, said.subscribed)
+        for held in found:
+            self._context.registry.register(endpoint, held)
+        if found:
+            log.info("%s: %d topics were not registered; they are now", endpoint.label, len(found))
+            await self.register([(endpoint, held) for held in found])
 
     async def clean_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that is gone at the master. Raises Unreachable."""
@@ -118,21 +135,48 @@ class Upkeep:
                 self._context.registry.drop_caller(endpoint, one.caller_id)
         return kept
 
-    async def _tell_publishers(self, updates: Sequence[tuple[Held, list[Any]]]) -> None:
+    async def _withdraw(self, topics: Iterable[str]) -> None:
+        """Tell the subscribers of topics that none but directly reached publishers are left."""
+        graph = await read_graph(self._context.upstream)
+        publishers = graph.by_topic(Kind.PUBLISHER)
+        subscribers = graph.by_topic(Kind.SUBSCRIBER)
         limit = asyncio.Semaphore(PARALLEL_CALLS)
-        await asyncio.gather(*(self._tell(limit, item, uris) for item, uris in updates))
+        calls = [
+            self._tell(limit, topic, uri, publishers.get(topic, []))
+            for topic in topics
+            for uri in subscribers.get(topic, [])
+        ]
+        await asyncio.gather(*calls)
 
-    async def _tell(self, limit: asyncio.Semaphore, item: Held, uris: list[Any]) -> None:
+    async def _tell(
+        self, limit: asyncio.Semaphore, topic: str, subscriber: str, publishers: list[str]
+    ) -> None:
+        endpoint = self._context.addressing.stands_for(subscriber)
+        where = endpoint.slave if endpoint else parse_slave_uri(subscriber)
+        if where is None:
+            return
+        asker = self._context.node_asker(endpoint) if endpoint else OUTSIDER
+        left = upkeep.reached_directly(publishers, asker, self._context.addressing)
+        async with limit:
+            await self._update(where, topic, left)
+
+    async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
+        limit = asyncio.Semaphore(PARALLEL_CALLS)
+        await asyncio.gather(*(self._tell_all(limit, item, uris) for item, uris in updates))
+
+    async def _tell_all(self, limit: asyncio.Semaphore, item: Held, uris: list[str]) -> None:
         endpoint, held = item
         asker = self._context.node_asker(endpoint)
-        known = [uri for uri in uris if isinstance(uri, str)]
-        publishers = self._context.addressing.import_slaves(known, asker)
-        body = xmlrpc.dump_call("publisherUpdate", "/master", held.name, publishers)
+        publishers = self._context.addressing.import_slaves(uris, asker)
         async with limit:
-            try:
-                await self._context.upstream.node(endpoint.slave, body)
-            except Unreachable as error:
-                log.debug("publisherUpdate for %s: %s", endpoint.label, error)
+            await self._update(endpoint.slave, held.name, publishers)
+
+    async def _update(self, where: HostPort, topic: str, publishers: list[str]) -> None:
+        body = xmlrpc.dump_call("publisherUpdate", "/master", topic, publishers)
+        try:
+            await self._context.upstream.node(where, body, self._context.settings.probe_timeout)
+        except Unreachable as error:
+            log.debug("publisherUpdate of %s: %s", topic, error)
 
 
 def _current(item: Held) -> bool:

@@ -6,12 +6,14 @@ import xmlrpc.client
 from collections import deque
 from contextlib import suppress
 from typing import Any
+from xmlrpc.client import Fault
 
 from rosproxy.demo.book import Book
 from tests.integration.http_fake import Answer, HttpFake, Request, ok, value
 from tests.integration.net import MASTER, rpc
 
 Triple = list[Any]
+ODD_PARAMETERS = (TypeError, AttributeError, LookupError, ValueError)
 
 
 class Master:
@@ -77,30 +79,32 @@ class Master:
         method, params = request.call
         if method in self.answers:
             return self.answers[method]
-        if method == "system.multicall":
-            return value([self._element(item) for item in params[0]])
-        self.calls.append((method, params))
         try:
+            if method == "system.multicall":
+                return value([self._element(item) for item in params[0]])
+            self.calls.append((method, params))
             return value(self._run(method, params))
-        except xmlrpc.client.Fault as fault:
+        except Fault as fault:
             return ok(xmlrpc.client.dumps(fault, methodresponse=True).encode())
+        except ODD_PARAMETERS as error:
+            return ok(xmlrpc.client.dumps(Fault(1, repr(error)), methodresponse=True).encode())
 
     def _element(self, item: dict[str, Any]) -> Any:
         method, params = item["methodName"], tuple(item["params"])
         self.calls.append((method, params))
         try:
             return [self._run(method, params)]
-        except xmlrpc.client.Fault as fault:
+        except Fault as fault:
             return {"faultCode": fault.faultCode, "faultString": fault.faultString}
 
     def _run(self, method: str, params: tuple[Any, ...]) -> Triple:
         run = getattr(self, f"_do_{_snake_case(method)}", None)
         if run is None:
-            raise xmlrpc.client.Fault(1, f'method "{method}" is not supported')
+            raise Fault(1, f'method "{method}" is not supported')
         try:
             result: Triple = run(*params)
-        except TypeError as error:
-            return [-1, str(error), 0]
+        except ODD_PARAMETERS as error:
+            return [-1, repr(error), 0]
         return result
 
     def _replace(self, caller: str, old: str | None) -> None:

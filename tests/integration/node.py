@@ -119,7 +119,7 @@ class Node:
             return [1, "topics", [list(item) for item in lists[method].items()]]
         if method == "getPid":
             return [1, "", self.pid]
-        if method == "requestTopic":
+        if method == "requestTopic" and len(params) == 3 and isinstance(params[1], str):
             return self._request_topic(*params)
         return [1, "", 0]
 

@@ -112,11 +112,22 @@ class Process:
         return self.reap()
 
     def reap(self, patience: float = STOP_PATIENCE) -> int:
-        """Waits for the end that was asked for, killing it when that takes too long."""
+        """Waits for the end that was asked for, killing what takes too long to end."""
+        deadline = time.monotonic() + patience
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._popen.wait(patience)
+        while self._group_lives() and time.monotonic() < deadline:
+            time.sleep(_POLL)
         self.kill()
         return self._popen.wait()
+
+    def _group_lives(self) -> bool:
+        """Whether it, or a child in its group (rosbag's recorder for one), still runs."""
+        try:
+            os.killpg(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        return True
 
 
 def descendants(pid: int) -> list[int]:

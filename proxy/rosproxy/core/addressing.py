@@ -90,7 +90,7 @@ class Addressing:
 
     def import_slave(self, uri: str, asker: Asker) -> str:
         """The form of a slave URI from outside that an inside node can use."""
-        endpoint = self._stands_for(uri)
+        endpoint = self.stands_for(uri)
         return self._import(endpoint, asker) if endpoint else uri
 
     def import_slaves(self, uris: Sequence[str], asker: Asker) -> list[str]:
@@ -114,7 +114,7 @@ class Addressing:
         where = parse_slave_uri(uri)
         if where is None:
             return False
-        return self._is_relayed(where, asker) or self._stands_for(uri) is not None
+        return self._is_relayed(where, asker) or self.stands_for(uri) is not None
 
     def identify(self, uri: str) -> tuple[int, InsidePath] | None:
         """The listening port and inside address of an advertised slave URI of this proxy."""
@@ -138,7 +138,8 @@ class Addressing:
     def _path(self, endpoint: Endpoint) -> str:
         return inside_path(endpoint.node, endpoint.place.address)
 
-    def _stands_for(self, uri: str) -> Endpoint | None:
+    def stands_for(self, uri: str) -> Endpoint | None:
+        """The endpoint that an advertised slave URI stands for."""
         port = self._listening(parse_slave_uri(uri))
         endpoint = self.registry.by_port.get(port) if port else None
         return endpoint if endpoint and self.advertised_uri(endpoint) == uri else None

@@ -9,16 +9,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address
-from typing import Any
 
 from rosproxy.core.addressing import Addressing, Network
+from rosproxy.core.graph import Graph
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
 from rosproxy.core.uris import InsidePath, is_address, slave_uri
 
 NO_MERIT = -(10**9)
 _EVERYBODYS = frozenset({"/rosout"})
-_STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
 @dataclass(slots=True)
@@ -50,29 +49,13 @@ class Claim:
         return slave_uri(self.inside.node)
 
 
-def registrations(state: Sequence[Any], types: Mapping[str, str]) -> dict[str, list[Registration]]:
-    """What each node has registered, from getSystemState and getTopicTypes.
-
-    ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``.
-    """
-    found: dict[str, list[Registration]] = {}
-    for kind, entries in zip(_STATE_KINDS, state, strict=True):
-        for name, nodes in entries:
-            for node in nodes:
-                held = Registration(kind, name, node, types.get(name, "*"))
-                found.setdefault(node, []).append(held)
-    return found
-
-
-def claims(
-    held: Mapping[str, list[Registration]], uris: Mapping[str, str], addressing: Addressing
-) -> list[Claim]:
-    """The endpoints of this proxy among the nodes of a master; ``uris`` are their slave URIs."""
+def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
+    """The endpoints of this proxy among the nodes of a master."""
     found: dict[str, Claim] = {}
-    for node, uri in uris.items():
+    for node, uri in graph.uris.items():
         ours = addressing.identify(uri)
         if ours:
-            found.setdefault(uri, Claim(*ours)).registrations += held.get(node, [])
+            found.setdefault(uri, Claim(*ours)).registrations += graph.held.get(node, [])
     return list(found.values())
 
 

@@ -1,8 +1,9 @@
 """The calls by which the proxy registers and unregisters at the master on behalf of nodes."""
 
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from rosproxy.core.addressing import Addressing
+from rosproxy.core.addressing import Addressing, Asker
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
 
@@ -41,7 +42,7 @@ def unregister_call(endpoint: Endpoint, held: Registration, addressing: Addressi
 
 
 def left_over(
-    endpoint: Endpoint, published: frozenset[str], subscribed: frozenset[str], before: float
+    endpoint: Endpoint, published: Collection[str], subscribed: Collection[str], before: float
 ) -> list[Registration]:
     """Which of an endpoint's registrations a process that is gone has left behind.
 
@@ -66,7 +67,7 @@ def left_over(
 
 
 def still_held(
-    endpoint: Endpoint, published: frozenset[str], subscribed: frozenset[str], same_process: bool
+    endpoint: Endpoint, published: Collection[str], subscribed: Collection[str], same_process: bool
 ) -> list[Registration]:
     """Which of an endpoint's registrations hold for a node that has come back.
 
@@ -79,3 +80,34 @@ def still_held(
     if not (kept and same_process):
         return kept
     return kept + [held for held in everything if held.kind not in topics]
+
+
+def unregistered(
+    endpoint: Endpoint, published: Mapping[str, str], subscribed: Mapping[str, str]
+) -> list[Registration]:
+    """The topics that a node has, with their types, and the master does not know of.
+
+    rospy gives up a registration for which it found no master. Nothing is said of a slave API
+    that several node names share.
+    """
+    names = endpoint.caller_ids
+    if len(names) != 1:
+        return []
+    said = {Kind.PUBLISHER: published, Kind.SUBSCRIBER: subscribed}
+    return [
+        Registration(kind, topic, names[0], type_)
+        for kind, topics in said.items()
+        for topic, type_ in topics.items()
+        if (kind, topic, names[0]) not in endpoint.registrations
+    ]
+
+
+def reached_directly(uris: Sequence[str], asker: Asker, addressing: Addressing) -> list[str]:
+    """The publishers that a subscriber reaches without the proxy, in the form that it knows them.
+
+    An inside subscriber (``asker.endpoint``) is given imported URIs.
+    """
+    if asker.endpoint is None:
+        return [uri for uri in uris if addressing.identify(uri) is None]
+    imported = addressing.import_slaves(uris, asker)
+    return [uri for uri in imported if not addressing.handed_out(uri, asker)]

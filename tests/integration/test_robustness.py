@@ -1,0 +1,352 @@
+"""Hostile and clumsy HTTP and XML-RPC, the same on the master port and on a node's port."""
+
+import gzip
+import struct
+import xmlrpc.client
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from rosproxy.core.methods import MASTER_METHODS
+from tests.integration.net import NODE, Where, connect, exchange, post, rpc, xml
+
+XML = b"<?xml version='1.0'?>"
+CALL = xml("getPid", "/somebody")
+NAMES = ["constructor", "__proto__", "__class__", "_dispatch", "toString", "a" * 5000, "é<&>'"]
+
+
+@dataclass
+class Door:
+    """A port that speaks XML-RPC, and the pid that answers behind it."""
+
+    address: Where
+    pid: int
+
+    async def works(self) -> bool:
+        """Whether it still answers as it should."""
+        return await rpc(self.address, "getPid", "/n", source=NODE) == [1, "", self.pid]
+
+
+@pytest.fixture(params=["master port", "node port"])
+async def door(request: Any, proxy: Any, master: Any, node: Any) -> Door:
+    if request.param == "master port":
+        return Door(proxy.master, master.pid)
+    await node.publish(proxy.master)
+    return Door(proxy.lease(node), node.pid)
+
+
+async def raw(door: Door, request: bytes, slices: int = 0) -> Any:
+    return await exchange(door.address, request, slices=slices)
+
+
+@pytest.mark.parametrize("verb", ["GET", "HEAD", "PUT", "DELETE", "OPTIONS", "PATCH"])
+async def test_every_verb_answers(door, verb):
+    async with connect(door.address) as wire:
+        for _ in range(2):
+            head = f"{verb} /x HTTP/1.1\r\nHost: h\r\n"
+            await wire.send(f"{head}Content-Length: 0\r\n\r\n".encode())
+            reply = await wire.reply(head=verb == "HEAD")
+            assert reply.status == (200 if verb in ("GET", "HEAD") else 405)
+            assert b"rosproxy" in reply.body or verb != "GET"
+    assert await door.works()
+
+
+@pytest.mark.parametrize("sent", [b"", b"P", b"POS", b"POST", b"POST / HTTP/1.1\r\nHos"])
+@pytest.mark.parametrize("how", ["reset", "close", "half close"])
+async def test_connections_that_end_early_are_survived(door, sent, how):
+    async with connect(door.address) as wire:
+        if sent:
+            await wire.send(sent)
+        if how == "reset":
+            wire.reset()
+        elif how == "half close":
+            await wire.half_close()
+            assert await wire.outcome() in ("closed", "reset", "answered")
+    assert await door.works()
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+async def test_requests_in_tiny_slices(door, size):
+    assert (await raw(door, post(CALL), slices=size)).value == [1, "", door.pid]
+
+
+async def test_several_requests_on_one_connection(door):
+    async with connect(door.address) as wire:
+        for _ in range(20):
+            await wire.send(post(CALL))
+            assert (await wire.reply()).value == [1, "", door.pid]
+
+
+async def test_pipelined_requests_are_answered_in_order(door):
+    calls = [xml("getPid", f"/n{i}") if i % 2 else xml("noSuchMethod") for i in range(10)]
+    async with connect(door.address) as wire:
+        await wire.send(b"".join(map(post, calls)))
+        for i in range(10):
+            reply = await wire.reply()
+            assert (b"faultCode" not in reply.body) or not i % 2
+
+
+async def test_http_1_0_is_answered_and_closed(door):
+    async with connect(door.address) as wire:
+        await wire.send(post(CALL, version="1.0"))
+        assert (await wire.reply()).value == [1, "", door.pid]
+        assert await wire.end() == "closed"
+
+
+async def test_http_1_0_with_keep_alive_stays_open(door):
+    async with connect(door.address) as wire:
+        for _ in range(2):
+            await wire.send(post(CALL, "Connection: keep-alive", version="1.0"))
+            assert (await wire.reply()).value == [1, "", door.pid]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["Content-length:{}"],
+        ["content-length: {}", "user-agent: XMLRPC++ 0.7"],
+        ["CONTENT-LENGTH:   {}  "],
+        ["Content-Length: {}", "Connection: close"],
+        ["Content-Length: {}", "Accept-Encoding: gzip", "User-Agent: Python-xmlrpc/3.11"],
+    ],
+)
+async def test_headers_as_old_clients_write_them(door, lines):
+    filled = [line.format(len(CALL)) for line in lines]
+    assert (await raw(door, post(CALL, *filled))).value == [1, "", door.pid]
+
+
+async def test_a_client_that_expects_100_continue_gets_it(door):
+    request = post(CALL, "Expect: 100-continue")
+    head, _, body = request.partition(b"\r\n\r\n")
+    async with connect(door.address) as wire:
+        await wire.send(head + b"\r\n\r\n")
+        assert (await wire.reply()).status == 100
+        await wire.send(body)
+        assert (await wire.reply()).value == [1, "", door.pid]
+
+
+@pytest.mark.parametrize("size", [1, 50, 10000])
+async def test_chunked_uploads(door, size):
+    parts = [CALL[i : i + size] for i in range(0, len(CALL), size)]
+    body = b"".join(b"%x\r\n%s\r\n" % (len(part), part) for part in parts) + b"0\r\n\r\n"
+    reply = await raw(door, post(body, "Transfer-Encoding: chunked"))
+    assert reply.value == [1, "", door.pid]
+
+
+async def test_compressed_uploads(door):
+    reply = await raw(door, post(gzip.compress(CALL), "Content-Encoding: gzip"))
+    assert reply.value == [1, "", door.pid]
+
+
+async def test_a_body_that_is_not_what_its_encoding_says_is_refused(door):
+    async with connect(door.address) as wire:
+        await wire.send(post(CALL, "Content-Encoding: gzip"))
+        assert (await wire.reply()).status == 400
+    assert await door.works()
+
+
+async def test_a_body_above_the_limit_is_413(door, monkeypatch):
+    monkeypatch.setattr("rosproxy.upstream.MAX_BODY", 100_000)
+    for body, headers in [
+        (b" " * 100_001, []),
+        (b" " * 100_001, [f"Content-Length: {10**15}"]),
+        (gzip.compress(b" " * 50_000_000), ["Content-Encoding: gzip"]),
+        (b"30d41\r\n" + b" " * 200_001 + b"\r\n0\r\n\r\n", ["Transfer-Encoding: chunked"]),
+    ]:
+        assert (await raw(door, post(body, *headers))).status == 413
+    assert await door.works()
+
+
+async def test_a_connection_is_usable_after_413(door, monkeypatch):
+    monkeypatch.setattr("rosproxy.upstream.MAX_BODY", 100_000)
+    async with connect(door.address) as wire:
+        await wire.send(post(b" " * 150_000))
+        assert (await wire.reply()).status == 413
+        await wire.send(post(CALL))
+        assert (await wire.reply()).value == [1, "", door.pid]
+
+
+@pytest.mark.parametrize("cut", [0, 1, len(CALL) // 2, len(CALL) - 1])
+@pytest.mark.parametrize("how", ["half close", "reset"])
+async def test_truncated_bodies(door, cut, how, caplog):
+    request = post(CALL)
+    async with connect(door.address) as wire:
+        await wire.send(request[: len(request) - len(CALL) + cut])
+        if how == "reset":
+            wire.reset()
+        else:
+            await wire.half_close()
+            assert await wire.outcome() in ("closed", "answered")
+    assert await door.works()
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        post(CALL, "Content-Length: -1"),
+        post(CALL, "Content-Length: 1x"),
+        post(CALL, "Content-Length: 5", "Content-Length: 6"),
+        post(CALL, "X: " + "y" * 20_000),
+        post(CALL, *[f"X{i}: 1" for i in range(500)]),
+        post(CALL, path="/" + "p" * 20_000),
+        b"POST / HTTP/9.9\r\n\r\n",
+        b"POST\r\n\r\n",
+        b"POST / HTTP/1.1\r\nbroken header\r\n\r\n",
+        b"POST / HTTP/1.1\r\nHost: a\x00b\r\n\r\n",
+    ],
+    ids=lambda request: repr(bytes(request)[:40]),
+)
+async def test_malformed_http_is_400(door, request_):
+    async with connect(door.address) as wire:
+        await wire.send(request_)
+        assert (await wire.reply()).status == 400
+    assert await door.works()
+
+
+@pytest.mark.parametrize("noise", [b"\x16\x03\x01\x02\x00\x01\x00", b"SSH-2.0-x\r\n", b"\0" * 64])
+async def test_other_protocols_are_survived(door, noise):
+    async with connect(door.address) as wire:
+        await wire.send(noise)
+        await wire.half_close()
+        await wire.outcome()
+    assert await door.works()
+
+
+def nested(depth: int) -> bytes:
+    value = b"<value><array><data>" * depth + b"</data></array></value>" * depth
+    return call_xml(b"<params><param>" + value + b"</param></params>")
+
+
+def call_xml(rest: bytes, method: bytes = b"getPid") -> bytes:
+    return XML + b"<methodCall><methodName>" + method + b"</methodName>" + rest + b"</methodCall>"
+
+
+ENTITIES = b"<!DOCTYPE a [<!ENTITY a 'aaaaaaaaaa'><!ENTITY b '&a;&a;&a;&a;'>]>"
+MALFORMED = {
+    "empty": b"",
+    "text": b"hello",
+    "unclosed": XML + b"<methodCall><methodName>getPid",
+    "wrong root": XML + b"<methodResponse/>",
+    "no name": XML + b"<methodCall><params/></methodCall>",
+    "empty name": call_xml(b"", method=b""),
+    "two names": call_xml(b"<methodName>shutdown</methodName>"),
+    "hidden name": call_xml(b"<!-- <methodName>shutdown</methodName> -->"),
+    "dtd": b"<!DOCTYPE methodCall SYSTEM 'http://127.0.0.1/x.dtd'>" + call_xml(b""),
+    "entities": ENTITIES + call_xml(b"<params><param><value>&b;</value></param></params>"),
+    "unknown entity": call_xml(b"<params><param><value>&x;</value></param></params>"),
+    "external entity": b"<!DOCTYPE a [<!ENTITY x SYSTEM 'file:///etc/passwd'>]>" + call_xml(b""),
+    "deep": nested(100),
+    "very deep": nested(100_000),
+    "bad utf-8": call_xml(b"<params><param><value>\xff\xfe</value></param></params>"),
+    "utf-16": "<?xml version='1.0' encoding='utf-16'?><a/>".encode("utf-16"),
+    "odd encoding": b"<?xml version='1.0' encoding='cp037'?><a/>",
+    "nul": call_xml(b"<params><param><value>\0</value></param></params>"),
+    "control": call_xml(b"<params><param><value>\x01</value></param></params>"),
+    "array alone": call_xml(b"<params><param><array/></param></params>"),
+    "member alone": call_xml(b"<params><param><value><struct><member/></struct></value></param>"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+async def test_malformed_calls_are_faults(door, name):
+    reply = await raw(door, post(MALFORMED[name]))
+    assert reply.status == 200
+    assert reply.fault in (-32700, -32600)
+    assert await door.works()
+
+
+async def test_a_huge_number_of_elements_is_a_fault(proxy):
+    body = call_xml(b"<params>" + b"<a/>" * 600_000 + b"</params>")
+    assert (await exchange(proxy.master, post(body))).fault == -32700
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("count", [0, 1, 5])
+async def test_unknown_methods_are_the_peers_to_answer(door, name, count):
+    reply = await raw(door, post(xml(name, *["/n"] * count)))
+    assert reply.status == 200
+    assert await door.works()
+
+
+ODD_VALUES: list[Any] = [0, 1.5, True, "", [], {}, ["x"], {"constructor": 1}, "http://"]
+KNOWN = [*MASTER_METHODS, "requestTopic", "publisherUpdate", "getBusInfo", "system.multicall"]
+
+
+@pytest.mark.parametrize("method", KNOWN)
+async def test_odd_parameters_are_survived(door, method):
+    async with connect(door.address, NODE) as wire:
+        for odd in ODD_VALUES:
+            for count in range(6):
+                await wire.send(post(xml(method, *[odd] * count)))
+                assert (await wire.reply()).status == 200
+            await wire.send(post(xml(method, "/talker", odd, odd, odd)))
+            assert (await wire.reply()).status == 200
+    assert await door.works()
+
+
+@pytest.mark.parametrize("name", NAMES)
+async def test_odd_names_register_and_unregister(proxy, master, node, name):
+    master.book.nodes.clear()
+    topic = f"/{name}"
+    assert (await node.publish(proxy.master, topic))[0] == 1
+    assert master.holds("publishers", topic) == [proxy.uri(node)]
+    assert (await node.call(proxy.master, "unregisterPublisher", topic, node.uri))[2] == 1
+    assert not proxy.endpoint(node).registrations
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "",
+        "/",
+        "http://",
+        "http://:80/",
+        "http://x/",
+        "http://x:0/",
+        "http://x:99999/",
+        "http://x:abc/",
+        "https://127.0.2.11:5/",
+        "http://[::1/",
+        "http://a b:5/",
+        "http://x:5@y:6/",
+        "http://" + "a" * 300 + ":5/",
+        "http://é.invalid:5/",
+        "http://%00:5/",
+        "http://-:5/",
+        "rosrpc://127.0.2.11:5",
+    ],
+)
+async def test_odd_slave_uris_are_refused_or_placed_at_their_source(proxy, node, uri):
+    code, text, _ = await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
+    if code == 1:
+        (endpoint,) = proxy.app.context.registry
+        assert endpoint.place.address == NODE
+    else:
+        assert (code, "not of the form" in text) == (-1, True)
+    assert (await node.publish(proxy.master))[0] == 1
+
+
+async def test_multicalls_with_odd_elements_keep_their_order(proxy, node):
+    calls: list[Any] = [
+        {"methodName": "getPid", "params": ["/n"]},
+        {"methodName": "registerPublisher", "params": ["/n", "/t", "x/Y", "no uri"]},
+        5,
+        {"methodName": 5, "params": 5},
+        {"params": []},
+        {"methodName": "getPid", "params": []},
+    ]
+    good = await rpc(proxy.master, "system.multicall", calls[:2], source=NODE)
+    assert good[0] == [[1, "", 4711]]
+    assert good[1][0][0] == -1
+    with pytest.raises((xmlrpc.client.Fault, ConnectionError, EOFError)):
+        await rpc(proxy.master, "system.multicall", calls[2:], source=NODE)
+    nest = {"methodName": "system.multicall", "params": [[calls[0]]]}
+    with pytest.raises(xmlrpc.client.Fault, match="inside"):
+        await rpc(proxy.master, "system.multicall", [nest])
+
+
+async def test_length_bytes_of_a_tcpros_header_are_no_http(proxy):
+    async with connect(proxy.master) as wire:
+        await wire.send(struct.pack("<I", 20) + b"\0" * 20)
+        assert (await wire.reply()).status == 400
