@@ -36,7 +36,7 @@ check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
-	$(BIN)/lint-imports
+	$(BIN)/lint-imports --no-logo
 	$(BIN)/pytest -q tests/unit
 
 .PHONY: format

@@ -95,7 +95,7 @@ def run_pytest(layer: Layer) -> Outcome:
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as directory:
         report = Path(directory) / "report.xml"
-        command = [sys.executable, "-m", "pytest", layer.path, f"--junitxml={report}"]
+        command = [sys.executable, "-m", "pytest", str(layer.path), f"--junitxml={report}"]
         code = subprocess.run(command, cwd=ROOT, check=False).returncode
         counts = count(report) if report.exists() else "no report"
     seconds = time.monotonic() - started

@@ -40,7 +40,7 @@ class App:
         self.context = context = make_context(settings)
         nodes = NodeClient(context.upstream, settings.probe_timeout)
         self._tcpros = TcprosService(context, nodes)
-        self._leases = Leases(context, nodes, self._connection)
+        self._leases = Leases(context, nodes, self._connection, self._close_port)
         self._upkeep = Upkeep(context, nodes)
         self._keeper = Keeper(context, self._leases, nodes, self._upkeep)
         self._watch = MasterWatch(context, self._keeper, self._upkeep)
@@ -104,6 +104,9 @@ class App:
             await self._slaves.serve(conn)
         else:
             await self._tcpros.serve(endpoint, conn, peer)
+
+    def _close_port(self, port: int) -> None:
+        self._slaves.close_port(port)
 
     def _reserve_range(self) -> None:
         ports = self.settings.ports.listen

@@ -178,9 +178,19 @@ def health(admin: Any) -> None:
     metavar="HOST",
     help="The advertised host if the proxy can't be asked for it.",
 )
+@click.option(
+    "--outside",
+    is_flag=True,
+    help="Look from here as a machine outside does, for example from a robot; ask no proxy.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
 def doctor(
-    names: tuple[str, ...], admin: Any, master_uri: str, advertise_host: str, as_json: bool
+    names: tuple[str, ...],
+    admin: Any,
+    master_uri: str,
+    advertise_host: str,
+    outside: bool,
+    as_json: bool,
 ) -> None:
     """Find out why A can't hear B, and say what mends it.
 
@@ -188,14 +198,18 @@ def doctor(
     subscribes to that topic; that node's topics; or what two nodes have to say to each other,
     and which of them are not connected, and why.
 
-    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. Exits with 0 if nothing is
-    wrong, with 1 if something is.
+    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. What outside machines see
+    is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
+    something is.
     """
     from rosproxy.doctor import examine
     from rosproxy.survey import Patient
 
+    if outside and not master_uri:
+        raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
     absolute = tuple(f"/{name.strip('/')}" for name in names)
-    sys.exit(examine(Patient(admin, master_uri, advertise_host, absolute), as_json))
+    patient = Patient(None if outside else admin, master_uri, advertise_host, absolute)
+    sys.exit(examine(patient, as_json))
 
 
 def _or_exit(ask: Callable[[], object]) -> None:

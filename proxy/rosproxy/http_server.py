@@ -31,6 +31,7 @@ class Call:
         peer = _address(request, "peername")
         here = _address(request, "sockname")
         self.body = body
+        self.path = request.path_qs
         self.source = peer.host
         self.local = here
         self.host_header = request.headers.get("Host", "")
@@ -61,11 +62,19 @@ class XmlRpcServer:
     def __init__(self, service: Service, greeting: str) -> None:
         self._service, self._greeting = service, greeting
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
+        self._by_port: dict[int, list[web.RequestHandler[web.BaseRequest]]] = {}
 
     async def serve(self, conn: socket.socket) -> None:
         """Take over a connection. Raises OSError if it has ended already."""
-        loop = asyncio.get_running_loop()
-        await loop.connect_accepted_socket(self._server, sock=conn)
+        port, loop = conn.getsockname()[1], asyncio.get_running_loop()
+        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
+        alive = [known for known in self._by_port.get(port, []) if known.transport is not None]
+        self._by_port[port] = [*alive, handler]
+
+    def close_port(self, port: int) -> None:
+        """Let the connections that came in on a port end with the calls that they carry now."""
+        for handler in self._by_port.pop(port, []):
+            handler.close()
 
     async def close(self) -> None:
         """Close all connections."""

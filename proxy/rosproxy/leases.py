@@ -25,8 +25,15 @@ Connection = Callable[[Endpoint, socket.socket, str], Awaitable[None]]
 class Leases:
     """Which node holds which port, and whether the port listens."""
 
-    def __init__(self, context: Context, nodes: NodeClient, on_connection: Connection) -> None:
-        self._context, self._nodes, self._on_connection = context, nodes, on_connection
+    def __init__(
+        self,
+        context: Context,
+        nodes: NodeClient,
+        on_connection: Connection,
+        on_close: Callable[[int], None],
+    ) -> None:
+        self._context, self._nodes = context, nodes
+        self._on_connection, self._on_close = on_connection, on_close
         self._acceptors: dict[int, Acceptor] = {}
 
     async def admit(self, call: Call, asker: Asker) -> Admission:
@@ -78,6 +85,7 @@ class Leases:
         acceptor = self._acceptors.pop(endpoint.port, None)
         if acceptor is not None:
             acceptor.stop()
+            self._on_close(endpoint.port)
             self._context.bank.close(endpoint.port, acceptor.sock)
 
     def end(self, endpoint: Endpoint) -> None:
@@ -112,7 +120,6 @@ class Leases:
             self._context.problems.add(asker.caller_id, str(error))
             log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
             return Refusal(str(error))
-        self.open(endpoint)
         self._context.tasks.spawn(self._greet(endpoint, asker.caller_id), f"first probe of {uri}")
         return endpoint
 
@@ -128,6 +135,19 @@ class Leases:
             endpoint.health.suspect()
 
     def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+        """A node's endpoint, its port open; ports that turn out to be taken are passed over."""
+        registry = self._context.registry
+        while True:
+            endpoint = self._take(uri, node, place, source)
+            self.open(endpoint)
+            if self.is_open(endpoint) or endpoint.registrations:
+                return endpoint
+            registry.remove(endpoint)
+            registry.pool.block(endpoint.port)
+            self._context.problems.solved_at(endpoint.port)
+            self._context.problems.add("--port-range", f"port {endpoint.port} is taken")
+
+    def _take(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         registry = self._context.registry
         try:
             return registry.admit(uri, node, place, source)

@@ -50,7 +50,11 @@ class PortBank:
     def open(self, port: int) -> socket.socket:
         """Let a reserved port listen. Raises OSError if another program took it meanwhile."""
         sock = self._bound.pop(port, None) or bind(self._address, port)
-        sock.listen(BACKLOG)
+        try:
+            sock.listen(BACKLOG)
+        except OSError:
+            sock.close()
+            raise
         return sock
 
     def close(self, port: int, sock: socket.socket) -> None:

@@ -9,7 +9,7 @@ from rosproxy.core.liveness import Change, Probe
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.slave_api import TopicPort, Visit
-from rosproxy.core.uris import HostPort
+from rosproxy.core.uris import HostPort, parse_inside_path
 from rosproxy.core.xmlrpc import MULTICALL
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
@@ -28,13 +28,22 @@ class SlaveService:
     async def __call__(self, call: Call) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
         endpoint = self._context.registry.by_port.get(call.local.port)
-        if endpoint is None:
-            raise Unreachable(f"port {call.local.port} has no node any more")
+        if endpoint is None or not self._means(endpoint, call.path):
+            raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
         parsed = xmlrpc.parse_call(call.body)
         if parsed.method != MULTICALL:
             return await self._one(endpoint, parsed, call)
         results = [await self._result(endpoint, inner, call) for inner in xmlrpc.multicall(parsed)]
         return xmlrpc.multicall_reply(results)
+
+    def _means(self, endpoint: Endpoint, path: str) -> bool:
+        """Whether a request's path names this endpoint, or none, as roscpp's.
+
+        A port may serve another node by now; the master's ``shutdown`` for a former one must not
+        end it.
+        """
+        said = parse_inside_path(path)
+        return said is None or (said.address or said.node.host, said.node.port) == endpoint.key
 
     async def _result(self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: Call) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""

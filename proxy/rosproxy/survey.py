@@ -15,18 +15,12 @@ from typing import Any, TypeVar
 from urllib.parse import urlsplit
 from xmlrpc.client import Fault, loads
 
+import aiohttp
+
 from rosproxy.admin_client import AdminClient, AdminError
 from rosproxy.core import xmlrpc
-from rosproxy.core.doctor.facts import (
-    Attempt,
-    Facts,
-    Graph,
-    Master,
-    Node,
-    Reach,
-    Words,
-    scope,
-)
+from rosproxy.core.doctor import replies
+from rosproxy.core.doctor.facts import Attempt, Facts, Master, Node, Reach, Words, scope
 from rosproxy.core.doctor.pair_rules import connected
 from rosproxy.core.tcpros import decode_header, encode_header, header_length
 from rosproxy.core.uris import HostPort, parse_host_port, parse_service_uri, parse_slave_uri
@@ -45,9 +39,12 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class Patient:
-    """What to look at: the admin endpoint, and what is known in case that it doesn't answer."""
+    """What to look at: the admin endpoint, and what is known in case that it doesn't answer.
 
-    admin: AdminClient
+    Without ``admin`` no proxy is asked: the look of an outside machine.
+    """
+
+    admin: AdminClient | None
     master_uri: str = ""
     advertise_host: str = ""
     names: tuple[str, ...] = ()
@@ -56,17 +53,22 @@ class Patient:
 async def survey(patient: Patient) -> Facts:
     """Gather all facts."""
     asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(PARALLEL))
-    facts = Facts(
-        admin=patient.admin.url, advertise_host=patient.advertise_host, names=patient.names
-    )
+    facts = Facts(advertise_host=patient.advertise_host, names=patient.names)
+    if patient.admin is None:
+        return await _beyond(facts, patient.master_uri, "")
     try:
-        status = await asyncio.to_thread(patient.admin.status)
+        return await _with_proxy(facts, patient.admin)
     except AdminError as error:
         facts = replace(facts, admin_error=str(error))
         return await _beyond(facts, patient.master_uri, "")
-    facts = replace(facts, status=status, advertise_host=status["settings"]["advertise_host"])
+
+
+async def _with_proxy(facts: Facts, admin: AdminClient) -> Facts:
+    status = await asyncio.to_thread(admin.status)
+    host = status["settings"]["advertise_host"]
+    facts = replace(facts, admin=admin.url, status=status, advertise_host=host)
     beyond = asyncio.create_task(_beyond(facts, status["master"]["uri"], status["instance"]))
-    probe, reason = await _probe(patient.admin)
+    probe, reason = await _probe(admin)
     return replace(await beyond, probe=probe, probe_error=reason)
 
 
@@ -139,7 +141,7 @@ class _Survey:
     async def graph(self, facts: Facts) -> Facts:
         """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
         ask = self._upstream.ask_master
-        graph = Graph(*[dict(rows) for rows in await ask("getSystemState")])
+        graph = replies.graph(await ask("getSystemState"))
         names, services = sorted(graph.names()), sorted(graph.services)
         uris = await self._look_up("lookupNode", names)
         facts = replace(
@@ -248,14 +250,9 @@ class _Survey:
         return replace(node, words=words)
 
     async def _words(self, where: HostPort) -> Words:
-        publishes, subscribes, bus = await asyncio.gather(
-            *(
-                self._upstream.ask_node(where, WITHIN, method)
-                for method in ("getPublications", "getSubscriptions", "getBusInfo")
-            )
-        )
-        peers = {(row[2], row[4], row[1]) for row in bus if len(row) > 5 and row[5]}
-        return Words(dict(publishes), dict(subscribes), frozenset(peers))
+        methods = ("getPublications", "getSubscriptions", "getBusInfo")
+        ask = self._upstream.ask_node
+        return replies.words(*[await ask(where, WITHIN, method) for method in methods])
 
     async def _data_port(self, facts: Facts, node: Node, topic: str) -> tuple[str, Attempt]:
         """Where a publisher serves a topic, and whether a subscriber gets through to there."""
@@ -266,10 +263,10 @@ class _Survey:
             answer = await self._upstream.ask_node(
                 where, WITHIN, "requestTopic", topic, [["TCPROS"]]
             )
-            target = HostPort(str(answer[1]), int(answer[2]))
         except (Unreachable, MasterError) as error:
             return "", _attempt(error)
-        except (LookupError, TypeError, ValueError):
+        target = replies.data_port(answer)
+        if target is None:
             return "", Attempt(Reach.STRANGER, "no TCPROS address")
         if facts.ours(node.where):
             return str(target), Attempt()
@@ -347,10 +344,17 @@ async def _exchange(where: HostPort, request: bytes) -> bytes:
 
 
 def _attempt(error: Unreachable | MasterError) -> Attempt:
-    reason = str(error)
-    if isinstance(error, MasterError) or "HTTP status" in reason or "XML-RPC" in reason:
-        return Attempt(Reach.STRANGER, reason)
-    return Attempt(Reach.REFUSED if error.refused else Reach.SILENT, reason)
+    """An attempt that failed: did nobody answer, or somebody who is no node or master?"""
+    if isinstance(error, Unreachable) and error.refused:
+        return Attempt(Reach.REFUSED)
+    if isinstance(error.__cause__, aiohttp.ClientOSError | TimeoutError):
+        return Attempt(Reach.SILENT)
+    return Attempt(Reach.STRANGER, _brief(str(error)))
+
+
+def _brief(text: str) -> str:
+    """The first line of what a stranger said."""
+    return text.partition("\n")[0].rpartition(": ")[2][:120] or "no sense"
 
 
 async def _each(

@@ -113,6 +113,12 @@ class TcprosService:
     def _fail(self, endpoint: Endpoint, conn: socket.socket, fields: dict[str, str]) -> None:
         """Reset, as a node that is gone would: roscpp and rospy try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
+        reset_on_close(conn)
+        conn.close()
+        if endpoint.registrations:
+            self._report(endpoint, fields)
+
+    def _report(self, endpoint: Endpoint, fields: dict[str, str]) -> None:
         what = fields.get("service") or fields.get("topic") or "?"
         text = f"no TCPROS connection to it for {what}"
         if is_loopback(endpoint.node.host):
@@ -122,8 +128,6 @@ class TcprosService:
             )
         log.warning("%s: %s", endpoint.label, text)
         self._context.problems.add(endpoint.label, text, endpoint.port)
-        reset_on_close(conn)
-        conn.close()
 
     async def _answer_error(self, conn: socket.socket, message: str) -> None:
         try:

@@ -22,6 +22,8 @@ MAX_BODY = 64 * 1024 * 1024
 MULTICALL_SIZE = 100
 CONNECT_TIMEOUT = 2.0
 MASTER_TIMEOUT = 30.0
+MASTER_KEEPALIVE = 8.0
+"""Seconds that an unused connection to the master is kept; rosmaster spends a thread on each."""
 NODE_TIMEOUT = 15.0
 
 
@@ -55,7 +57,7 @@ class Upstream:
         parts = urlsplit(master_uri)
         self._master_url = f"http://{parts.netloc}{parts.path or '/'}"
         self._master = _session(
-            aiohttp.TCPConnector(limit=64, keepalive_timeout=30), {LOOP_HEADER: instance}
+            aiohttp.TCPConnector(limit=64, keepalive_timeout=MASTER_KEEPALIVE), {LOOP_HEADER: instance}
         )
         self._nodes = _session(aiohttp.TCPConnector(limit=0, force_close=True), {})
 
@@ -128,6 +130,7 @@ def _session(connector: aiohttp.TCPConnector, headers: dict[str, str]) -> aiohtt
     return aiohttp.ClientSession(
         connector=connector,
         headers={"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers},
+        cookie_jar=aiohttp.DummyCookieJar(),
         skip_auto_headers=["Accept-Encoding", "Accept"],
         auto_decompress=True,
     )
@@ -135,7 +138,8 @@ def _session(connector: aiohttp.TCPConnector, headers: dict[str, str]) -> aiohtt
 
 async def _post(session: aiohttp.ClientSession, url: str, body: bytes, within: float) -> bytes:
     timeout = aiohttp.ClientTimeout(total=within, sock_connect=min(CONNECT_TIMEOUT, within))
-    async with session.post(url, data=body, timeout=timeout) as reply:
+    # A peer that could redirect the proxy would make it fetch from any host that it reaches.
+    async with session.post(url, data=body, timeout=timeout, allow_redirects=False) as reply:
         if reply.status != 200:
             raise ValueError(f"HTTP status {reply.status}")
         return await read_bounded(reply.content)

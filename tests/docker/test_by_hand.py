@@ -13,7 +13,7 @@ from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
 from tests.docker.robot import HOST_ADDRESS, MASTER_URI, Robot
 
 EXAMPLE = ROOT / "examples/docker/by-hand"
-PUBLISHED = range(45000, 45020)
+PUBLISHED = range(11400, 11420)
 
 
 class Inside:

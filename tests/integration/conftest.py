@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from aiohttp.http_exceptions import HttpProcessingError
+from aiohttp.web import RequestPayloadError
 
 from tests.integration.master import Master
 from tests.integration.net import NODE
@@ -45,7 +46,9 @@ def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 def is_malformed_http(record: logging.LogRecord) -> bool:
     """Whether it is of the kind that ``rosproxy run`` leaves out of its log."""
     error = record.exc_info[1] if record.exc_info else None
-    return record.name == "aiohttp.server" and isinstance(error, HttpProcessingError)
+    return record.name == "aiohttp.server" and isinstance(
+        error, HttpProcessingError | RequestPayloadError
+    )
 
 
 @pytest.fixture

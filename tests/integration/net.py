@@ -73,6 +73,22 @@ async def refuses(address: Where, source: str = OUTSIDE) -> bool:
         return True
 
 
+async def knock(address: Where, data: bytes, source: str = OUTSIDE) -> str:
+    """What becomes of a connection and of what is sent on it.
+
+    ``refused``, ``reset``, ``closed``, ``answered``, or ``silent`` for half a second.
+    """
+    try:
+        async with connect(address, source) as wire:
+            await wire.send(data)
+            async with asyncio.timeout(0.5):
+                return await wire.outcome()
+    except ConnectionRefusedError:
+        return "refused"
+    except TimeoutError:
+        return "silent"
+
+
 @dataclass
 class Reply:
     """An HTTP response; header names in lower case."""
@@ -209,11 +225,16 @@ async def exchange(address: Where, request: bytes, source: str = OUTSIDE, slices
         return await wire.reply()
 
 
-async def rpc(address: Where | str, method: str, *params: Any, source: str = OUTSIDE) -> Any:
-    """The value of an XML-RPC call. Raises Fault, OSError, EOFError."""
+async def rpc(
+    address: Where | str, method: str, *params: Any, source: str = OUTSIDE, host: str = ""
+) -> Any:
+    """The value of an XML-RPC call. Raises Fault, OSError, EOFError.
+
+    ``host`` is what the caller calls the peer, for one that it reaches through NAT.
+    """
     target = where(address) if isinstance(address, str) else address
-    host = f"[{target[0]}]" if ":" in target[0] else target[0]
+    host = host or "{}:{}".format(f"[{target[0]}]" if ":" in target[0] else target[0], target[1])
     body = xml(method, *params)
-    lines = ["POST / HTTP/1.1", f"Host: {host}:{target[1]}", f"Content-Length: {len(body)}"]
+    lines = ["POST / HTTP/1.1", f"Host: {host}", f"Content-Length: {len(body)}"]
     request = "\r\n".join([*lines, "", ""]).encode() + body
     return (await exchange(target, request, source)).value

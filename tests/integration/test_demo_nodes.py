@@ -120,6 +120,18 @@ def test_a_publisher_out_of_reach_is_named_as_the_problem():
         eventually(lambda: "refused" in subscription.to_json()["problem"])
 
 
+def test_an_update_that_overtakes_the_registration_s_reply_counts(make_node):
+    talker = make_node("/talker")
+    publisher = talker.advertise("/t")
+    talker.start()
+    with closing(Subscription("/listener", "/t", FREE)) as subscription:
+        subscription.update([talker.uri])
+        subscription.begin([])
+        eventually(publisher.peers)
+        publish(publisher, 1)
+        eventually(lambda: subscription.to_json()["count"] == 1)
+
+
 def test_services_are_called_across_the_master(make_node, master):
     server = make_node("/server")
     adder = server.serve("/add")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,7 @@ class Lab:
         self.master: Process | None = None
         self.proxy: Process | None = None
         self.nodes: list[Process] = []
+        self.master_answered = 0.0
         self._proxy_mark = 0
         self._numbers = itertools.count(1)
 
@@ -60,7 +62,15 @@ class Lab:
         env = self.environment(role) | {"ROS_MASTER_URI": uri}
         argv = ["/usr/bin/roscore", "-p", str(MASTER_PORT)]
         self.master = self._spawn("roscore", self.place(role), argv, env)
+        wait_until("the master answers", self._master_answers, timeout=30)
+        self.master_answered = time.time()
         self.master.wait_for(r"started core service \[/rosout\]", timeout=30)
+
+    def _master_answers(self) -> bool:
+        try:
+            return bool(self.ask_master("getPid"))
+        except OSError:
+            return False
 
     def start_proxy(self) -> None:
         """Starts the proxy with this lab's settings and waits until it is listening."""

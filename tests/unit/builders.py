@@ -99,7 +99,7 @@ def comparable(value: Any) -> Any:
     if isinstance(value, xmlrpc.client.Binary):
         return value.data
     if isinstance(value, xmlrpc.client.DateTime):
-        return datetime.strptime(value.value, "%Y%m%dT%H:%M:%S")  # noqa: DTZ007 - has no zone
+        return datetime.strptime(value.value, "%Y%m%dT%H:%M:%S")
     return value
 
 

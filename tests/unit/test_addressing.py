@@ -20,8 +20,16 @@ STRANGER = make_asker("172.20.0.9")  # inside, in a network from which the node 
     [
         (LITERAL, None, OUTSIDE),
         ("http://c5:40001/", "10.0.0.5", "http://robot-host:45000/c5:40001/10.0.0.5/"),
-        ("http://localhost:40001/", "10.0.0.5", "http://robot-host:45000/localhost:40001/10.0.0.5/"),
-        ("http://127.0.0.1:40001/", "10.0.0.5", "http://robot-host:45000/127.0.0.1:40001/10.0.0.5/"),
+        (
+            "http://localhost:40001/",
+            "10.0.0.5",
+            "http://robot-host:45000/localhost:40001/10.0.0.5/",
+        ),
+        (
+            "http://127.0.0.1:40001/",
+            "10.0.0.5",
+            "http://robot-host:45000/127.0.0.1:40001/10.0.0.5/",
+        ),
         ("http://[fd00::5]:40001/", None, "http://robot-host:45000/[fd00::5]:40001/"),
         ("http://c5:40001/", "fd00::5", "http://robot-host:45000/c5:40001/fd00::5/"),
         ("http://10.0.0.5:40001", None, OUTSIDE),
@@ -45,7 +53,9 @@ def test_advertised_ports_have_an_offset() -> None:
     assert addressing.advertised_uri(endpoint) == outside
     assert addressing.import_slave(outside, STRANGER) == RELAYED
     assert addressing.export_slave(RELAYED, STRANGER) == outside
-    assert addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE  # a port that means nothing outside
+    assert (
+        addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE
+    )  # a port that means nothing outside
     assert addressing.identify(OUTSIDE) is None
 
 
@@ -68,7 +78,13 @@ IMPORTS = [
     ("a neighbour", NEIGHBOUR, LITERAL, None, LITERAL),
     ("a stranger", STRANGER, LITERAL, None, RELAYED),
     ("one of another family", make_asker("fd00::6", proxy="fd00::1"), LITERAL, None, None),
-    ("the node, by an unresolvable name", make_asker("10.0.0.5"), "http://c5:40001/", "10.0.0.5", ""),
+    (
+        "the node, by an unresolvable name",
+        make_asker("10.0.0.5"),
+        "http://c5:40001/",
+        "10.0.0.5",
+        "",
+    ),
     ("a neighbour, same", NEIGHBOUR, "http://c5:40001/", "10.0.0.5", None),
     ("a stranger, same", STRANGER, "http://c5:40001/", "10.0.0.5", None),
     ("the node, by loopback", make_asker("10.0.0.5"), "http://127.0.0.1:40001/", "10.0.0.5", ""),

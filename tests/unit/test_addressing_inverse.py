@@ -59,10 +59,10 @@ MEMBERS = st.builds(
 def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, list[Endpoint]]:
     """A proxy with nodes behind it; ``distinct``: no two call themselves the same."""
     first = 45000 + draw(OFFSETS)
-    addressing = make_addressing(
-        draw(HOSTS), (45000, 45009), (first, first + 9), draw(NETWORKS)
+    addressing = make_addressing(draw(HOSTS), (45000, 45009), (first, first + 9), draw(NETWORKS))
+    members = draw(
+        st.lists(MEMBERS, min_size=1, max_size=7, unique_by=lambda m: (m.address, m.port))
     )
-    members = draw(st.lists(MEMBERS, min_size=1, max_size=7, unique_by=lambda m: (m.address, m.port)))
     for member in members:
         uri = slave_uri(HostPort(member.name or member.address, member.port))
         if not (distinct and addressing.registry.by_uri(uri)):

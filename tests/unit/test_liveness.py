@@ -1,6 +1,7 @@
 """A node's health, as a script of probe results."""
 
 import pytest
+
 from rosproxy.core.liveness import Change, Health, Probe
 
 A, R, S = Probe.ANSWERED, Probe.REFUSED, Probe.SILENT
@@ -23,7 +24,11 @@ A, R, S = Probe.ANSWERED, Probe.REFUSED, Probe.SILENT
         ([R, R, S], [Change.NONE, Change.DOWN, Change.NONE], "silent"),
         ([R, R, A], [Change.NONE, Change.DOWN, Change.UP], "ok"),
         ([S, S, A, A], [Change.NONE, Change.DOWN, Change.UP, Change.NONE], "ok"),
-        ([S, S, A, S, S], [Change.NONE, Change.DOWN, Change.UP, Change.NONE, Change.DOWN], "silent"),
+        (
+            [S, S, A, S, S],
+            [Change.NONE, Change.DOWN, Change.UP, Change.NONE, Change.DOWN],
+            "silent",
+        ),
     ],
 )
 def test_changes_and_state(probes: list[Probe], changes: list[Change], state: str) -> None:

@@ -1,6 +1,7 @@
 """The table of master methods against DESIGN's rows, and how the master resolves names."""
 
 import pytest
+
 from rosproxy.core.methods import MASTER_METHODS, NO_ROW, Kind, Reply, resolve_name, row
 
 SIGNATURES = {

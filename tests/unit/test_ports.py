@@ -3,6 +3,7 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rosproxy.core.ports import PortMap, PortPool, PortRange
 
 RANGE = PortRange(45000, 45003)

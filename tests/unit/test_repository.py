@@ -15,15 +15,18 @@ MAX_FUNCTION_LINES = 45
 MAX_MEDIAN_LINES = 10
 
 
+def lines(node: ast.stmt) -> int:
+    assert node.end_lineno is not None
+    return node.end_lineno - node.lineno + 1
+
+
 def functions(path: Path) -> dict[str, int]:
     """The functions of a module, each with its lines of code: no docstring, no decorators."""
     found = {}
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            docstring = node.body[0] if ast.get_docstring(node) else None
-            described = docstring.end_lineno - docstring.lineno + 1 if docstring else 0
-            length = node.end_lineno - node.lineno + 1 - described
-            found[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = length
+            docstring = lines(node.body[0]) if ast.get_docstring(node) else 0
+            found[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = lines(node) - docstring
     return found
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rosproxy.core.ports import PortMap, PortRange
 from rosproxy.core.settings import SettingError, parse_settings
 from rosproxy.core.uris import HostPort
@@ -117,7 +118,7 @@ BAD: list[tuple[str, Any, str]] = [
     ("port_range", "45000:45010", "not a range"),
     ("port_range", "a-b", "not a range"),
     ("port_range", "9" * 5000 + "-1", "not a range"),
-    ("port_range", "٤-٥", "not a range"),
+    ("port_range", "\u0664-\u0665", "not a range"),
     ("port_range", "45010-45000", "must rise"),
     ("port_range", "0-10", "between 1 and 65535"),
     ("port_range", "65000-65536", "between 1 and 65535"),
@@ -165,9 +166,13 @@ def test_a_bad_value_names_its_option(name: str, value: Any, complaint: str) -> 
         assert option in message
 
 
-@given(st.sampled_from(["master_uri", "advertise_host", "port_range", "bind", "admin_bind"]), st.text())
+@given(
+    st.sampled_from(["master_uri", "advertise_host", "port_range", "bind", "admin_bind"]), st.text()
+)
 def test_any_text_is_accepted_or_refused_in_one_line(name: str, text: str) -> None:
+    message = ""
     try:
         parse_settings({**GIVEN, name: text})
     except SettingError as error:
-        assert len(str(error).splitlines()) == 1
+        message = str(error)
+    assert len(message.splitlines()) <= 1

@@ -1,10 +1,12 @@
 """The TCPROS connection header, and what tells it from HTTP."""
 
 import struct
+from contextlib import suppress
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rosproxy.core.tcpros import (
     MAX_HEADER,
     HeaderError,
@@ -107,11 +109,8 @@ def test_odd_fields_that_are_read(raw: bytes, fields: dict[str, str]) -> None:
 
 @given(st.binary(max_size=60))
 def test_random_bytes_raise_nothing_but_header_errors(body: bytes) -> None:
-    try:
+    with suppress(HeaderError):
         fields = decode_header(body)
-    except HeaderError as error:
-        assert str(error)
-    else:
         assert sum(len(name) + len(value) for name, value in fields.items()) <= len(body)
 
 

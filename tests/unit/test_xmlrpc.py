@@ -1,9 +1,9 @@
 """XML-RPC documents: what is found in them and what a rewrite leaves as it was."""
 
 import pytest
+
 from rosproxy.core import xmlrpc
 from rosproxy.core.xmlrpc import Edit, Limits, XmlRpcError
-
 from tests.unit.builders import DIALECTS, cpp_call, py_call, py_reply, python_values, raw_call
 
 URI = "http://10.0.0.5:40001/"
@@ -138,9 +138,7 @@ def test_a_byte_order_mark_moves_no_offset() -> None:
 
 def test_a_self_closing_value_ends_where_its_tag_ends() -> None:
     """Its end was taken to be that of the next tag; with white space next it was refused."""
-    body = raw_call(
-        "<value><array><data><value/>\n<value>x</value><value/></data></array></value>"
-    )
+    body = raw_call("<value><array><data><value/>\n<value>x</value><value/></data></array></value>")
     array = xmlrpc.parse_call(body).params[0]
     assert [item.raw for item in array.items] == [b"<value/>", b"<value>x</value>", b"<value/>"]
     removed = xmlrpc.apply(body, [xmlrpc.remove(array.items[0]), xmlrpc.remove(array.items[2])])

@@ -1,5 +1,6 @@
 """XML-RPC documents of every kind, well formed or not: nothing is lost and nothing is raised."""
 
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 from xmlrpc.client import Binary, DateTime
@@ -7,10 +8,10 @@ from xmlrpc.client import Binary, DateTime
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from rosproxy.core import master_api, slave_api, xmlrpc
 from rosproxy.core.uris import HostPort
 from rosproxy.core.xmlrpc import Value, XmlRpcError
-
 from tests.unit.builders import (
     add_node,
     cpp_call,
@@ -20,6 +21,7 @@ from tests.unit.builders import (
     py_call,
     py_reply,
     python_values,
+    raw_call,
 )
 
 TEXT = st.text(
@@ -32,7 +34,7 @@ SCALARS = (
     | st.booleans()
     | st.floats(allow_nan=False, allow_infinity=False)
     | st.binary(max_size=40).map(Binary)
-    | st.datetimes(datetime(1900, 1, 1), datetime(9999, 1, 1)).map(  # noqa: DTZ001 - has no zone
+    | st.datetimes(datetime(1900, 1, 1), datetime(9999, 1, 1)).map(
         lambda when: DateTime(when.replace(microsecond=0))
     )
 )
@@ -127,10 +129,9 @@ def test_the_slave_side_leaves_other_values_alone(
     call, reply = dialect
     body, answer = call(method, *values), reply([1, "said", values])
     parsed = xmlrpc.parse_call(body)
-    strings_given = [v for v in values[2] if isinstance(v, str)] if len(values) > 2 and isinstance(
-        values[2], list
-    ) else []
-    if len(strings_given) == len(set(strings_given)):  # publisherUpdate drops what comes twice
+    named = values[2] if len(values) > 2 and isinstance(values[2], list) else []
+    publishers = [item for item in named if isinstance(item, str)]
+    if len(publishers) == len(set(publishers)):  # publisherUpdate drops what comes twice
         assert slave_api.import_call(body, parsed, VISIT, WORLD) == body
     assert slave_api.export_reply(parsed, answer, VISIT, WORLD) == answer
 
@@ -142,6 +143,9 @@ def everything(body: bytes) -> None:
     master_api.export_request(request, WORLD)
     parsed = xmlrpc.parse_call(body)
     slave_api.import_call(body, parsed, VISIT, WORLD)
+    for call in (parsed, *xmlrpc.multicall(parsed)):
+        if call:
+            xmlrpc.parse_call(xmlrpc.single_call(call))
 
 
 def everything_in_reply(reply: bytes) -> None:
@@ -151,20 +155,17 @@ def everything_in_reply(reply: bytes) -> None:
     slave_api.export_reply(call, reply, VISIT, WORLD)
     request = master_api.read_request(py_call("system.multicall", []), ASKER)
     master_api.import_answer(request, master_api.read_answer(request, reply), WORLD)
+    xmlrpc.multicall_reply([xmlrpc.multicall_result(reply)])
 
 
 def survived(body: bytes) -> bool:
     """Whether a body is accepted; anything but XmlRpcError goes up."""
-    outcomes = []
+    accepted = 0
     for function in (everything, everything_in_reply):
-        try:
+        with suppress(XmlRpcError):
             function(body)
-        except XmlRpcError as error:
-            assert str(error)
-            outcomes.append(False)
-        else:
-            outcomes.append(True)
-    return any(outcomes)
+            accepted += 1
+    return accepted > 0
 
 
 SAMPLES = [
@@ -199,8 +200,10 @@ def test_random_bytes_are_refused(body: bytes) -> None:
     assert not survived(body)
 
 
-TAGS = "methodCall methodResponse methodName params param value array data struct member name".split()
-TYPES = "string int i4 i8 boolean double base64 dateTime.iso8601 nil fault ex:nil x".split()
+TAGS = ["methodCall", "methodResponse", "methodName", "params", "param", "value", "array", "data"]
+TAGS += ["struct", "member", "name", "fault"]
+TYPES = ["string", "int", "i4", "i8", "boolean", "double", "base64", "dateTime.iso8601", "nil"]
+TYPES += ["ex:nil", "x"]
 PIECES = st.sampled_from(
     [piece for tag in TAGS + TYPES for piece in (f"<{tag}>", f"</{tag}>", f"<{tag}/>")]
     + ["x", "1", " ", "\n", "&amp;", "<![CDATA[x]]>", "<!-- x -->", "<?x y?>", "http://10.0.0.5:4/"]
@@ -223,7 +226,5 @@ def test_any_soup_of_tags_raises_nothing_else(pieces: list[str]) -> None:
 @given(st.lists(st.recursive(PIECES, tree, max_leaves=15), max_size=3), st.sampled_from(METHODS))
 def test_any_tree_of_tags_raises_nothing_else(parts: list[str], method: str) -> None:
     inside = "".join(parts)
-    survived(
-        f"<methodCall><methodName>{method}</methodName><params>{inside}</params></methodCall>".encode()
-    )
+    survived(raw_call(method=method).replace(b"<params>", f"<params>{inside}".encode()))
     survived(f"<methodResponse><params>{inside}</params></methodResponse>".encode())

@@ -5,6 +5,7 @@ from typing import Any
 
 from rosproxy.core.text import (
     GAP,
+    besides_first,
     clean,
     duration,
     listed,
@@ -21,7 +22,8 @@ Status = Mapping[str, Any]
 """What ``/status`` returns."""
 
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
-FLEXIBLE = 4
+LEAST_NAME = 20
+"""Columns for names; where the addresses leave less, they get a line of their own."""
 MOST_LINES = 3
 """Lines that the topics or services of one node may take."""
 MOST_CONNECTIONS = 8
@@ -65,7 +67,7 @@ def _master(master: Status) -> str:
         return f"{uri} up for {since}{trip} (pid {master['pid']})"
     if not master["error"]:
         return f"{uri} not asked yet"
-    return f"{uri} DOWN for {since}: {clean(master['error'])}"
+    return f"{uri} DOWN for {since}: {clean(master['error']).removeprefix(f'master {uri}: ')}"
 
 
 def _ports(status: Status) -> str:
@@ -77,20 +79,27 @@ def _ports(status: Status) -> str:
 
 
 def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:
-    if not status["nodes"]:
+    nodes = status["nodes"]
+    if not nodes:
         yield "No node has registered through the proxy yet."
         return
-    heading, *rows = table([HEADING, *map(_row, status["nodes"])], columns, FLEXIBLE)
+    rows = [HEADING, *map(_row, nodes)]
+    narrow = columns - besides_first(rows) < LEAST_NAME
+    if narrow:
+        rows = [(row[0], *row[3:]) for row in rows]
+    room = max(columns - besides_first(rows), LEAST_NAME)
+    heading, *lines = table(rows, 2 if narrow else 4, room)
     yield heading
-    for node, row in zip(status["nodes"], rows, strict=True):
-        yield row
+    for node, line in zip(nodes, lines, strict=True):
+        yield line
+        if narrow:
+            yield f"{INDENT}{'at':<11}{clean(node['address'])}, outside {_outside(node)}"
         if details:
             yield from _details(node, columns)
 
 
-def _row(node: Status) -> Sequence[str]:
+def _row(node: Status) -> tuple[str, ...]:
     names = [clean(name) for name in node["nodes"]] or ["(unnamed)"]
-    outside = parse_slave_uri(node["advertised_uri"])
     connections = node["connections"]
     out, into = (
         f"{size(sum(c[key] for c in connections))}/s" if connections else "-"
@@ -99,12 +108,16 @@ def _row(node: Status) -> Sequence[str]:
     return (
         names[0] + (f" +{len(names) - 1}" if len(names) > 1 else ""),
         clean(node["address"]),
-        clean(outside or node["advertised_uri"]),
+        _outside(node),
         clean(node["state"]),
         *(str(len(node[key])) for key in ("publishes", "subscribes", "services", "connections")),
         out,
         into,
     )
+
+
+def _outside(node: Status) -> str:
+    return clean(parse_slave_uri(node["advertised_uri"]) or node["advertised_uri"])
 
 
 def _details(node: Status, columns: int) -> Iterator[str]:
@@ -119,7 +132,8 @@ def _details(node: Status, columns: int) -> Iterator[str]:
         yield from _names(word, [clean(name) for name in names], columns)
     connections = node["connections"]
     for connection in connections[:MOST_CONNECTIONS]:
-        yield shorten(INDENT + _connection(connection), max(columns, 40))
+        text = _connection(connection)
+        yield from wrap(text, columns, f"{INDENT}{' ':<11}", f"{INDENT}{'connected':<11}")
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
 
@@ -145,8 +159,7 @@ def _names(word: str, names: Sequence[str], columns: int) -> Iterator[str]:
 def _connection(connection: Status) -> str:
     what = f"{clean(connection['kind'])} {clean(connection['name'])}"
     who = f"{clean(connection['caller_id']) or '?'} at {clean(connection['peer'])}"
-    traffic = f"{size(connection['sent'])} out, {size(connection['received'])} in"
-    return f"{'connected':<11}{what} with {who}: {traffic}"
+    return f"{what} with {who}: {size(connection['sent'])} out, {size(connection['received'])} in"
 
 
 def _problems(status: Status, columns: int) -> Iterator[str]:

@@ -3,7 +3,7 @@
 import textwrap
 import unicodedata
 from collections.abc import Iterable, Sequence
-from itertools import pairwise, zip_longest
+from itertools import pairwise
 
 GAP = "  "
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
@@ -55,16 +55,20 @@ def wrap(text: str, columns: int, indent: str, first: str = "") -> list[str]:
     )
 
 
-def table(rows: Sequence[Sequence[str]], columns: int, flexible: int, least: int = 8) -> list[str]:
-    """Lines of a table with a heading in its first row, fitted into ``columns``.
+def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
+    """Lines of a table with its heading in the first row.
 
-    The first ``flexible`` cells of a row stand left and are shortened where the table is too
-    wide, down to ``least``; the others stand right and keep their width.
+    The first ``left`` cells stand left, the others right. The first cell gets ``room`` columns at
+    most and is shortened where it has more.
     """
-    widths = [max(map(width, cells)) for cells in zip_longest(*rows, fillvalue="")]
-    excess = sum(widths) + len(GAP) * (len(widths) - 1) - columns
-    widths[:flexible] = _narrowed(widths[:flexible], excess, least)
-    return [_line(row, widths, flexible) for row in rows]
+    widths = [max(map(width, cells)) for cells in zip(*rows, strict=True)]
+    widths[0] = min(widths[0], room)
+    return [_line(row, widths, left) for row in rows]
+
+
+def besides_first(rows: Sequence[Sequence[str]]) -> int:
+    """The columns that a table takes besides its first cells."""
+    return sum(len(GAP) + max(map(width, cells)) for cells in [*zip(*rows, strict=True)][1:])
 
 
 def duration(seconds: float) -> str:
@@ -118,18 +122,9 @@ def _head(text: str, room: int) -> str:
     return text
 
 
-def _narrowed(widths: list[int], excess: int, least: int) -> list[int]:
-    """Take ``excess`` columns off, each from the widest cell."""
-    widths = list(widths)
-    while excess > 0 and max(widths, default=0) > least:
-        widths[widths.index(max(widths))] -= 1
-        excess -= 1
-    return widths
-
-
-def _line(row: Sequence[str], widths: Sequence[int], flexible: int) -> str:
+def _line(row: Sequence[str], widths: Sequence[int], left: int) -> str:
     cells = [
-        pad(shorten(cell, columns), columns, right=index >= flexible)
-        for index, (cell, columns) in enumerate(zip(row, widths, strict=False))
+        pad(shorten(cell, columns), columns, right=index >= left)
+        for index, (cell, columns) in enumerate(zip(row, widths, strict=True))
     ]
     return GAP.join(cells).rstrip()

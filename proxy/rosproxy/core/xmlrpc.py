@@ -85,8 +85,8 @@ class Value:
 
     @property
     def raw(self) -> bytes:
-        """The whole element as it was sent."""
-        return self.body[slice(*self.outer)]
+        """The whole element as it was sent, in UTF-8."""
+        return self.body[slice(*self.outer)].decode(self.encoding).encode()
 
     def string(self) -> str | None:
         """The text if this is a string, else None."""

@@ -77,7 +77,7 @@ class Node:
         for method, *args in self._registrations():
             answer = self._insist(method, *args)
             if method == "registerSubscriber" and answer is not None:
-                self.subscriptions[args[0]].update([str(uri) for uri in answer])
+                self.subscriptions[args[0]].begin([str(uri) for uri in answer])
         if not self.stopping.is_set():
             self.registered.set()
 

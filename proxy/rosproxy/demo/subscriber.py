@@ -35,18 +35,34 @@ class Subscription:
         self.problem = ""
         self._links: list[Link] = []
         self._workers: dict[str, _Worker] = {}
+        self._updated = False
         self._lock = threading.Lock()
+
+    def begin(self, publishers: list[str]) -> None:
+        """Take the list that came with the registration's reply.
+
+        An update that overtook the reply is newer: the master sends them to registered nodes only.
+        """
+        with self._lock:
+            if self._updated:
+                return
+            self._follow_only(publishers)
 
     def update(self, publishers: list[str]) -> None:
         """Follow the master's list of publishers (their slave URIs)."""
         with self._lock:
-            gone = [self._workers.pop(uri) for uri in [*self._workers] if uri not in publishers]
-            for uri in publishers:
-                worker = self._workers.get(uri)
-                if worker is None or not worker.prod():
-                    self._workers[uri] = _Worker(self, uri)
+            self._updated = True
+            gone = self._follow_only(publishers)
         for worker in gone:
             worker.stop()
+
+    def _follow_only(self, publishers: list[str]) -> list[_Worker]:
+        """Have a worker for each publisher; return the workers of those that are gone."""
+        for uri in publishers:
+            worker = self._workers.get(uri)
+            if worker is None or not worker.prod():
+                self._workers[uri] = _Worker(self, uri)
+        return [self._workers.pop(uri) for uri in [*self._workers] if uri not in publishers]
 
     def close(self) -> None:
         """Drop all publishers and wait for the workers to end."""

@@ -161,14 +161,15 @@ def _asked_for(pair: set[str], nodes: set[str]) -> bool:
 class Facts:
     """Everything gathered.
 
-    ``admin`` is the admin endpoint's URL and ``admin_error`` why it could not be asked; ``status``
+    ``admin`` is the admin endpoint's URL and ``admin_error`` why it could not be asked, if it
+    was; ``status``
     and ``probe`` are what it said. ``service_uris`` are the master's, by service. ``clock`` tells
     of simulated time: whether nodes are told to use it. ``names`` are the nodes, topics and
     services that the user asked for; ``data_ports`` tells, by publisher and topic, where its
     subscribers have to connect to and whether that was reached from here.
     """
 
-    admin: str
+    admin: str = ""
     admin_error: str = ""
     status: Mapping[str, Any] | None = None
     probe: Mapping[str, Any] | None = None

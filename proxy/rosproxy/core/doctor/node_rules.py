@@ -71,7 +71,10 @@ def _inside_node(facts: Facts, node: Mapping[str, Any], name: str) -> Iterator[F
         own = f"the proxy unregisters it {after:g} s after that" if after else CLEANUP
         text = f"has ended without unregistering: {address} refuses connections"
         yield Finding(Severity.ERROR, INSIDE, name, text, f"restart it; {own}")
-    elif state in ("silent", "failing"):
+    elif state == "failing":
+        text = f"did not answer the last probe at {address}"
+        yield Finding(Severity.WARNING, INSIDE, name, text, "look again in some seconds")
+    elif state == "silent":
         text = f"does not answer at {address}: it hangs, or something drops the packets"
         fix = f"restart it; from the proxy: nc -vz {address.replace(':', ' ')}"
         yield Finding(Severity.ERROR, INSIDE, name, text, fix)
@@ -159,14 +162,30 @@ def _unresolvable(facts: Facts, node: Node, where: HostPort) -> Finding:
 
 
 def _unanswering(facts: Facts, node: Node, where: HostPort) -> Finding:
+    answer = node.attempt.reason if node.attempt.reach is Reach.STRANGER else ""
+    how = node.attempt.reach.value + (f" ({answer})" if answer else "")
+    if parse_inside_path(node.uri):
+        text = f"registered through a rosproxy as {node.uri}: {how}"
+        return Finding(Severity.ERROR, OUTSIDE, node.name, text, _fix_proxied(facts, where))
     if node.attempt.reach is Reach.SILENT:
-        text = f"no answer at {node.uri} ({node.attempt.reason}): hangs, is cut off or off"
+        text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
         fix = f"from here: nc -vz {where.host} {where.port}; if it is gone: {CLEANUP}"
         return Finding(Severity.ERROR, OUTSIDE, node.name, text, fix)
-    text = f"registered as {node.uri}, but gone: {node.attempt.reason}"
-    if where.host == facts.advertise_host and parse_inside_path(node.uri):
-        text += ". Left from a proxy here with another --port-range"
+    text = f"registered as {node.uri}, but gone: {how}"
     return Finding(Severity.ERROR, STALE, node.name, text, CLEANUP)
+
+
+def _fix_proxied(facts: Facts, where: HostPort) -> str:
+    """Cleaning up would lose nodes that a proxy takes back when it starts again."""
+    if facts.status is None:
+        return (
+            f"on {where.host}: rosproxy doctor. Does the proxy run there, does the firewall let "
+            "its ports through? Started again with the same ports it takes its nodes back"
+        )
+    return (
+        f"if this proxy had {where} before, start it with its old --advertise-host and "
+        f"--port-range, or restart the node; if it is of another proxy, look there; else {CLEANUP}"
+    )
 
 
 def _past_the_proxy(facts: Facts, node: Node) -> bool:

@@ -46,9 +46,10 @@ def _lonely(facts: Facts, topic: str) -> Finding:
     sides = graph.sides(topic) if graph else ()
     who, lacks = ("published", "subscribes to") if publishers else ("subscribed to", "publishes")
     text = f"{who} by {listed(sides)}; nobody {lacks} it"
-    others = sorted(facts.graph.topics - {topic}) if facts.graph else []
+    others = sorted(graph.topics - {topic}) if graph else []
     alike = [o for o in others if o.rpartition("/")[2] == topic.rpartition("/")[2]]
-    fix = f"a namespace or remapping? there is also {listed(alike)}" if alike else ""
+    fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
+    fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
     severity = Severity.ERROR if topic in facts.names else Severity.INFO
     return Finding(severity, PAIR, topic, text, fix)
 

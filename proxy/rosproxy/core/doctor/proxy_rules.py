@@ -1,10 +1,9 @@
 """The proxy itself: its admin endpoint, its master, its advertised address and its ports."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 from urllib.parse import urlsplit
 
-from rosproxy.core.doctor.facts import Attempt, Facts, Master, Reach
+from rosproxy.core.doctor.facts import Facts, Master, Reach
 from rosproxy.core.doctor.findings import Finding, Severity
 from rosproxy.core.text import duration, plural
 from rosproxy.core.uris import is_loopback
@@ -12,6 +11,9 @@ from rosproxy.core.uris import is_loopback
 FEW_FREE = 0.1
 """Share of the range that should be free at least."""
 
+RANGE = "published range"
+_NO_WAY_BACK = ("refused", "silent", "unreachable")
+"""How the proxy's own try may end although outside gets through: NAT has no hairpin."""
 _TRIES = {
     "refused": "nothing listens there: the range is not published, or the host is another machine",
     "silent": "no answer: a firewall drops it, or the host is not this one",
@@ -29,20 +31,14 @@ def check(facts: Facts) -> Iterator[Finding]:
 
 
 def _admin(facts: Facts) -> Iterator[Finding]:
-    if facts.status is None:
-        yield Finding(
-            Severity.ERROR,
-            "admin",
-            "",
-            facts.admin_error,
-            "docker exec CONTAINER rosproxy doctor; what follows is only what can be told "
-            "without the proxy",
-        )
-        return
-    status = facts.status
-    up = duration(status["uptime"])
-    text = f"rosproxy {status['version']} at {facts.admin}, up {up}"
-    yield Finding(Severity.OK, "admin", "proxy", text)
+    if facts.status is not None:
+        status = facts.status
+        text = f"rosproxy {status['version']} at {facts.admin}, up {duration(status['uptime'])}"
+        yield Finding(Severity.OK, "admin", "proxy", text)
+    elif facts.admin_error:
+        text = f"{facts.admin_error}. What else is said here was found without it"
+        fix = "docker ps; docker logs CONTAINER; docker exec CONTAINER rosproxy doctor"
+        yield Finding(Severity.ERROR, "admin", "proxy", text, fix)
 
 
 def _master(facts: Facts) -> Iterator[Finding]:
@@ -104,8 +100,8 @@ def _unanswered(master: Master) -> tuple[str, str]:
                 f"on {host}: roscore -p {port}; or {_other_uri()}",
             )
     return (
-        f"{master.uri} does not answer ({master.attempt.reason}): its machine is down or cut "
-        "off, or a firewall drops it",
+        f"{master.uri} does not answer: its machine is down or cut off, a firewall drops it, or "
+        "the address is wrong",
         f"from here: nc -vz {host} {port}; on {host}: rosnode list",
     )
 
@@ -120,11 +116,11 @@ def _error_of_master(text: str, fix: str) -> Finding:
 
 def _advertised_host(facts: Facts) -> Iterator[Finding]:
     host = facts.advertise_host
-    if not host:
+    if not host and facts.admin_error:
         text = "not checked: it is not known"
         fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
         yield Finding(Severity.INFO, "advertised host", "advertised host", text, fix)
-    elif is_loopback(host) and not local_master(facts):
+    elif is_loopback(host) and facts.master and not local_master(facts):
         yield Finding(
             Severity.ERROR,
             "advertised host",
@@ -148,58 +144,56 @@ def _range(facts: Facts) -> Iterator[Finding]:
         return
     if facts.probe is None:
         text = f"not tried: {facts.probe_error}"
-        yield Finding(Severity.WARNING, "published range", "published range", text)
+        yield Finding(Severity.WARNING, RANGE, RANGE, text)
         return
     outcomes: dict[tuple[str, str], list[str]] = {}
     for probe in facts.probe["probes"]:
-        key = probe["from_proxy"], probe["from_master"]
-        outcomes.setdefault(key, []).append(probe["advertised"])
-    for (mine, masters), addresses in outcomes.items():
-        whole = len(outcomes) == 1
-        yield _tried(facts.status, mine, masters, " and ".join(dict.fromkeys(addresses)), whole)
+        port = probe["advertised"].rpartition(":")[2]
+        outcomes.setdefault((probe["from_proxy"], probe["from_master"]), []).append(port)
+    for (mine, masters), ports in outcomes.items():
+        at = f"{facts.advertise_host}, port {' and '.join(dict.fromkeys(ports))}"
+        yield _tried(facts, mine, masters, at, len(outcomes) == 1)
 
 
-def _tried(
-    status: Mapping[str, Any], mine: str, masters: str, addresses: str, whole: bool
-) -> Finding:
-    """What two tries at free ports mean: by the proxy itself and by the master."""
-    check = "published range"
+def _tried(facts: Facts, mine: str, masters: str, at: str, whole: bool) -> Finding:
+    """What tries at free ports mean: one by the proxy itself and one by the master."""
     if masters == "ok":
-        text = f"the master reaches {addresses}"
-        if mine != "ok":
-            text += f"; the proxy itself does not ({mine}), which does no harm"
-        return Finding(Severity.OK, check, check, text)
+        back = "" if mine == "ok" else f" (the proxy itself does not, {mine}: no harm)"
+        return Finding(Severity.OK, RANGE, RANGE, f"the master reaches {at}{back}")
     if mine == "ok" and masters == "unknown":
-        text = f"the proxy reaches {addresses}; the master could not be asked to try"
-        return Finding(Severity.OK, check, check, text)
+        text = f"the proxy reaches {at}; the master could not be asked to try"
+        return Finding(Severity.OK, RANGE, RANGE, text)
     if mine == "ok":
         text = (
-            f"{addresses} leads here from here, but not from the master: there it is another "
+            f"{at}: reached from here, but not from the master's machine. For that it is another "
             "machine, an address that only this side has, or behind a firewall"
         )
-        return Finding(Severity.ERROR, check, check, text, _fix_host(addresses))
-    text = f"{addresses}: {_TRIES.get(mine, mine)}"
+        return Finding(Severity.ERROR, RANGE, RANGE, text, _fix_host(facts, at))
+    text, severity = f"{at}: {_TRIES.get(mine, mine)}", Severity.ERROR
     if masters == "missed":
         text += ". The master does not get through either"
-    return Finding(Severity.ERROR, check, check, text, _fix_range(status, mine, addresses, whole))
+    elif mine in _NO_WAY_BACK:
+        severity = Severity.WARNING
+        text += ". Or only the way back is missing; the master, which could tell, is not there"
+    return Finding(severity, RANGE, RANGE, text, _fix_range(facts, mine, whole))
 
 
-def _fix_host(addresses: str) -> str:
-    where = addresses.split(" ", maxsplit=1)[0].rpartition(":")
+def _fix_host(facts: Facts, at: str) -> str:
+    port = at.rpartition(" ")[2]
     return (
-        "--advertise-host ADDRESS, this host's address as the master's machine knows it; to try "
-        f"on that machine: nc -vz {where[0]} {where[2]}"
+        "--advertise-host ADDRESS: this host as the master's machine knows it "
+        f"(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz {facts.advertise_host} {port}"
     )
 
 
-def _fix_range(status: Mapping[str, Any], mine: str, addresses: str, whole: bool) -> str:
+def _fix_range(facts: Facts, mine: str, whole: bool) -> str:
     if mine == "unresolvable":
         return "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
-    ports = status["ports"]
+    ports = facts.status["ports"] if facts.status else {}
     publish = f"docker run -p {ports['advertise']}:{ports['listen']}"
     if not whole:
         return f"publish the whole range: {publish}"
-    return f"{publish}; or another --advertise-host than {addresses.rpartition(':')[0]}"
+    return f"{publish}; or correct --advertise-host, now {facts.advertise_host}"
 
 
 def _ports(facts: Facts) -> Iterator[Finding]:
@@ -207,7 +201,10 @@ def _ports(facts: Facts) -> Iterator[Finding]:
         return
     ports = facts.status["ports"]
     used, free, blocked = ports["used"], ports["free"], ports["blocked"]
-    larger = "a larger --port-range (ROSPROXY_PORT_RANGE), published as well"
+    larger = (
+        "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
+        "was refused"
+    )
     if blocked:
         first, last = ports["listen"].split("-")
         text = f"{plural(blocked, 'port')} of the range {ports['listen']} held by other programs"
@@ -232,13 +229,13 @@ def _published_master(facts: Facts) -> Iterator[Finding]:
     port = facts.status["settings"]["publish_master"] if facts.status else None
     if port is None:
         return
-    uri = f"http://{facts.advertise_host}:{port}"
-    yield _published(uri, port, facts.published_master)
-
-
-def _published(uri: str, port: int, attempt: Attempt) -> Finding:
-    check = "published master"
+    check, attempt = "published master", facts.published_master
+    text = f"http://{facts.advertise_host}:{port} for nodes outside: {attempt.reach.value}"
     if not attempt.failed:
-        return Finding(Severity.OK, check, check, f"{uri} {attempt.reach.value}")
-    text = f"{uri} for nodes outside: {attempt.reach.value}"
-    return Finding(Severity.ERROR, check, check, text, f"docker run -p {port}:{port}")
+        yield Finding(Severity.OK, check, check, text)
+    elif facts.probe and any(probe["from_proxy"] == "ok" for probe in facts.probe["probes"]):
+        yield Finding(Severity.ERROR, check, check, text, f"docker run -p {port}:{port}")
+    else:
+        text += ". From here that proves little: no port of this host was reached"
+        fix = f"docker run -p {port}:{port}; to try outside: nc -vz {facts.advertise_host} {port}"
+        yield Finding(Severity.WARNING, check, check, text, fix)
