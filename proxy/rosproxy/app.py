@@ -48,11 +48,12 @@ class App:
             SlaveService(context, self._leases), "rosproxy: slave API of a ROS node behind it\n"
         )
         self._servers = [self._slaves]
-        self._sockets: list[socket.socket] = []
+        self._acceptors: list[Acceptor] = []
         self._admin = Admin(context.metrics.registry, self.status, self._unready, self._probe)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
+        self._check_bind()
         self._reserve_range()
         settings = self.settings
         master = MasterService(self.context, self._leases, self._watch.recovered)
@@ -72,15 +73,15 @@ class App:
 
     async def stop(self) -> None:
         """End everything; registrations stay at the master, for the next start to find."""
-        await self._admin.stop()
-        await self.context.tasks.cancel()
-        for server in self._servers:
-            await server.close()
+        for acceptor in self._acceptors:
+            acceptor.stop()
+            acceptor.sock.close()
         for endpoint in self.context.registry:
             self._leases.close(endpoint)
-        for sock in self._sockets:
-            sock.close()
         self.context.bank.close_all()
+        await self.context.tasks.cancel()
+        servers = (server.close() for server in self._servers)
+        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
@@ -108,6 +109,13 @@ class App:
     def _close_port(self, port: int) -> None:
         self._slaves.close_port(port)
 
+    def _check_bind(self) -> None:
+        try:
+            listeners.bind(self.settings.bind, 0).close()
+        except OSError as error:
+            text = f"{self.settings.bind} can't be bound: {error.strerror}"
+            raise SettingError("--bind", text) from None
+
     def _reserve_range(self) -> None:
         ports = self.settings.ports.listen
         taken = self.context.bank.reserve(ports.ports())
@@ -127,8 +135,9 @@ class App:
             raise SettingError(option, f"port {port} can't be bound: {error.strerror}") from None
         server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
         self._servers.append(server)
-        self._sockets.append(sock)
-        Acceptor(self.context.tasks, sock, lambda conn, peer: _serve_speaker(server, conn))
+        self._acceptors.append(
+            Acceptor(self.context.tasks, sock, lambda conn, peer: _serve_speaker(server, conn))
+        )
 
     async def _start_admin(self) -> None:
         try:

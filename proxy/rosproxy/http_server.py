@@ -24,6 +24,10 @@ BODY_TIMEOUT = 60.0
 """Seconds in which a request's body must arrive."""
 
 
+STOP_TIMEOUT = 0.5
+"""Seconds that calls under way get to end when the server stops."""
+
+
 class Call:
     """One XML-RPC request: its body, who sent it and where it arrived."""
 
@@ -36,6 +40,10 @@ class Call:
         self.local = here
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
+
+    def comes_from(self, instance: str) -> bool:
+        """Whether a proxy itself made this call."""
+        return self.loop_id.partition(" ")[0] == instance
 
     def with_body(self, body: bytes) -> "Call":
         """The same call with another body."""
@@ -62,7 +70,7 @@ class XmlRpcServer:
     def __init__(self, service: Service, greeting: str) -> None:
         self._service, self._greeting = service, greeting
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
-        self._by_port: dict[int, list[web.RequestHandler[web.BaseRequest]]] = {}
+        self._by_port: dict[int, list[web.RequestHandler]] = {}
 
     async def serve(self, conn: socket.socket) -> None:
         """Take over a connection. Raises OSError if it has ended already."""
@@ -78,7 +86,7 @@ class XmlRpcServer:
 
     async def close(self) -> None:
         """Close all connections."""
-        await self._server.shutdown(1.0)
+        await self._server.shutdown(STOP_TIMEOUT)
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
         if request.method in ("GET", "HEAD"):

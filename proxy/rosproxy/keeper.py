@@ -9,7 +9,7 @@ from rosproxy.core.recovery import Claim, allowed, confirmed_by
 from rosproxy.core.registry import Endpoint, Place
 from rosproxy.core.uris import HostPort
 from rosproxy.leases import Leases
-from rosproxy.network import resolve
+from rosproxy.names import resolve
 from rosproxy.node_client import NodeClient
 from rosproxy.upkeep import Upkeep
 from rosproxy.upstream import MasterError, Unreachable
@@ -55,8 +55,8 @@ class Keeper:
             self._leases.end(endpoint)
             return
         endpoint.tcpros_port, endpoint.trusted = said.tcpros_port, True
-        await self._name(endpoint)
         self._leases.open(endpoint)
+        await self._name(endpoint)
         await self._upkeep.adopt(endpoint, said)
 
     async def probe(self, endpoint: Endpoint) -> None:

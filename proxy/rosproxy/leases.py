@@ -13,7 +13,7 @@ from rosproxy.core.master_api import Admission, Refusal, registering_uri
 from rosproxy.core.registry import Endpoint, Place, RangeExhausted
 from rosproxy.core.uris import HostPort, is_loopback, parse_slave_uri
 from rosproxy.core.xmlrpc import Call
-from rosproxy.network import resolve
+from rosproxy.names import resolve
 from rosproxy.node_client import NodeClient
 
 log = logging.getLogger(__name__)
@@ -161,10 +161,10 @@ class Leases:
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""
         addresses = await resolve(node.host)
-        if source in addresses:
-            return Place(source, named=True)
         elsewhere = [address for address in addresses if not is_loopback(address)]
-        if not elsewhere or (await self._nodes.probe(HostPort(source, node.port))).pid is not None:
+        if source in addresses or not elsewhere:
+            return Place(source, named=source in addresses)
+        if (await self._nodes.probe(HostPort(source, node.port))).pid is not None:
             return Place(source, named=False)
         for address in elsewhere:
             if (await self._nodes.probe(HostPort(address, node.port))).pid is not None:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 from rosproxy.context import Context
 from rosproxy.core import master_api, xmlrpc
@@ -64,25 +65,32 @@ class MasterService:
         body = master_api.export_request(request, self._context.addressing)
         reply = await self._context.upstream.master(body)
         answer = master_api.read_answer(request, reply)
-        self._note(answer)
+        self._note(answer, request.asker)
         return master_api.import_answer(request, answer, self._context.addressing)
 
-    def _note(self, answer: Answer) -> None:
+    def _note(self, answer: Answer, asker: Asker) -> None:
+        """Take in what the master accepted.
+
+        A service's port is believed only from the node's own address: anybody may register a
+        service in another node's name, and its port would be opened to outside.
+        """
         registry, now = self._context.registry, self._context.now()
         for fact in master_api.noted(answer, now):
             held = fact.registration
             if fact.endpoint is None:
                 registry.unregister(held.kind, held.name, held.caller_id)
             elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
-                registry.register(fact.endpoint, held)
+                own = asker.address == fact.endpoint.place.address
+                registry.register(fact.endpoint, held if own else replace(held, service_api=None))
 
     def _refuse_loop(self, call: Call) -> None:
+        if not call.comes_from(self._context.instance):
+            return
+        what = "a node's address"
         if call.loop_id == self._context.instance:
-            uri = self._context.settings.master_uri
-            log.error("--master-uri %s leads back to this proxy", uri)
-            raise xmlrpc.XmlRpcError(
-                xmlrpc.SYSTEM_ERROR, f"--master-uri {uri} leads back to the proxy itself"
-            )
+            what = f"--master-uri {self._context.settings.master_uri}"
+            log.error("%s leads back to this proxy", what)
+        raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
 
 
 class PublishedMaster:

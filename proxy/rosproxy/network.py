@@ -1,27 +1,11 @@
-"""What the operating system knows of addresses: names, routes and interfaces."""
+"""What the operating system knows of addresses: routes and interfaces."""
 
-import asyncio
 import socket
 from ipaddress import ip_network
 from pathlib import Path
 
 from rosproxy.core.addressing import Network
 from rosproxy.core.uris import plain_address
-
-RESOLVE_TIMEOUT = 3.0
-"""Seconds after which a name counts as unresolvable."""
-
-
-async def resolve(host: str) -> list[str]:
-    """The addresses of a host name, IPv4 first; empty if it can't be resolved in time."""
-    loop = asyncio.get_running_loop()
-    try:
-        async with asyncio.timeout(RESOLVE_TIMEOUT):
-            found = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-    except (OSError, TimeoutError, UnicodeError):
-        return []
-    addresses = dict.fromkeys(plain_address(str(info[4][0])) for info in found)
-    return sorted(addresses, key=lambda address: ":" in address)
 
 
 def address_towards(address: str) -> str:

@@ -12,7 +12,7 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 log = logging.getLogger(__name__)
@@ -65,9 +65,19 @@ class Relay:
             )
             for index in (0, 1)
         ]
-        for thread in threads:
+        for index, thread in enumerate(threads):
             thread.daemon = True
-            thread.start()
+            try:
+                thread.start()
+            except RuntimeError as error:
+                self._give_up(error, range(index, 2), finished)
+                return
+
+    def end(self) -> None:
+        """End both directions; ``finished`` is called when that is done."""
+        for sock in (self.outside, self.inside):
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
 
     def sample(self, now: float) -> None:
         """Compute the rates since the last sample; ``now`` is in seconds."""
@@ -86,6 +96,16 @@ class Relay:
             log.debug("relay of %s: %s", self.name, error)
             self._pass_reset_on(index)
         self._finish(index, finished)
+
+    def _give_up(
+        self, error: RuntimeError, left: Iterable[int], finished: Callable[["Relay"], None]
+    ) -> None:
+        """Reset both sides: the directions that are ``left`` can't be started."""
+        log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
+        self.failed = True
+        self.end()
+        for index in left:
+            self._finish(index, finished)
 
     def _count_sent(self, size: int) -> None:
         self.sent += size

@@ -4,16 +4,15 @@ import logging
 from urllib.parse import urlsplit
 
 from rosproxy.context import Context
-from rosproxy.core import slave_api, xmlrpc
+from rosproxy.core import multicall, slave_api, xmlrpc
 from rosproxy.core.liveness import Change, Probe
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.slave_api import TopicPort, Visit
 from rosproxy.core.uris import HostPort, parse_inside_path
-from rosproxy.core.xmlrpc import MULTICALL
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
-from rosproxy.network import resolve
+from rosproxy.names import resolve
 from rosproxy.upstream import Unreachable
 
 log = logging.getLogger(__name__)
@@ -28,13 +27,16 @@ class SlaveService:
     async def __call__(self, call: Call) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
         endpoint = self._context.registry.by_port.get(call.local.port)
+        if call.comes_from(self._context.instance):
+            raise Unreachable("a node's address leads back to the proxy itself")
         if endpoint is None or not self._means(endpoint, call.path):
             raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
         parsed = xmlrpc.parse_call(call.body)
-        if parsed.method != MULTICALL:
+        if parsed.method != multicall.MULTICALL:
             return await self._one(endpoint, parsed, call)
-        results = [await self._result(endpoint, inner, call) for inner in xmlrpc.multicall(parsed)]
-        return xmlrpc.multicall_reply(results)
+        calls = multicall.inner_calls(parsed)
+        results = [await self._result(endpoint, inner, call) for inner in calls]
+        return multicall.results_reply(results)
 
     def _means(self, endpoint: Endpoint, path: str) -> bool:
         """Whether a request's path names this endpoint, or none, as roscpp's.
@@ -48,10 +50,10 @@ class SlaveService:
     async def _result(self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: Call) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
-            return xmlrpc.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
-        single = call.with_body(xmlrpc.single_call(inner))
+            return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
+        single = call.with_body(multicall.single_call(inner))
         reply = await self._one(endpoint, xmlrpc.parse_call(single.body), single)
-        return xmlrpc.multicall_result(reply)
+        return multicall.result_value(reply)
 
     async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
         if not await self._may(parsed.method, call.source):

@@ -22,10 +22,10 @@ from rosproxy.core import xmlrpc
 from rosproxy.core.doctor import replies
 from rosproxy.core.doctor.facts import Attempt, Facts, Master, Node, Reach, Words, scope
 from rosproxy.core.doctor.pair_rules import connected
-from rosproxy.core.tcpros import decode_header, encode_header, header_length
+from rosproxy.core.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.core.uris import HostPort, parse_host_port, parse_service_uri, parse_slave_uri
 from rosproxy.metrics import Metrics
-from rosproxy.network import resolve
+from rosproxy.names import resolve
 from rosproxy.upstream import CALLER_ID, MasterError, Unreachable, Upstream
 
 PARALLEL = 64
@@ -311,10 +311,12 @@ async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
     try:
         async with asyncio.timeout(WITHIN):
             reply = await _exchange_header(where, encode_header(header))
-    except ConnectionRefusedError:
+    except (ConnectionError, EOFError):
         return Attempt(Reach.REFUSED)
-    except (OSError, EOFError, ValueError) as error:
-        return Attempt(Reach.SILENT, str(error))
+    except OSError:
+        return Attempt(Reach.SILENT)
+    except HeaderError as error:
+        return Attempt(Reach.STRANGER, str(error))
     if "error" in reply:
         return Attempt(Reach.STRANGER, reply["error"])
     return Attempt(Reach.ANSWERED)

@@ -1,6 +1,7 @@
 """TCPROS through a lease: read the connection header, find the node's port, relay."""
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections.abc import Callable
@@ -19,6 +20,7 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT = 5.0
 RATE_INTERVAL = 2.0
+STOP_TIMEOUT = 1.0
 
 
 class TcprosService:
@@ -62,11 +64,19 @@ class TcprosService:
             self._context.metrics.relay_errors.labels("bad header").inc()
             return
         inside = await self._connect(endpoint, fields)
-        if inside is None:
+        if inside is None or not await _hand_on(header, inside):
             self._fail(endpoint, conn, fields)
             return
-        await asyncio.get_running_loop().sock_sendall(inside, header)
         self._start(endpoint, fields, conn, inside, peer)
+
+    async def stop(self) -> None:
+        """End all connections."""
+        for relay in self.relays:
+            relay.end()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STOP_TIMEOUT):
+                while self._relays:
+                    await asyncio.sleep(0.01)
 
     async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
         """A connection to the node; its port is asked for anew if the known one refuses."""
@@ -152,6 +162,21 @@ async def _dial(address: str, port: int) -> socket.socket | None:
         sock.close()
         raise
     return sock
+
+
+async def _hand_on(header: bytes, inside: socket.socket) -> bool:
+    """Send a node the header that was read; closes the connection to it if that fails."""
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            await asyncio.get_running_loop().sock_sendall(inside, header)
+    except (OSError, TimeoutError) as error:
+        log.debug("handing a header on: %s", error)
+        inside.close()
+        return False
+    except BaseException:
+        inside.close()
+        raise
+    return True
 
 
 def _call_in(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:

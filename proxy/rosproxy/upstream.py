@@ -12,11 +12,12 @@ from rosproxy.core import xmlrpc
 from rosproxy.core.liveness import Probe
 from rosproxy.core.uris import HostPort, slave_uri
 from rosproxy.metrics import Metrics
+from rosproxy.names import Resolver
 
 CALLER_ID = "/rosproxy"
 """The node name under which the proxy itself calls."""
 LOOP_HEADER = "X-Rosproxy"
-"""Carries the proxy's own id upstream, so that a proxy that is its own master notices."""
+"""Carries the proxy's own id, so that it notices when a call of its own comes back to it."""
 MAX_BODY = 64 * 1024 * 1024
 """Longest XML-RPC body in bytes, either way."""
 MULTICALL_SIZE = 100
@@ -57,9 +58,12 @@ class Upstream:
         parts = urlsplit(master_uri)
         self._master_url = f"http://{parts.netloc}{parts.path or '/'}"
         self._master = _session(
-            aiohttp.TCPConnector(limit=64, keepalive_timeout=MASTER_KEEPALIVE), {LOOP_HEADER: instance}
+            aiohttp.TCPConnector(resolver=Resolver(), limit=64, keepalive_timeout=MASTER_KEEPALIVE),
+            {LOOP_HEADER: instance},
         )
-        self._nodes = _session(aiohttp.TCPConnector(limit=0, force_close=True), {})
+        self._nodes = _session(
+            aiohttp.TCPConnector(limit=0, force_close=True), {LOOP_HEADER: f"{instance} node"}
+        )
 
     async def close(self) -> None:
         """Close all connections."""

@@ -145,11 +145,13 @@ async def test_the_master_can_not_redirect_the_proxy(proxy, master, victim):
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
-async def test_the_proxys_own_ports_do_not_pass_for_nodes(proxy, node):
+async def test_the_proxys_own_ports_do_not_pass_for_nodes(proxy, master, node):
     uri = f"http://{PROXY}:{proxy.settings.master_port}/"
     await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
     (endpoint,) = proxy.app.context.registry
-    assert endpoint.place.address == NODE
+    with pytest.raises(ConnectionResetError):
+        await rpc((HOST, endpoint.port), "getPid", "/outside")
+    assert not [call for call in master.named("getPid") if call == ("/outside",)]
     own = f"http://{PROXY}:{endpoint.port}/"
     await node.call(proxy.master, "registerPublisher", "/t2", "x/Y", own)
     assert len(proxy.app.context.registry) == 1

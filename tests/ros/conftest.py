@@ -104,12 +104,13 @@ def module_lab(
     topology_of: Callable[[Plan], Topology],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Lab]:
-    """One roscore and one proxy for a module, which may set PLAN and PROXY_OPTIONS."""
+    """One roscore and one proxy for a module, which may set PLAN and what else is read here."""
     compiled_node()
     plan = getattr(request.module, "PLAN", SHARED)
     lab = Lab(topology_of(plan), tmp_path_factory.mktemp("lab"))
     lab.proxy_options = getattr(request.module, "PROXY_OPTIONS", ())
     lab.advertise_host = getattr(request.module, "ADVERTISE_HOST", lab.advertise_host)
+    lab.master_role = getattr(request.module, "MASTER_ROLE", lab.master_role)
     try:
         yield lab
     finally:

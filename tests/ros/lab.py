@@ -14,12 +14,19 @@ from typing import Any
 from tests.ros import wire
 from tests.ros.cpp import NODES, compiled_node
 from tests.ros.processes import Process, stop_all, wait_until
-from tests.ros.topology import MASTER_PORT, OUT_HOST, OUT_NODE, Place, Topology
+from tests.ros.topology import (
+    ADVERTISED_NAME,
+    MASTER_PORT,
+    OUT_HOST,
+    OUT_NODE,
+    PUBLISHED_MASTER_PORT,
+    Place,
+    Topology,
+)
 
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 """ROS's programs are the system Python's: no other Python may come first."""
 MASTER_URI = f"http://robot:{MASTER_PORT}"
-INSIDE_MASTER_URI = f"http://rosproxy:{MASTER_PORT}"
 CALLER = "/rosproxy_tests"
 
 
@@ -39,6 +46,7 @@ class Lab:
         self.folder = folder
         self.flat = topology.plan.flat
         self.advertise_host = OUT_HOST
+        self.master_role = "out"
         self.proxy_options: tuple[str, ...] = ()
         self.master: Process | None = None
         self.proxy: Process | None = None
@@ -56,19 +64,21 @@ class Lab:
 
     # roscore and proxy
 
-    def start_master(self, role: str = "out") -> None:
+    def start_master(self) -> None:
         """Starts a real roscore and waits until it serves."""
-        uri = f"http://{self.place(role).hostname}:{MASTER_PORT}"
-        env = self.environment(role) | {"ROS_MASTER_URI": uri}
+        place = self.place(self.master_role)
+        uri = f"http://{place.hostname}:{MASTER_PORT}"
+        env = self.environment(place.role) | {"ROS_MASTER_URI": uri}
         argv = ["/usr/bin/roscore", "-p", str(MASTER_PORT)]
-        self.master = self._spawn("roscore", self.place(role), argv, env)
+        self.master = self._spawn("roscore", place, argv, env)
         wait_until("the master answers", self._master_answers, timeout=30)
         self.master_answered = time.time()
         self.master.wait_for(r"started core service \[/rosout\]", timeout=30)
 
     def _master_answers(self) -> bool:
         try:
-            return bool(self.ask_master("getPid"))
+            master = self.place(self.master_role).address
+            return bool(wire.call(self.place("px"), master, MASTER_PORT, "getPid", CALLER))
         except OSError:
             return False
 
@@ -77,12 +87,18 @@ class Lab:
         if self.flat:
             return
         ports = self.topology.plan.ports
-        argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER_URI]
+        argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", self._upstream()]
         argv += ["--advertise-host", self.advertise_host, "--port-range", ports.bound]
         if ports.published != ports.bound:
             argv += ["--advertise-port-range", ports.published]
         self.proxy = self._spawn_proxy([*argv, *self.proxy_options])
         self.proxy.wait_for(r"ready: ", timeout=15)
+
+    def _upstream(self) -> str:
+        """The real master, as the proxy reaches it."""
+        if self.master_role == "out":
+            return MASTER_URI
+        return f"http://{self.place(self.master_role).address}:{MASTER_PORT}"
 
     def _spawn_proxy(self, argv: list[str]) -> Process:
         env = {"PATH": SYSTEM_PATH, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
@@ -156,7 +172,6 @@ class Lab:
 
     def environment(self, role: str) -> dict[str, str]:
         """All that a ROS program on this machine gets: no ROS_IP, no ROS_HOSTNAME."""
-        inside = role.startswith("c") and not self.flat
         home = self.folder / role
         home.mkdir(exist_ok=True)
         return {
@@ -165,7 +180,7 @@ class Lab:
             "HOME": str(home),
             "ROS_HOME": str(home),
             "ROS_LOG_DIR": str(home / "log"),
-            "ROS_MASTER_URI": INSIDE_MASTER_URI if inside else MASTER_URI,
+            "ROS_MASTER_URI": self.master_uri(role),
             "PYTHONUNBUFFERED": "1",
             "PYTHONDONTWRITEBYTECODE": "1",
         }
@@ -186,10 +201,24 @@ class Lab:
         address, port = self.master_address(role)
         return wire.call(self.place(role), address, port, method, CALLER, *arguments)
 
+    def master_uri(self, role: str) -> str:
+        """ROS_MASTER_URI on a machine: inside it names the proxy."""
+        if self._is_inside(role):
+            return f"http://rosproxy:{MASTER_PORT}"
+        if self.master_role == "out":
+            return MASTER_URI
+        return f"http://{ADVERTISED_NAME}:{PUBLISHED_MASTER_PORT}"
+
     def master_address(self, role: str) -> tuple[str, int]:
-        """Where programs on a machine find their master."""
-        inside = role.startswith("c") and not self.flat
-        return (self.place("px").address if inside else OUT_NODE), MASTER_PORT
+        """The same as an address and a port."""
+        if self._is_inside(role):
+            return self.place("px").address, MASTER_PORT
+        if self.master_role == "out":
+            return OUT_NODE, MASTER_PORT
+        return OUT_HOST, PUBLISHED_MASTER_PORT
+
+    def _is_inside(self, role: str) -> bool:
+        return role.startswith("c") and not self.flat
 
     def node_uri(self, name: str) -> str | None:
         """The slave URI that outside sees for a node, or nothing."""

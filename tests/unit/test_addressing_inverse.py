@@ -142,7 +142,7 @@ def test_a_service_uri_handed_out_comes_back_as_it_was(
 def test_outside_uris_pass_both_ways(
     topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
 ) -> None:
-    addressing, endpoints = topology
+    addressing, _ = topology
     asker, _ = data.draw(askers(addressing))
     host = data.draw(st.sampled_from(["laptop", "192.168.1.77", addressing.host]))
     uri = slave_uri(HostPort(host, data.draw(st.integers(1024, 29000))))

@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 
-from rosproxy.core import master_api, xmlrpc
+from rosproxy.core import master_api
 from rosproxy.core.addressing import Addressing
 from rosproxy.core.methods import Kind
+from rosproxy.core.multicall import MULTICALL
 from rosproxy.core.xmlrpc import INVALID_PARAMS, XmlRpcError, dump_fault
 from tests.unit.builders import (
     DIALECTS,
@@ -232,4 +233,4 @@ def test_empty_and_self_closing_results_keep_their_places() -> None:
 def test_a_multicall_without_addresses_is_plain(calls: list[Any]) -> None:
     request = master_api.read_request(py_call("system.multicall", calls), NODE)
     assert request.plain
-    assert request.method == xmlrpc.MULTICALL
+    assert request.method == MULTICALL

@@ -74,14 +74,6 @@ def test_a_claim_takes_that_port_or_none() -> None:
     assert pool.free == 3
 
 
-def test_peeking_takes_nothing() -> None:
-    pool = PortPool(PortRange(5, 5))
-    assert pool.peek() == 5
-    assert pool.free == 1
-    pool.take()
-    assert pool.peek() is None
-
-
 def test_a_blocked_port_is_never_handed_out() -> None:
     pool = PortPool(RANGE)
     pool.block(45000)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.core import master_api, slave_api, xmlrpc
+from rosproxy.core import master_api, multicall, slave_api, xmlrpc
 from rosproxy.core.uris import HostPort
 from rosproxy.core.xmlrpc import Value, XmlRpcError
 from tests.unit.builders import (
@@ -25,7 +25,7 @@ from tests.unit.builders import (
 )
 
 TEXT = st.text(
-    st.characters(min_codepoint=0x20, exclude_categories=("Cs",), exclude_characters="\ufffe\uffff")
+    st.characters(min_codepoint=0x20, exclude_categories=["Cs"], exclude_characters="\ufffe\uffff")
     | st.sampled_from("\t\n<>&'\"")
 )
 SCALARS = (
@@ -143,9 +143,9 @@ def everything(body: bytes) -> None:
     master_api.export_request(request, WORLD)
     parsed = xmlrpc.parse_call(body)
     slave_api.import_call(body, parsed, VISIT, WORLD)
-    for call in (parsed, *xmlrpc.multicall(parsed)):
+    for call in (parsed, *multicall.inner_calls(parsed)):
         if call:
-            xmlrpc.parse_call(xmlrpc.single_call(call))
+            xmlrpc.parse_call(multicall.single_call(call))
 
 
 def everything_in_reply(reply: bytes) -> None:
@@ -155,7 +155,7 @@ def everything_in_reply(reply: bytes) -> None:
     slave_api.export_reply(call, reply, VISIT, WORLD)
     request = master_api.read_request(py_call("system.multicall", []), ASKER)
     master_api.import_answer(request, master_api.read_answer(request, reply), WORLD)
-    xmlrpc.multicall_reply([xmlrpc.multicall_result(reply)])
+    multicall.results_reply([multicall.result_value(reply)])
 
 
 def survived(body: bytes) -> bool:

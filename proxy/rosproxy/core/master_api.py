@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 from rosproxy.core import xmlrpc
 from rosproxy.core.addressing import Addressing, Asker
 from rosproxy.core.methods import Reply, Row, resolve_name, row
+from rosproxy.core.multicall import MULTICALL, inner_calls, inner_items, insert_items
 from rosproxy.core.registry import Endpoint, Registration
 from rosproxy.core.uris import parse_service_uri
-from rosproxy.core.xmlrpc import MULTICALL, Call, Edit, Value
+from rosproxy.core.xmlrpc import Call, Edit, Value
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +103,9 @@ def read_request(body: bytes, asker: Asker) -> Request:
     call = xmlrpc.parse_call(body)
     if call.method != MULTICALL:
         return Request(body, [call], False, replace(asker, caller_id=_caller_id(call)))
-    calls = list(xmlrpc.multicall(call))
+    calls = inner_calls(call)
     caller_id = next((_caller_id(inner) for inner in calls if inner), "")
-    items = xmlrpc.multicall_items(call)
+    items = inner_items(call)
     return Request(body, calls, True, replace(asker, caller_id=caller_id), items)
 
 
@@ -152,7 +153,7 @@ def import_answer(request: Request, answer: Answer, addressing: Addressing) -> b
         asker = replace(request.asker, endpoint=result.endpoint or request.asker.endpoint)
         edits += _import_result(result, asker, addressing)
     if request.multicall and answer.value and answer.value.items:
-        edits += xmlrpc.insert_items(answer.value, _refused_results(request))
+        edits += insert_items(answer.value, _refused_results(request))
     return xmlrpc.apply(answer.body, edits)
 
 

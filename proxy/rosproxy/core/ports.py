@@ -84,10 +84,6 @@ class PortPool:
         """Take exactly this port; False if it is not free."""
         return port in self._free and self.take(port) == port
 
-    def peek(self) -> int | None:
-        """A port that is free, without taking it."""
-        return next(iter(self._free), None)
-
     def give_back(self, port: int) -> None:
         """Return a port that was taken."""
         if port not in self._blocked:

@@ -1,6 +1,6 @@
 """``/status`` as text for people."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rosproxy.core.text import (
@@ -10,10 +10,8 @@ from rosproxy.core.text import (
     duration,
     listed,
     plural,
-    shorten,
     size,
     table,
-    width,
     wrap,
 )
 from rosproxy.core.uris import parse_slave_uri
@@ -25,24 +23,22 @@ HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "O
 LEAST_NAME = 20
 """Columns for names; where the addresses leave less, they get a line of their own."""
 MOST_LINES = 3
-"""Lines that the topics or services of one node may take."""
+"""Lines that the topics, services or connections of one node may take, each."""
 MOST_CONNECTIONS = 8
 INDENT = "    "
 
 
 def render(status: Status, columns: int, lines: int | None = None) -> str:
-    """The whole status in ``columns``; without the details of nodes if it has ``lines`` only."""
-    full = [*_head(status), "", *_nodes(status, columns, True), *_problems(status, columns)]
+    """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
+    head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
+    problems = [*_problems(status, columns)]
+    full = [*head, "", *_nodes(status, columns, True), *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
-    short = [*_head(status), "", *_nodes(status, columns, False), *_problems(status, columns)]
-    return "\n".join(_cut(short, lines))
-
-
-def _cut(text: list[str], lines: int) -> list[str]:
-    if len(text) <= lines:
-        return text
-    return [*text[: lines - 1], f"… {len(text) - lines + 1} more lines: rosproxy status | less"]
+    short = [*head, *problems, "", *_nodes(status, columns, False)]
+    if len(short) > lines:
+        short[lines - 1 :] = [f"… {plural(len(short) - lines + 1, 'line')} more: rosproxy status"]
+    return "\n".join(short)
 
 
 def _head(status: Status) -> Iterator[str]:
@@ -87,13 +83,13 @@ def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:
     narrow = columns - besides_first(rows) < LEAST_NAME
     if narrow:
         rows = [(row[0], *row[3:]) for row in rows]
-    room = max(columns - besides_first(rows), LEAST_NAME)
+    room = max(columns - besides_first(rows), len(HEADING[0]))
     heading, *lines = table(rows, 2 if narrow else 4, room)
     yield heading
     for node, line in zip(nodes, lines, strict=True):
         yield line
         if narrow:
-            yield f"{INDENT}{'at':<11}{clean(node['address'])}, outside {_outside(node)}"
+            yield from _detail("at", f"{clean(node['address'])}, outside {_outside(node)}", columns)
         if details:
             yield from _details(node, columns)
 
@@ -121,39 +117,24 @@ def _outside(node: Status) -> str:
 
 
 def _details(node: Status, columns: int) -> Iterator[str]:
-    others = node["nodes"] if len(node["nodes"]) > 1 else ()
     for word, names in (
-        ("also", others[1:]),
+        ("also", node["nodes"][1:]),
         ("publishes", node["publishes"]),
         ("subscribes", node["subscribes"]),
         ("services", node["services"]),
         ("parameters", node["parameters"]),
     ):
-        yield from _names(word, [clean(name) for name in names], columns)
+        yield from _detail(word, GAP.join(map(clean, names)), columns)
     connections = node["connections"]
     for connection in connections[:MOST_CONNECTIONS]:
-        text = _connection(connection)
-        yield from wrap(text, columns, f"{INDENT}{' ':<11}", f"{INDENT}{'connected':<11}")
+        yield from _detail("connected", _connection(connection), columns)
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
 
 
-def _names(word: str, names: Sequence[str], columns: int) -> Iterator[str]:
-    """Names on at most MOST_LINES lines, then how many more."""
+def _detail(word: str, text: str, columns: int) -> list[str]:
     lead = f"{INDENT}{word:<11}"
-    indent = " " * len(lead)
-    line, number = lead, 1
-    for index, name in enumerate(names):
-        word = shorten(name, max(columns - len(indent), 20))
-        if line.strip() and line != lead and width(line + GAP + word) > columns:
-            if number == MOST_LINES:
-                yield f"{line}  … {len(names) - index} more"
-                return
-            yield line
-            line, number = indent, number + 1
-        line += word if line in (lead, indent) else GAP + word
-    if names:
-        yield line
+    return wrap(text, columns, " " * len(lead), lead, MOST_LINES)
 
 
 def _connection(connection: Status) -> str:

@@ -40,10 +40,13 @@ def pad(text: str, columns: int, right: bool = False) -> str:
     return space + text if right else text + space
 
 
-def wrap(text: str, columns: int, indent: str, first: str = "") -> list[str]:
+def wrap(
+    text: str, columns: int, indent: str, first: str = "", most: int | None = None
+) -> list[str]:
     """Lines of at most ``columns``, led by ``indent``; the first one by ``first`` if given.
 
-    Words stay whole, even those that are too long for a line: they may be commands to copy.
+    Not more than ``most`` lines, the last of which then ends in an ellipsis. Words stay whole,
+    even those that are too long for a line: they may be commands to copy.
     """
     return textwrap.wrap(
         text,
@@ -52,6 +55,8 @@ def wrap(text: str, columns: int, indent: str, first: str = "") -> list[str]:
         subsequent_indent=indent,
         break_long_words=False,
         break_on_hyphens=False,
+        max_lines=most,
+        placeholder=" …",
     )
 
 

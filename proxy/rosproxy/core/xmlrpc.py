@@ -9,7 +9,7 @@ Specification: http://xmlrpc.com/spec.md.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 from xml.parsers import expat
@@ -24,8 +24,6 @@ INVALID_PARAMS = -32602
 """Fault code: a method's parameters do not fit."""
 SYSTEM_ERROR = -32400
 """Fault code: the proxy itself could not do its part."""
-
-MULTICALL = "system.multicall"
 
 _SCALARS = frozenset(
     {"string", "int", "i4", "i8", "boolean", "double", "dateTime.iso8601", "base64", "nil"}
@@ -100,10 +98,6 @@ class Value:
             return int(self.text)
         except ValueError:
             return None
-
-    def strings(self) -> list[str]:
-        """The strings of an array; everything else in it is left out."""
-        return [item.text for item in self.items if item.kind == "string"]
 
     def member(self, name: str) -> "Value | None":
         """The value of a struct's member, or None."""
@@ -182,10 +176,19 @@ def parse_reply(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value | None:
 
     Raises XmlRpcError if the document is malformed, exceeds ``limits`` or is not a response.
     """
+    value, fault = parse_response(body, limits)
+    return None if fault else value
+
+
+def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[Value, bool]:
+    """Parse a ``methodResponse``: its value, and whether that is a fault.
+
+    Raises XmlRpcError as ``parse_reply`` does.
+    """
     parser = _Parser(body, limits)
     if parser.root != "methodResponse" or len(parser.values) != 1:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
-    return None if parser.fault else parser.values[0]
+    return parser.values[0], parser.fault
 
 
 def dump_call(method: str, *params: Any) -> bytes:
@@ -209,11 +212,6 @@ def dump_value(value: Any) -> bytes:
     return text[text.index(b"<value>") : text.rindex(b"</value>") + len(b"</value>")]
 
 
-def fault_value(code: int, message: str) -> bytes:
-    """A fault as ``system.multicall`` returns it: a bare struct among the results."""
-    return dump_value({"faultCode": code, "faultString": message})
-
-
 def python_value(value: Value) -> Any:
     """A value as Python sees it, for lists of strings and numbers such as ROS status triples.
 
@@ -224,83 +222,6 @@ def python_value(value: Value) -> Any:
     if value.kind == "struct":
         return dict(zip(value.members, map(python_value, value.items), strict=True))
     return value.integer() if value.kind == "int" else value.text
-
-
-def multicall(call: Call) -> Iterator[Call | None]:
-    """The calls of a ``system.multicall``, in order; None for one that is no call.
-
-    Shape of the parameter: ``[{methodName: string, params: array}, …]``
-    (https://mirrors.talideon.com/articles/multicall.html). Raises XmlRpcError if one of the calls
-    is a ``system.multicall`` again, which rosmaster would carry out.
-    """
-    for item in multicall_items(call):
-        method, params = item.member("methodName"), item.member("params")
-        name = method.string() if method else None
-        if name == MULTICALL:
-            raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} inside {MULTICALL}")
-        if name and params and params.kind == "array":
-            yield Call(name, params.items)
-        else:
-            yield None
-
-
-def multicall_items(call: Call) -> list[Value]:
-    """The elements of a ``system.multicall``'s parameter."""
-    if len(call.params) != 1 or call.params[0].kind != "array":
-        return []
-    return call.params[0].items
-
-
-def single_call(call: Call) -> bytes:
-    """One call of a multicall as a document of its own, its parameters as they were sent."""
-    params = b"".join(b"<param>" + value.raw + b"</param>" for value in call.params)
-    name = escape(call.method).encode()
-    return (
-        b"<?xml version='1.0'?><methodCall><methodName>" + name + b"</methodName>"
-        b"<params>" + params + b"</params></methodCall>"
-    )
-
-
-def multicall_result(reply: bytes) -> bytes:
-    """A reply as ``system.multicall`` returns it: a one-element array, or a bare fault struct.
-
-    Raises XmlRpcError if it is no XML-RPC response.
-    """
-    parser = _Parser(reply, DEFAULT_LIMITS)
-    if parser.root != "methodResponse" or len(parser.values) != 1:
-        raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
-    raw = parser.values[0].raw
-    return raw if parser.fault else array_value([raw])
-
-
-def array_value(items: Iterable[bytes]) -> bytes:
-    """An array of raw values."""
-    return b"<value><array><data>" + b"".join(items) + b"</data></array></value>"
-
-
-def multicall_reply(results: Iterable[bytes]) -> bytes:
-    """The ``methodResponse`` of a multicall from its results, each a raw value."""
-    return (
-        b"<?xml version='1.0'?><methodResponse><params><param>"
-        + array_value(results)
-        + b"</param></params></methodResponse>"
-    )
-
-
-def insert_items(reply: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edit]:
-    """Edits that insert raw values into an array of at least one item.
-
-    Each insert is (index in the finished array, value); indices rise.
-    """
-    edits = []
-    for done, (index, raw) in enumerate(inserts):
-        before = index - done
-        if before < len(reply.items):
-            place = reply.items[before].outer[0]
-        else:
-            place = reply.items[-1].outer[1]
-        edits.append(Edit(place, place, raw))
-    return edits
 
 
 def _text(raw: bytes, encoding: str) -> str:
@@ -430,10 +351,7 @@ class _Parser:
         return self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
 
     def _tag_end(self) -> int:
-        match = _TAG.match(self.body, self._expat.CurrentByteIndex)
-        if not match:
-            raise XmlRpcError(PARSE_ERROR, "a tag without an end")
-        return match.end()
+        return next(_TAG.finditer(self.body, self._expat.CurrentByteIndex)).end()
 
 
 _STARTS = {

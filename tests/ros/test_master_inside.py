@@ -1,0 +1,48 @@
+"""The master itself runs inside; outside finds it at a port that the proxy publishes."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.ros.combinations import each_direction, each_pair
+from tests.ros.lab import Lab
+from tests.ros.topology import ADVERTISED_NAME, PUBLISHED_MASTER_PORT
+
+pytestmark = pytest.mark.boundary
+
+MASTER_ROLE = "c1"
+ADVERTISE_HOST = ADVERTISED_NAME
+PROXY_OPTIONS = ("--publish-master", str(PUBLISHED_MASTER_PORT))
+
+
+@each_direction
+@each_pair("publisher", "subscriber")
+def test_topics(lab: Lab, publisher: str, subscriber: str, source: str, sink: str) -> None:
+    topic = f"/{lab.unique('topic')}"
+    receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    receiver.wait_for("^ready")
+    lab.node(publisher, source, "pub", topic=topic)
+    receiver.wait_for_count("^got hello ", 5)
+
+
+@each_direction
+@each_pair("server", "client")
+def test_services(lab: Lab, server: str, client: str, source: str, sink: str) -> None:
+    service = f"/{lab.unique('service')}"
+    lab.node(server, source, "serve", service=service)
+    lab.node(client, sink, "call", service=service).wait_for("^reply ask 0 ")
+
+
+def test_the_published_master_tells_its_published_address(lab: Lab) -> None:
+    assert lab.ask_master("getUri") == f"http://{ADVERTISED_NAME}:{PUBLISHED_MASTER_PORT}/"
+
+
+def test_parameters_and_tools_through_the_published_master(lab: Lab) -> None:
+    key, name = f"/{lab.unique('value')}", lab.unique("talker")
+    lab.ask_master("setParam", key, {"a": [1, 2.0, ""]})
+    assert lab.ask_master("getParam", key, role="c2") == {"a": [1, 2.0, ""]}
+    node = lab.node("rospy", "c2", "pub", name=name, topic=f"/{name}/topic")
+    node.wait_for("^sent ")
+    assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
+    lab.run("out", "rosnode", "kill", name)
+    node.wait(timeout=5)
