@@ -1,5 +1,6 @@
 """The slave API of inside nodes, as outside and the master reach it through a lease."""
 
+import asyncio
 import logging
 from urllib.parse import urlsplit
 
@@ -16,6 +17,9 @@ from rosproxy.names import resolve
 from rosproxy.upstream import Unreachable
 
 log = logging.getLogger(__name__)
+
+REGISTRATION_GRACE = 0.5
+"""Seconds that a publisherUpdate waits at most for a registration of the same node."""
 
 
 class SlaveService:
@@ -70,6 +74,8 @@ class SlaveService:
     async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
         if not slave_api.rewritten(parsed):
             return await self._ask(endpoint, call.body)
+        if parsed.method == "publisherUpdate":
+            await self._after_registration(endpoint)
         self._context.refresh_networks()
         visit = self._visit(endpoint, call)
         addressing = self._context.addressing
@@ -78,6 +84,16 @@ class SlaveService:
         )
         self._note_port(endpoint, slave_api.topic_port(parsed, reply))
         return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    async def _after_registration(self, endpoint: Endpoint) -> None:
+        """Let the reply to a registration that is under way reach the node first.
+
+        A node that applies an older list of publishers after a newer one loses a publisher; the
+        way through the proxy must not make that race of ROS more likely.
+        """
+        deadline = self._context.now() + REGISTRATION_GRACE
+        while endpoint.pending and self._context.now() < deadline:  # noqa: ASYNC110 - rare, short
+            await asyncio.sleep(0.002)
 
     def _note_port(self, endpoint: Endpoint, said: TopicPort | None) -> None:
         """Note a TCPROS port; by topic only for topics that the node has registered.

@@ -53,7 +53,12 @@ class Patient:
 async def survey(patient: Patient) -> Facts:
     """Gather all facts."""
     asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(PARALLEL))
-    facts = Facts(advertise_host=patient.advertise_host, names=patient.names)
+    host = patient.advertise_host
+    facts = Facts(
+        advertise_host=host,
+        advertised_addresses=tuple(await resolve(host)) if host else (),
+        names=patient.names,
+    )
     if patient.admin is None:
         return await _beyond(facts, patient.master_uri, "")
     try:

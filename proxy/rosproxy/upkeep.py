@@ -75,9 +75,9 @@ class Upkeep:
 
     async def clean_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that is gone at the master. Raises Unreachable."""
-        held = list(endpoint.registrations.values())
+        started, held = self._context.now(), list(endpoint.registrations.values())
         await self._unregister(endpoint, held)
-        endpoint.health.cleaned = True
+        endpoint.health.cleaned, endpoint.health.cleaned_at = True, started
         self._context.metrics.cleanups.inc()
         log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
 
@@ -113,7 +113,7 @@ class Upkeep:
             return
         kept = upkeep.still_held(endpoint, said.published, said.subscribed, answer.pid == pid)
         for held in list(endpoint.registrations.values()):
-            if held not in kept:
+            if held not in kept and held.since < endpoint.health.cleaned_at:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
         endpoint.health.pid, endpoint.health.cleaned = answer.pid, False
         await self.register([(endpoint, held) for held in kept])

@@ -21,9 +21,9 @@ LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 
 
 def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, LoopFactory]:
-    """Tests of the proxy run in both event loops that users have: uvloop is optional."""
+    """A module with BOTH_LOOPS runs in both event loops that users have: uvloop is optional."""
     factories: dict[str, LoopFactory] = {"asyncio": asyncio.new_event_loop}
-    if "make_proxy" not in getattr(item, "fixturenames", ()):
+    if not getattr(getattr(item, "module", None), "BOTH_LOOPS", False):
         return factories
     try:
         import uvloop
@@ -61,8 +61,11 @@ async def master() -> AsyncIterator[Master]:
 
 
 @pytest.fixture
-async def make_proxy(master: Master) -> AsyncIterator[MakeProxy]:
+async def make_proxy(
+    master: Master, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[MakeProxy]:
     """Starts proxies in this process, for the master unless told otherwise."""
+    monkeypatch.setattr("rosproxy.app.TICK", 0.05)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:

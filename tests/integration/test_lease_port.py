@@ -25,6 +25,8 @@ from tests.integration.net import (
 )
 from tests.integration.node import Node, greet, read_header, service_header, topic_header
 
+BOTH_LOOPS = True
+
 
 async def test_xml_rpc_and_tcpros_share_the_port(proxy, node):
     await node.publish(proxy.master)

@@ -20,6 +20,8 @@ from tests.integration.net import (
     xml,
 )
 
+BOTH_LOOPS = True
+
 
 async def test_a_registration_reaches_the_master_with_the_advertised_address(proxy, master, node):
     assert await node.publish(proxy.master) == [1, "registered", []]

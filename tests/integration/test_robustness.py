@@ -12,6 +12,7 @@ import pytest
 from rosproxy.core.methods import MASTER_METHODS
 from tests.integration.net import NODE, Where, connect, exchange, post, rpc, xml
 
+BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
 CALL = xml("getPid", "/somebody")
 NAMES = ["constructor", "__proto__", "__class__", "_dispatch", "toString", "a" * 5000, "é<&>'"]

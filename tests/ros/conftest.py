@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,12 +55,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
-) -> Iterator[None, pytest.TestReport, pytest.TestReport]:
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Shows with a failure what the proxy and the nodes of that test have printed."""
     result = yield
     lab = getattr(item, "funcargs", {}).get("lab")
     if result.failed and isinstance(lab, Lab):
-        result.sections += [(title, text) for title, text in lab.transcripts()]
+        result.sections += lab.transcripts()
     if HERE in item.path.parents:
         item.config.stash[report.KEY].add(result)
     return result

@@ -160,9 +160,7 @@ class Lab:
         self.nodes.append(process)
         return process
 
-    def run(
-        self, role: str, *argv: str, timeout: float = 30, check: bool = True
-    ) -> Result:
+    def run(self, role: str, *argv: str, timeout: float = 30, check: bool = True) -> Result:
         """Runs a program on a machine to its end. Raises AssertionError when it fails."""
         process = self.start(role, *argv)
         code = process.wait(timeout)

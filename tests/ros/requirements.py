@@ -24,9 +24,10 @@ def missing(with_proxy: bool) -> str | None:
     gone = [name for name in _PROGRAMS if shutil.which(name) is None]
     gone += [name for name in _FILES if not Path(name).exists()]
     if gone:
-        return f"the real-ROS layer needs ROS 1: run `scripts/install-ros.sh` as root (missing: {', '.join(gone)})"
+        names = ", ".join(gone)
+        return f"this layer needs ROS 1: run `scripts/install-ros.sh` as root (missing: {names})"
     if os.geteuid() != 0:
-        return "the real-ROS layer makes network namespaces: run it as root (`sudo make test LAYERS=ros`)"
+        return "this layer makes network namespaces: run it as root (`make test LAYERS=ros`)"
     if with_proxy and importlib.util.find_spec("rosproxy") is None:
         return "rosproxy is not installed in this Python: run `make venv`"
     return None

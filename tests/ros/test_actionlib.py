@@ -23,9 +23,7 @@ def test_a_goal_gives_feedback_and_a_result(
 
 @each_direction
 @each_pair("server", "client")
-def test_a_goal_is_cancelled(
-    lab: Lab, server: str, client: str, source: str, sink: str
-) -> None:
+def test_a_goal_is_cancelled(lab: Lab, server: str, client: str, source: str, sink: str) -> None:
     action = f"/{lab.unique('long')}"
     serving = lab.node(server, source, "actionserver", action=action, seconds=30)
     caller = lab.node(client, sink, "actionclient", action=action, cancel=1)

@@ -64,9 +64,7 @@ def test_services_with_ros_ip_set_to_the_inside_address(lab: Lab, library: str, 
 
 @pytest.mark.boundary
 @each_library
-def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(
-    lab: Lab, library: str
-) -> None:
+def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(lab: Lab, library: str) -> None:
     """With ROS_IP=127.0.0.1 both libraries listen on loopback only: nobody can reach them."""
     assert lab.proxy is not None
     since = lab.proxy.mark()
@@ -79,9 +77,7 @@ def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(
 
 @each_direction
 @each_pair("first", "second")
-def test_nodes_in_a_namespace(
-    lab: Lab, first: str, second: str, source: str, sink: str
-) -> None:
+def test_nodes_in_a_namespace(lab: Lab, first: str, second: str, source: str, sink: str) -> None:
     """The same relative names, pushed into a namespace, meet each other."""
     space = [f"__ns:=/{lab.unique('robot')}/arm"]
     receiver = lab.node(second, sink, "sub", remap=space, topic="joint")

@@ -22,7 +22,9 @@ ROLES = {"publisher": "pub", "subscriber": "sub", "server": "serve"}
 each_role = pytest.mark.parametrize("role", ROLES.values(), ids=ROLES.keys())
 
 
-def start(lab: Lab, library: str, role: str, where: str = "c1", name: str = "") -> tuple[Process, str]:
+def start(
+    lab: Lab, library: str, role: str, where: str = "c1", name: str = ""
+) -> tuple[Process, str]:
     """A registered node of that role, and its name."""
     name = name or lab.unique("mortal")
     names = {"serve": {"service": f"/{name}/service"}}.get(role, {"topic": f"/{name}/topic"})
@@ -64,9 +66,7 @@ def test_a_node_ended_by_sigint_leaves_nothing(lab: Lab, library: str, role: str
 @pytest.mark.boundary
 @each_role
 @each_library
-def test_a_node_ended_by_sigkill_is_cleaned_up(
-    lab: Lab, library: str, role: str, measure
-) -> None:
+def test_a_node_ended_by_sigkill_is_cleaned_up(lab: Lab, library: str, role: str, measure) -> None:
     node, name = start(lab, library, role)
     port = port_of(lab, name)
     node.kill()
@@ -77,9 +77,7 @@ def test_a_node_ended_by_sigkill_is_cleaned_up(
 
 @pytest.mark.boundary
 @each_library
-def test_a_stopped_node_that_goes_on_is_registered_and_served_again(
-    lab: Lab, library: str
-) -> None:
+def test_a_stopped_node_that_goes_on_is_registered_and_served_again(lab: Lab, library: str) -> None:
     node, name = start(lab, library, "pub")
     node.send(signal.SIGSTOP)
     lab.wait_unregistered(name, timeout=12)
@@ -124,7 +122,11 @@ def test_a_short_hang_is_nobodys_loss(lab: Lab, library: str) -> None:
     assert port_of(lab, name) == port
 
 
-WAYS_TO_END = {"after-sigint": signal.SIGINT, "after-sigkill": signal.SIGKILL, "while-it-lives": None}
+WAYS_TO_END = {
+    "after-sigint": signal.SIGINT,
+    "after-sigkill": signal.SIGKILL,
+    "while-it-lives": None,
+}
 
 
 @pytest.mark.parametrize("way", WAYS_TO_END.values(), ids=WAYS_TO_END.keys())

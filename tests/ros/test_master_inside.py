@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from tests.ros.combinations import each_direction, each_pair
 from tests.ros.lab import Lab
-from tests.ros.topology import ADVERTISED_NAME, PUBLISHED_MASTER_PORT
+from tests.ros.topology import ADVERTISED_NAME, PUBLISHED_MASTER_PORT, SHARED
 
 pytestmark = pytest.mark.boundary
 
+PLAN = replace(SHARED, name="h", hairpin=True)
 MASTER_ROLE = "c1"
 ADVERTISE_HOST = ADVERTISED_NAME
 PROXY_OPTIONS = ("--publish-master", str(PUBLISHED_MASTER_PORT))

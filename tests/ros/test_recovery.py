@@ -61,7 +61,10 @@ def test_messages_flow_again_after_the_proxy_was_killed(
     receiver.wait_for_count("^got ", 5)
     uri = lab.node_uri(name)
     started = restart_proxy(lab)
-    measure(f"messages {SIDES[source]} to {SIDES[sink]} again, proxy restarted", next_time(receiver, "^got ", started))
+    measure(
+        f"messages {SIDES[source]} to {SIDES[sink]} again, proxy restarted",
+        next_time(receiver, "^got ", started),
+    )
     assert lab.node_uri(name) == uri
     late = lab.node(subscriber, sink, "sub", topic=topic)
     late.wait_for_count("^got ", 5, HARD_LIMIT)
@@ -78,7 +81,10 @@ def test_calls_are_answered_again_after_the_proxy_was_killed(
     caller = lab.node(client, sink, "call", service=service, rate=50, count=100000)
     caller.wait_for_count("^reply ", 5)
     started = restart_proxy(lab)
-    measure(f"calls {SIDES[sink]} to {SIDES[source]} again, proxy restarted", next_time(caller, "^reply ", started))
+    measure(
+        f"calls {SIDES[sink]} to {SIDES[source]} again, proxy restarted",
+        next_time(caller, "^reply ", started),
+    )
     late = lab.node(client, sink, "call", service=service)
     late.wait_for("^reply ", HARD_LIMIT)
 

@@ -35,7 +35,7 @@ def test_list_names_the_topics_of_both_sides(lab: Lab, side: str) -> None:
 
 @each_side
 def test_list_by_host(lab: Lab, side: str) -> None:
-    name, topic = talker(lab, "c1")
+    _, topic = talker(lab, "c1")
     output = lab.run(side, "rostopic", "list", "--host").output
     assert re.search(rf"^Host \[\S+\]:(\n  .*)*\n  {topic}$", output, re.MULTILINE), output
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from tests.ros.combinations import each_direction, each_pair
@@ -15,7 +17,7 @@ def test_every_call_gets_its_answer(
     lab: Lab, server: str, client: str, source: str, sink: str, first: str
 ) -> None:
     service = f"/{lab.unique('service')}"
-    options = {"service": service, "count": 5, "rate": 50}
+    options: dict[str, Any] = {"service": service, "count": 5, "rate": 50}
     if first == "server":
         lab.node(server, source, "serve", service=service).wait_for("^ready")
         caller = lab.node(client, sink, "call", **options)
@@ -35,7 +37,13 @@ def test_a_persistent_connection_carries_every_call(
 ) -> None:
     service = f"/{lab.unique('persistent')}"
     lab.node(server, source, "serve", service=service).wait_for("^ready")
-    options = {"service": service, "persistent": 1, "count": 20, "rate": 100, "size": 5000}
+    options: dict[str, Any] = {
+        "service": service,
+        "persistent": 1,
+        "count": 20,
+        "rate": 100,
+        "size": 5000,
+    }
     caller = lab.node(client, sink, "call", **options)
     caller.wait_for("^done")
     assert len(caller.wait_for_count(r"^reply ask \d+ size 5000 crc", 20)) == 20

@@ -22,8 +22,9 @@ def test_rosparam_set_get_list_and_delete(lab: Lab, side: str) -> None:
     lab.run(side, "rosparam", "set", f"{key}/text", "two words")
     assert lab.run(OTHER[side], "rosparam", "get", f"{key}/text").output == "two words\n"
     listed = lab.run(OTHER[side], "rosparam", "list", key).output.split()
-    assert set(listed) == {f"{key}/{leaf}" for leaf in
-                           ("gains/p", "gains/i", "gains/name", "gains/flag", "text")}
+    assert set(listed) == {
+        f"{key}/{leaf}" for leaf in ("gains/p", "gains/i", "gains/name", "gains/flag", "text")
+    }
     got = lab.run(OTHER[side], "rosparam", "get", f"{key}/gains").output
     assert sorted(got.split("\n")) == ["", "", "flag: true", "i: 2", "name: ''", "p: 1.5"]
     lab.run(OTHER[side], "rosparam", "delete", key)
@@ -132,7 +133,9 @@ def test_roslaunch_sees_that_a_required_node_died(lab: Lab, side: str, tmp_path:
     space = lab.unique("required")
     launch_package(tmp_path)
     file = tmp_path / "test.launch"
-    file.write_text(LAUNCH.format(ns=space).replace('name="talker"', 'name="talker" required="true"'))
+    file.write_text(
+        LAUNCH.format(ns=space).replace('name="talker"', 'name="talker" required="true"')
+    )
     path = {"ROS_PACKAGE_PATH": f"{tmp_path}:/usr/share"}
     launched = lab.start(side, "roslaunch", str(file), env=path)
     lab.wait_registered(f"/{space}/talker", timeout=30)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from tests.ros.lab import Lab
@@ -11,7 +13,7 @@ from tests.ros.lab import Lab
 @pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
 def test_messages_come_by_udp(lab: Lab, first: str, size: int) -> None:
     topic = f"/{lab.unique('udp')}"
-    receiver_options = {"topic": topic, "udp": 1}
+    receiver_options: dict[str, Any] = {"topic": topic, "udp": 1}
     if first == "subscriber":
         receiver = lab.node("roscpp", "out", "sub", **receiver_options)
         receiver.wait_for("^ready")

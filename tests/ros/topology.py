@@ -64,12 +64,15 @@ class Plan:
 
     With `flat`, nothing separates the machines and every name resolves everywhere: nodes
     then work without a proxy, which shows that a test and its nodes are sound.
+    With `hairpin`, inside reaches the published ports at the host's address too, as it does
+    with Docker's own proxy process; without, a wrong address handed to inside is found out.
     """
 
     name: str
     networks: tuple[tuple[str, ...], ...]
     ports: PortMap
     flat: bool = False
+    hairpin: bool = False
 
 
 SHARED = Plan("s", (("c1", "c2"),), PortMap(45000, 45099, 45000))
@@ -174,7 +177,7 @@ class Topology:
         host = self.places["host"].namespace
         _run("ip", "netns", "exec", host, "sysctl", "-q", "-w", "net.ipv4.ip_forward=1")
         if not self.plan.flat:
-            rules = _rules(self.plan.ports, self.places["px"].address)
+            rules = _rules(self.plan, self.places["px"].address)
             _run("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
     def _write_names(self, place: Place) -> None:
@@ -199,18 +202,21 @@ class Topology:
         return next(a for a in self.places["px"].addresses if a.startswith(f"{subnet}."))
 
 
-def _rules(ports: PortMap, proxy: str) -> str:
-    pairs = [*ports.pairs(), (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)]
+def _rules(plan: Plan, proxy: str) -> str:
+    pairs = [*plan.ports.pairs(), (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)]
     published = ", ".join(f"{host} : {bound}" for host, bound in pairs)
+    come = "" if plan.hairpin else 'iifname "out0"'
     return f"""
     table ip boundary {{
       chain published {{
         type nat hook prerouting priority dstnat;
-        iifname "out0" meta l4proto tcp dnat ip to {proxy} : tcp dport map {{ {published} }}
+        ip daddr {OUT_HOST} {come} meta l4proto tcp \
+          dnat ip to {proxy} : tcp dport map {{ {published} }}
       }}
       chain leaving {{
         type nat hook postrouting priority srcnat;
         ip saddr 172.30.0.0/16 oifname "out0" masquerade
+        ip saddr 172.30.0.0/16 ct status dnat masquerade
       }}
       chain forward {{
         type filter hook forward priority filter; policy drop;

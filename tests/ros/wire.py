@@ -28,7 +28,8 @@ def post(place: Place, address: str, port: int, body: bytes, path: str = "/") ->
 def call(place: Place, address: str, port: int, method: str, *arguments: Any) -> Any:
     """Calls a method; gives the value of its ROS status triple, or raises LookupError."""
     reply = post(place, address, port, dumps(arguments, method).encode())
-    code, message, value = loads(reply)[0][0]
+    triple: Any = loads(reply)[0][0]
+    code, message, value = triple
     if code != 1:
         raise LookupError(message)
     return value

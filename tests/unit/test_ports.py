@@ -85,7 +85,20 @@ def test_a_blocked_port_is_never_handed_out() -> None:
     assert [pool.take(45001), pool.take(), pool.take()] == [45002, 45003, None]
 
 
-@given(st.lists(st.tuples(st.sampled_from(["take", "give", "block"]), st.integers(0, 3))))
+def test_a_port_that_is_let_go_by_another_program_is_handed_out_last() -> None:
+    pool = PortPool(RANGE)
+    pool.block(45000)
+    pool.block(45002)
+    assert pool.blocked_ports == [45000, 45002]
+    pool.unblock(45000)
+    assert pool.blocked_ports == [45002]
+    assert [pool.take() for _ in range(4)] == [45001, 45003, 45000, None]
+
+
+STEPS = st.sampled_from(["take", "give", "block", "unblock"])
+
+
+@given(st.lists(st.tuples(STEPS, st.integers(0, 3))))
 def test_every_port_is_free_held_or_blocked(steps: list[tuple[str, int]]) -> None:
     pool, held, blocked = PortPool(RANGE), set[int](), set[int]()
     for what, index in steps:
@@ -99,5 +112,8 @@ def test_every_port_is_free_held_or_blocked(steps: list[tuple[str, int]]) -> Non
         elif what == "block":
             pool.block(port)
             blocked.add(port)
+        elif what == "unblock" and port in blocked - held:
+            pool.unblock(port)
+            blocked.discard(port)
         assert pool.free == len(RANGE) - len(held | blocked)
         assert pool.blocked == len(blocked)

@@ -173,6 +173,16 @@ def test_registrations_keep_an_endpoint_unless_it_was_cleaned_up() -> None:
     assert registry.reclaimable() is endpoint
     endpoint.connections = 1
     assert registry.reclaimable() is None
+    endpoint.connections, endpoint.pending = 0, 1
+    assert registry.reclaimable() is None
+
+
+def test_a_call_under_way_keeps_an_endpoint() -> None:
+    registry = make_registry()
+    endpoint = idle(registry, 5, 10.0)
+    endpoint.pending = 1
+    assert not endpoint.idle
+    assert registry.reclaimable() is None
 
 
 def test_restored_endpoints_have_the_port_that_they_had() -> None:

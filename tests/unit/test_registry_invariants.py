@@ -106,6 +106,13 @@ class Registries(RuleBasedStateMachine):
             self.registry.remove(endpoint)
             self.expected = {k: e for k, e in self.expected.items() if e is not endpoint}
 
+    @rule(data=st.data())
+    def another_program_ends(self, data: st.DataObject) -> None:
+        if self.blocked:
+            port = data.draw(st.sampled_from(sorted(self.blocked)))
+            self.registry.pool.unblock(port)
+            self.blocked.discard(port)
+
     @invariant()
     def every_port_is_free_held_or_blocked(self) -> None:
         pool, held = self.registry.pool, set(self.registry.by_port)

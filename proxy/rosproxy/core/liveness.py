@@ -33,7 +33,8 @@ class Health:
 
     ``refused`` tells whether the last failure was a refused connection, which only a node that
     has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
-    taken back at the master and are kept only for the case that it answers again.
+    taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
+    again.
     """
 
     answered: float | None = None
@@ -41,6 +42,7 @@ class Health:
     failures: int = 0
     refused: bool = False
     cleaned: bool = False
+    cleaned_at: float = 0.0
     pid: int | None = None
     checked: float | None = None
 

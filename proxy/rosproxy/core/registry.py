@@ -175,8 +175,8 @@ class Registry:
 
         One that has just been admitted is not idle: the master's reply is still on its way.
         """
-        spare = [e for e in self if e.idle_since is not None and not e.connections]
-        idle = [e for e in spare if e.idle or e.health.cleaned]
+        unused = [e for e in self if not (e.connections or e.pending or e.idle_since is None)]
+        idle = [e for e in unused if e.idle or e.health.cleaned]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
     def exhausted(self) -> RangeExhausted:

@@ -101,6 +101,10 @@ class Graph:
         """The publishers and the subscribers of a topic."""
         return [*self.publishers.get(topic, ()), *self.subscribers.get(topic, ())]
 
+    def lonely(self, topic: str) -> bool:
+        """Whether a topic lacks publishers or subscribers."""
+        return not (self.publishers.get(topic) and self.subscribers.get(topic))
+
     def names(self) -> set[str]:
         """All nodes."""
         tables = (self.publishers, self.subscribers, self.services)
@@ -111,9 +115,11 @@ class Graph:
 class Scope:
     """What the names that the user asked for lead to.
 
-    ``pairs`` are (topic, publisher, subscriber), ``lonely`` topics that lack one side.
+    ``named`` are the nodes among the names, ``nodes`` all that have to be looked at; ``pairs`` are
+    (topic, publisher, subscriber), ``lonely`` topics that lack one side.
     """
 
+    named: Sequence[str] = ()
     pairs: Sequence[tuple[str, str, str]] = ()
     lonely: Sequence[str] = ()
     services: Sequence[str] = ()
@@ -125,31 +131,28 @@ def scope(graph: Graph, names: Sequence[str]) -> Scope:
     """Resolve names of nodes, topics and services.
 
     One node means all of its topics (without ``/rosout``, which every node has), several nodes
-    what they have in common, topics their publishers and subscribers.
+    what they have in common, topics their publishers and subscribers. A name that is both a
+    node's and a topic's means the topic.
     """
-    known = graph.names()
-    nodes = {name for name in names if name in known}
-    topics = {name for name in names if name in graph.topics and name not in nodes}
+    topics = [name for name in names if name in graph.topics]
+    nodes = [name for name in names if name in graph.names() and name not in topics]
     services = [name for name in names if name in graph.services]
-    rest = [n for n in names if n not in nodes and n not in topics and n not in services]
-    candidates = topics or (graph.topics - {"/rosout"} if nodes else set())
+    candidates = sorted(topics or (graph.topics - {"/rosout"} if nodes else ()))
     pairs = [
         (topic, publisher, subscriber)
-        for topic in sorted(candidates)
+        for topic in candidates
         for publisher in graph.publishers.get(topic, ())
         for subscriber in graph.subscribers.get(topic, ())
-        if _asked_for({publisher, subscriber}, nodes)
+        if _asked_for({publisher, subscriber}, {*nodes})
     ]
-    lonely = [
-        topic
-        for topic in sorted(candidates)
-        if not (graph.publishers.get(topic) and graph.subscribers.get(topic))
-        and (topic in topics or nodes & {*graph.sides(topic)})
-    ]
-    providers = {node for name in services for node in graph.services[name]}
-    involved = {node for _, *both in pairs for node in both}
-    sides = {node for topic in topics for node in graph.sides(topic)}
-    return Scope(pairs, lonely, services, rest, frozenset(nodes | providers | involved | sides))
+    lonely = [topic for topic in candidates if graph.lonely(topic)]
+    if not topics:
+        lonely = [topic for topic in lonely if {*nodes} & {*graph.sides(topic)}]
+    unknown = [name for name in names if name not in {*nodes, *topics, *services}]
+    asked = {*nodes, *(node for name in services for node in graph.services[name])}
+    sides = {node for _, *both in pairs for node in both}
+    sides |= {node for topic in topics for node in graph.sides(topic)}
+    return Scope(nodes, pairs, lonely, services, unknown, frozenset(asked | sides))
 
 
 def _asked_for(pair: set[str], nodes: set[str]) -> bool:
@@ -161,12 +164,12 @@ def _asked_for(pair: set[str], nodes: set[str]) -> bool:
 class Facts:
     """Everything gathered.
 
-    ``admin`` is the admin endpoint's URL and ``admin_error`` why it could not be asked, if it
-    was; ``status``
-    and ``probe`` are what it said. ``service_uris`` are the master's, by service. ``clock`` tells
-    of simulated time: whether nodes are told to use it. ``names`` are the nodes, topics and
-    services that the user asked for; ``data_ports`` tells, by publisher and topic, where its
-    subscribers have to connect to and whether that was reached from here.
+    ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status``
+    and ``probe`` are what it said. ``advertised_addresses`` is what the advertised host resolves
+    to here. ``service_uris`` are the master's, by service. ``clock``: nodes are told to use
+    simulated time. ``names`` are the nodes, topics and services that the user asked for;
+    ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
+    whether that was reached from here.
     """
 
     admin: str = ""
@@ -176,6 +179,7 @@ class Facts:
     probe_error: str = ""
     master: Master | None = None
     advertise_host: str = ""
+    advertised_addresses: tuple[str, ...] = ()
     published_master: Attempt = Attempt()
     graph: Graph | None = None
     nodes: Mapping[str, Node] = field(default_factory=dict)

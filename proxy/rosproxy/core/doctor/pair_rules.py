@@ -1,6 +1,6 @@
 """The names asked for: which publisher and subscriber are not connected, and why."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -14,25 +14,28 @@ PAIR, ANY = "pair", "*"
 
 def check(facts: Facts) -> Iterator[Finding]:
     """All findings about the names asked for."""
-    if not facts.names or facts.graph is None:
-        return
+    if facts.names and facts.graph is None:
+        text = "nothing can be said: the master does not answer"
+        yield Finding(Severity.INFO, PAIR, ", ".join(facts.names), text)
+    elif facts.names:
+        yield from _named(facts)
+
+
+def _named(facts: Facts) -> Iterator[Finding]:
     scope = facts.scope
-    for name in scope.unknown:
-        yield _unknown(facts, name)
-    for topic in scope.lonely:
-        yield _lonely(facts, topic)
-    for topic, publisher, subscriber in scope.pairs:
-        yield _pair(facts, topic, publisher, subscriber)
-    for service in scope.services:
-        yield _service(facts, service)
-    if not (scope.pairs or scope.lonely or scope.services or scope.unknown):
-        yield _nothing_common(facts)
+    yield from (_unknown(facts, name) for name in scope.unknown)
+    yield from (_lonely(facts, topic) for topic in scope.lonely)
+    yield from (_pair(facts, *pair) for pair in scope.pairs)
+    yield from (_service(facts, service) for service in scope.services)
+    together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
+    if scope.named and len(together) > 1 and not scope.pairs:
+        yield _nothing_common(together)
 
 
 def _unknown(facts: Facts, name: str) -> Finding:
     graph = facts.graph
     known = sorted(graph.names() | graph.topics | {*graph.services}) if graph else []
-    alike = get_close_matches(name, known, 3, 0.5)
+    alike = get_close_matches(name, known, 3, 0.7)
     alike += [other for other in known if other.endswith(name) and other not in alike][:3]
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
@@ -54,10 +57,10 @@ def _lonely(facts: Facts, topic: str) -> Finding:
     return Finding(severity, PAIR, topic, text, fix)
 
 
-def _nothing_common(facts: Facts) -> Finding:
-    text = "no topic is published by one of these nodes and subscribed to by another"
-    fix = f"compare: rosnode info {' '.join(facts.names)}; look for namespaces and remappings"
-    return Finding(Severity.ERROR, PAIR, " and ".join(facts.names), text, fix)
+def _nothing_common(names: Sequence[str]) -> Finding:
+    text = "none publishes what another of them subscribes to"
+    fix = f"compare: rosnode info {' '.join(names)}; look for namespaces and remappings"
+    return Finding(Severity.ERROR, PAIR, " and ".join(names), text, fix)
 
 
 def _pair(facts: Facts, topic: str, publisher: str, subscriber: str) -> Finding:

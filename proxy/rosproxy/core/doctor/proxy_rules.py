@@ -12,6 +12,7 @@ FEW_FREE = 0.1
 """Share of the range that should be free at least."""
 
 RANGE = "published range"
+_BY_ADDRESS = "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
 _NO_WAY_BACK = ("refused", "silent", "unreachable")
 """How the proxy's own try may end although outside gets through: NAT has no hairpin."""
 _TRIES = {
@@ -55,6 +56,10 @@ def _master(facts: Facts) -> Iterator[Finding]:
         by = ", through another rosproxy" if master.proxied else ""
         yield Finding(Severity.OK, "master", "master", f"{master.uri} answers{trip}{by}")
         yield from _master_elsewhere(facts, master)
+        if facts.graph is None:
+            yield _error_of_master(
+                f"{master.uri} answers, but does not tell its state", "rosnode list"
+            )
     else:
         yield _error_of_master(*_unanswered(master))
 
@@ -115,20 +120,18 @@ def _error_of_master(text: str, fix: str) -> Finding:
 
 
 def _advertised_host(facts: Facts) -> Iterator[Finding]:
-    host = facts.advertise_host
-    if not host and facts.admin_error:
-        text = "not checked: it is not known"
-        fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
-        yield Finding(Severity.INFO, "advertised host", "advertised host", text, fix)
+    host, check = facts.advertise_host, "advertised host"
+    if not host:
+        if facts.admin_error:
+            fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
+            yield Finding(Severity.INFO, check, check, "not checked: it is not known", fix)
     elif is_loopback(host) and facts.master and not local_master(facts):
-        yield Finding(
-            Severity.ERROR,
-            "advertised host",
-            "advertised host",
-            f"{host} is a loopback address: to every other machine it means that machine itself",
-            "--advertise-host ADDRESS, the address of this host in the network of the robots "
-            "(ROSPROXY_ADVERTISE_HOST)",
-        )
+        text = f"{host} is a loopback address: to every other machine it means that machine itself"
+        fix = "--advertise-host ADDRESS, the address of this host in the network of the robots"
+        yield Finding(Severity.ERROR, check, check, text, f"{fix} (ROSPROXY_ADVERTISE_HOST)")
+    elif not facts.advertised_addresses and facts.status is None:
+        text = f"the host name {host} can't be resolved here"
+        yield Finding(Severity.ERROR, check, check, text, _BY_ADDRESS)
 
 
 def local_master(facts: Facts) -> bool:
@@ -188,7 +191,7 @@ def _fix_host(facts: Facts, at: str) -> str:
 
 def _fix_range(facts: Facts, mine: str, whole: bool) -> str:
     if mine == "unresolvable":
-        return "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
+        return _BY_ADDRESS
     ports = facts.status["ports"] if facts.status else {}
     publish = f"docker run -p {ports['advertise']}:{ports['listen']}"
     if not whole:
@@ -208,7 +211,7 @@ def _ports(facts: Facts) -> Iterator[Finding]:
     if blocked:
         first, last = ports["listen"].split("-")
         text = f"{plural(blocked, 'port')} of the range {ports['listen']} held by other programs"
-        look = f"ss -ltnp 'sport >= {first} and sport <= {last}'"
+        look = f"ss -ltnp 'sport >= :{first} and sport <= :{last}'"
         yield _of_ports(Severity.WARNING, text, f"{look}; or another --port-range")
     if not free:
         yield _of_ports(
