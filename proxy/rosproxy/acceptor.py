@@ -11,6 +11,7 @@ import socket
 from collections.abc import Awaitable, Callable
 
 from rosproxy.core.tcpros import header_length
+from rosproxy.core.uris import plain_address
 from rosproxy.tasks import Tasks
 
 log = logging.getLogger(__name__)
@@ -48,7 +49,8 @@ class Acceptor:
             for _ in range(ACCEPTS_PER_TURN):
                 conn, peer = self.sock.accept()
                 conn.setblocking(False)
-                self._tasks.spawn(self._serve(conn, peer[0]), f"connection from {peer[0]}")
+                source = plain_address(peer[0])
+                self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
         except BlockingIOError:
             return
         except OSError as error:

@@ -5,7 +5,7 @@ import logging
 import socket
 from typing import Any
 
-from rosproxy import listeners
+from rosproxy import limits, listeners
 from rosproxy.acceptor import Acceptor, first_bytes
 from rosproxy.admin import Admin
 from rosproxy.context import make_context
@@ -118,6 +118,9 @@ class App:
 
     def _reserve_range(self) -> None:
         ports = self.settings.ports.listen
+        if not limits.files_for(len(ports)):
+            text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
+            raise SettingError("--port-range", text)
         taken = self.context.bank.reserve(ports.ports())
         for port in taken:
             self.context.registry.pool.block(port)
@@ -177,6 +180,7 @@ async def _serve_speaker(server: XmlRpcServer, conn: socket.socket) -> None:
 
 async def serve(settings: Settings, stopped: asyncio.Event) -> None:
     """Run a proxy until ``stopped`` is set. Raises SettingError if a port is taken."""
+    limits.raise_file_limit()
     app = App(settings)
     try:
         await app.start()

@@ -1,7 +1,8 @@
 """The command line."""
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
@@ -11,7 +12,43 @@ from rosproxy import __version__
 Command = Callable[..., Any]
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class UsageError(click.ClickException):
+    """A mistake on the command line, told in one line."""
+
+    exit_code = 2
+
+    def show(self, file: Any = None) -> None:
+        """Print it."""
+        click.echo(f"rosproxy: {self.format_message()}", file, err=True)
+
+
+class Commands(click.Group):
+    """Commands whose usage errors are one line; click prints four."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        """Parse the words before the command. Raises UsageError."""
+        with _in_one_line():
+            return super().make_context(*args, **kwargs)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Parse the command's words and run it. Raises UsageError."""
+        with _in_one_line():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _in_one_line() -> Iterator[None]:
+    try:
+        yield
+    except click.exceptions.NoArgsIsHelpError:
+        raise
+    except click.UsageError as error:
+        raise UsageError(error.format_message()) from None
+
+
+@click.group(
+    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.version_option(__version__, prog_name="rosproxy")
 def main() -> None:
     """Transparent proxy for ROS 1: nodes behind it and nodes outside talk both ways."""
@@ -202,11 +239,14 @@ def doctor(
     is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
     something is.
     """
+    from rosproxy.core.uris import parse_slave_uri
     from rosproxy.doctor import examine
     from rosproxy.survey import Patient
 
     if outside and not master_uri:
         raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
+    if master_uri and parse_slave_uri(master_uri) is None:
+        raise click.UsageError(f"--master-uri: {master_uri!r} is not of the form http://host:11311")
     absolute = tuple(f"/{name.strip('/')}" for name in names)
     patient = Patient(None if outside else admin, master_uri, advertise_host, absolute)
     sys.exit(examine(patient, as_json))

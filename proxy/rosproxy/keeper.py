@@ -119,7 +119,7 @@ class Keeper:
 
     def _maybe_end(self, endpoint: Endpoint) -> None:
         now, health = self._context.now(), endpoint.health
-        if endpoint.connections or not (endpoint.idle or health.cleaned):
+        if endpoint.connections or endpoint.pending or not (endpoint.idle or health.cleaned):
             endpoint.idle_since = None
             return
         if endpoint.idle_since is None:

@@ -24,6 +24,7 @@ class MasterWatch:
         self._context, self._keeper, self._upkeep = context, keeper, upkeep
         self._recovering = asyncio.Lock()
         self._recovered = False
+        self._failures = 0
         self._looks = 0
         self.up: bool | None = None
         self.error = ""
@@ -32,14 +33,23 @@ class MasterWatch:
         self.since = context.now()
 
     async def recovered(self) -> None:
-        """Wait until the registry is rebuilt from the master. Raises Unreachable."""
+        """Wait until the registry is rebuilt from the master. Raises Unreachable.
+
+        All who wait for the same attempt share its failure: a master that hangs would keep the
+        last of them waiting for as many attempts as there are callers.
+        """
+        failures = self._failures
         async with self._recovering:
-            if not self._recovered:
-                try:
-                    await self._recover()
-                except MasterError as error:
-                    raise Unreachable(f"the master can't be asked for its state: {error}") from None
-                self._recovered = True
+            if self._recovered:
+                return
+            if self._failures != failures:
+                raise Unreachable("the master has not told its state")
+            try:
+                await self._recover()
+            except (Unreachable, MasterError) as error:
+                self._failures += 1
+                raise Unreachable(str(error)) from None
+            self._recovered = True
 
     async def look(self) -> None:
         """Ask the master for its pid; recover or restore where that is due."""

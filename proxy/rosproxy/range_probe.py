@@ -19,6 +19,7 @@ from rosproxy.acceptor import Acceptor
 from rosproxy.context import Context
 from rosproxy.core import xmlrpc
 from rosproxy.core.uris import HostPort, slave_uri
+from rosproxy.names import resolve
 from rosproxy.upstream import CALLER_ID, Unreachable
 
 log = logging.getLogger(__name__)
@@ -68,23 +69,23 @@ async def probe_range(context: Context) -> dict[str, Any]:
     ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
     on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
     master's call did not arrive) or unknown (the master could not be asked).
+
+    The second port is left out where the master misses the first: rosmaster calls back from three
+    threads, and each call into a void holds one for as long as TCP tries, two minutes.
     """
-    trials = [_Trial(port, context.addressing.outside(port)) for port in _claim(context)]
-    try:
-        async with asyncio.TaskGroup() as group:
-            tasks = [group.create_task(_try(context, trial)) for trial in trials]
-    finally:
-        for trial in trials:
-            context.registry.pool.give_back(trial.port)
-    return {"probes": [task.result() for task in tasks]}
-
-
-def _claim(context: Context) -> list[int]:
-    """Take the lowest and the highest free port, if there are any."""
     pool, ports = context.registry.pool, context.settings.ports.listen.ports()
-    lowest = next(filter(pool.claim, ports), None)
-    highest = next(filter(pool.claim, reversed(ports)), None)
-    return [port for port in (lowest, highest) if port is not None]
+    probes: list[dict[str, Any]] = []
+    for order in (ports, reversed(ports)):
+        port = next(filter(pool.claim, order), None)
+        if port is None:
+            break
+        try:
+            probes.append(await _try(context, _Trial(port, context.addressing.outside(port))))
+        finally:
+            pool.give_back(port)
+        if probes[0]["from_master"] == "missed" or pool.free == 1:
+            break
+    return {"probes": probes}
 
 
 async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
@@ -100,15 +101,16 @@ async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
 
 async def _dial(trial: _Trial) -> str:
     """Connect through the advertised address and see who answers."""
+    addresses = await resolve(trial.where.host)
+    if not addresses:
+        return "unresolvable"
     try:
         async with asyncio.timeout(TIMEOUT):
-            reader, writer = await asyncio.open_connection(trial.where.host, trial.where.port)
+            reader, writer = await asyncio.open_connection(addresses[0], trial.where.port)
     except TimeoutError:
         return "silent"
     except ConnectionRefusedError:
         return "refused"
-    except (socket.gaierror, UnicodeError):
-        return "unresolvable"
     except OSError:
         return "unreachable"
     return await _greeted(trial, reader, writer)

@@ -12,7 +12,7 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 log = logging.getLogger(__name__)
@@ -70,7 +70,7 @@ class Relay:
             try:
                 thread.start()
             except RuntimeError as error:
-                self._give_up(error, range(index, 2), finished)
+                self._give_up(error, index, finished)
                 return
 
     def end(self) -> None:
@@ -98,14 +98,15 @@ class Relay:
         self._finish(index, finished)
 
     def _give_up(
-        self, error: RuntimeError, left: Iterable[int], finished: Callable[["Relay"], None]
+        self, error: RuntimeError, index: int, finished: Callable[["Relay"], None]
     ) -> None:
-        """Reset both sides: the directions that are ``left`` can't be started."""
+        """Reset both sides: direction ``index`` can't be started, those before it run."""
         log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
         self.failed = True
-        self.end()
-        for index in left:
-            self._finish(index, finished)
+        if index:
+            self._pass_reset_on(index)
+        for left in range(index, 2):
+            self._finish(left, finished)
 
     def _count_sent(self, size: int) -> None:
         self.sent += size

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
@@ -28,7 +27,8 @@ from rosproxy.metrics import Metrics
 from rosproxy.names import resolve
 from rosproxy.upstream import CALLER_ID, MasterError, Unreachable, Upstream
 
-PARALLEL = 64
+PARALLEL = 32
+"""Questions under way at once; fewer than the look-ups of names that may be."""
 WITHIN = 3.0
 """Seconds that a node has to answer."""
 
@@ -52,7 +52,6 @@ class Patient:
 
 async def survey(patient: Patient) -> Facts:
     """Gather all facts."""
-    asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(PARALLEL))
     host = patient.advertise_host
     facts = Facts(
         advertise_host=host,
@@ -89,8 +88,8 @@ async def _beyond(facts: Facts, master_uri: str, instance: str) -> Facts:
     """What the master and the nodes say."""
     if not master_uri:
         return facts
-    async with _upstream(master_uri, instance) as upstream:
-        survey = _Survey(upstream)
+    async with _upstream(master_uri, instance) as master, _upstream(master_uri, "doctor") as nodes:
+        survey = _Survey(master, nodes)
         facts = replace(
             facts,
             master=await survey.master(),
@@ -112,15 +111,19 @@ async def _upstream(master_uri: str, instance: str) -> AsyncIterator[Upstream]:
 
 
 class _Survey:
-    """Questions to the master and to nodes, a bounded number at once."""
+    """Questions to the master and to nodes, a bounded number at once.
 
-    def __init__(self, upstream: Upstream) -> None:
-        self._upstream = upstream
+    The master is asked in the proxy's name, so that a proxy that is its own master shows itself;
+    nodes are not, since those behind the proxy are asked through it.
+    """
+
+    def __init__(self, master: Upstream, nodes: Upstream) -> None:
+        self._master, self._nodes = master, nodes
         self._limit = asyncio.Semaphore(PARALLEL)
 
     async def master(self) -> Master:
         """Look at the master: its name, its answer, its path, and whether it is the proxy."""
-        uri = self._upstream.master_uri
+        uri = self._master.master_uri
         host = urlsplit(uri).hostname or ""
         found = Master(uri, addresses=tuple(await resolve(host)))
         if not found.addresses:
@@ -131,7 +134,6 @@ class _Survey:
             found,
             attempt=attempt,
             looped=looped,
-            proxied=await self._is_proxy(uri),
             round_trip=time.monotonic() - started,
         )
         if attempt.reach is Reach.STRANGER and urlsplit(uri).path not in ("", "/"):
@@ -145,7 +147,7 @@ class _Survey:
 
     async def graph(self, facts: Facts) -> Facts:
         """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
-        ask = self._upstream.ask_master
+        ask = self._master.ask_master
         graph = replies.graph(await ask("getSystemState"))
         names, services = sorted(graph.names()), sorted(graph.services)
         uris = await self._look_up("lookupNode", names)
@@ -185,7 +187,7 @@ class _Survey:
     async def _ask_master(self) -> tuple[Attempt, bool]:
         """How the master answers ``getPid``, and whether it is the proxy that refuses a loop."""
         try:
-            reply = await self._upstream.master(xmlrpc.dump_call("getPid", CALLER_ID))
+            reply = await self._master.master(xmlrpc.dump_call("getPid", CALLER_ID))
             xmlrpc.parse_reply(reply)
             loads(reply)
         except Unreachable as error:
@@ -197,28 +199,20 @@ class _Survey:
             return Attempt(Reach.STRANGER, str(error)), False
         return Attempt(Reach.ANSWERED), False
 
-    async def _is_proxy(self, uri: str) -> bool:
-        """Whether a GET is answered as a rosproxy does; a ROS master refuses it."""
-        where = parse_slave_uri(uri)
-        if where is None:
-            return False
-        reply = await _exchange(where, b"GET / HTTP/1.0\r\n\r\n")
-        return b"\r\n\r\nrosproxy: " in reply
-
     async def _answers_at_root(self, uri: str) -> bool:
         where = parse_slave_uri(uri)
         return where is not None and (await self._pid(where)).reach is Reach.ANSWERED
 
     async def _simulated_time(self) -> bool:
         try:
-            said = await self._upstream.ask_master("getParam", "/use_sim_time")
+            said = await self._master.ask_master("getParam", "/use_sim_time")
         except MasterError:
             return False
         return said in ("1", "true", 1)
 
     async def _look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
         wanted = list(names)
-        found = await self._upstream.batch([(method, [CALLER_ID, name]) for name in wanted])
+        found = await self._master.batch([(method, [CALLER_ID, name]) for name in wanted])
         pairs = zip(wanted, found, strict=False)
         return {name: uri for name, uri in pairs if isinstance(uri, str)}
 
@@ -227,15 +221,14 @@ class _Survey:
         where = node.where
         if where is None or facts.ours(where):
             return node
-        addresses = tuple(await resolve(where.host))
-        if not addresses:
-            return replace(node, attempt=Attempt(Reach.UNRESOLVABLE))
         async with self._limit:
-            return replace(node, addresses=addresses, attempt=await self._pid(where))
+            addresses = tuple(await resolve(where.host))
+            attempt = await self._pid(where) if addresses else Attempt(Reach.UNRESOLVABLE)
+        return replace(node, addresses=addresses, attempt=attempt)
 
     async def _pid(self, where: HostPort) -> Attempt:
         try:
-            pid = await self._upstream.ask_node(where, WITHIN, "getPid")
+            pid = await self._nodes.ask_node(where, WITHIN, "getPid")
         except (Unreachable, MasterError) as error:
             return _attempt(error)
         if isinstance(pid, int):
@@ -256,7 +249,7 @@ class _Survey:
 
     async def _words(self, where: HostPort) -> Words:
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
-        ask = self._upstream.ask_node
+        ask = self._nodes.ask_node
         return replies.words(*[await ask(where, WITHIN, method) for method in methods])
 
     async def _data_port(self, facts: Facts, node: Node, topic: str) -> tuple[str, Attempt]:
@@ -265,9 +258,7 @@ class _Survey:
         if where is None or node.words is None:
             return "", Attempt()
         try:
-            answer = await self._upstream.ask_node(
-                where, WITHIN, "requestTopic", topic, [["TCPROS"]]
-            )
+            answer = await self._nodes.ask_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
         except (Unreachable, MasterError) as error:
             return "", _attempt(error)
         target = replies.data_port(answer)
@@ -311,11 +302,13 @@ def _proxy_door(facts: Facts, advertised: int) -> HostPort | None:
 
 async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
     """Exchange TCPROS connection headers."""
-    if not await resolve(where.host):
-        return Attempt(Reach.UNRESOLVABLE, where.host)
     try:
-        async with asyncio.timeout(WITHIN):
-            reply = await _exchange_header(where, encode_header(header))
+        async with asyncio.timeout(WITHIN), _connected(where) as (reader, writer):
+            writer.write(encode_header(header))
+            length = header_length(await reader.readexactly(4))
+            reply = decode_header(await reader.readexactly(length))
+    except Unresolvable:
+        return Attempt(Reach.UNRESOLVABLE)
     except (ConnectionError, EOFError):
         return Attempt(Reach.REFUSED)
     except OSError:
@@ -327,27 +320,23 @@ async def _shake_hands(where: HostPort, header: Mapping[str, str]) -> Attempt:
     return Attempt(Reach.ANSWERED)
 
 
-async def _exchange_header(where: HostPort, header: bytes) -> dict[str, str]:
-    reader, writer = await asyncio.open_connection(where.host, where.port)
+class Unresolvable(OSError):
+    """A host name without an address."""
+
+
+@contextlib.asynccontextmanager
+async def _connected(
+    where: HostPort,
+) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A connection. Raises Unresolvable, OSError."""
+    addresses = await resolve(where.host)
+    if not addresses:
+        raise Unresolvable(where.host)
+    reader, writer = await asyncio.open_connection(addresses[0], where.port)
     try:
-        writer.write(header)
-        return decode_header(await reader.readexactly(header_length(await reader.readexactly(4))))
+        yield reader, writer
     finally:
         writer.close()
-
-
-async def _exchange(where: HostPort, request: bytes) -> bytes:
-    """The start of the answer to a request; nothing if there is none."""
-    try:
-        async with asyncio.timeout(WITHIN):
-            reader, writer = await asyncio.open_connection(where.host, where.port)
-            try:
-                writer.write(request)
-                return await reader.read(4096)
-            finally:
-                writer.close()
-    except OSError:
-        return b""
 
 
 def _attempt(error: Unreachable | MasterError) -> Attempt:

@@ -34,6 +34,7 @@ class TcprosService:
         self._context, self._nodes = context, nodes
         self._relays: set[Relay] = set()
         self._ended = Traffic()
+        self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
 
     @property
     def relays(self) -> list[Relay]:
@@ -84,8 +85,19 @@ class TcprosService:
         inside = await _dial(endpoint.place.address, port) if port else None
         if inside is not None:
             return inside
-        learned = await self._nodes.learn_tcpros_port(endpoint)
+        learned = await self._learn_port(endpoint)
         return await _dial(endpoint.place.address, learned) if learned else None
+
+    async def _learn_port(self, endpoint: Endpoint) -> int | None:
+        """The TCPROS port that the node names now; it is asked once for all who wait."""
+        asking = self._asking.get(endpoint)
+        if asking is None:
+            asking = self._context.tasks.spawn(
+                self._nodes.learn_tcpros_port(endpoint), f"TCPROS port of {endpoint.uri}"
+            )
+            self._asking[endpoint] = asking
+            asking.add_done_callback(lambda _: self._asking.pop(endpoint))
+        return await asyncio.shield(asking)
 
     def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
         service = fields.get("service")

@@ -37,7 +37,7 @@ def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     """No test may leave a traceback in the log, whatever it did to the proxy."""
     yield
     for phase in ("setup", "call", "teardown"):
-        for record in caplog.get_records(phase):  # type: ignore[arg-type]
+        for record in caplog.get_records(phase):
             if not is_malformed_http(record):
                 assert not record.exc_info, f"a traceback in the log: {record.getMessage()}"
                 assert record.name.startswith("rosproxy") or record.levelno < logging.ERROR, record
@@ -61,9 +61,7 @@ async def master() -> AsyncIterator[Master]:
 
 
 @pytest.fixture
-async def make_proxy(
-    master: Master, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[MakeProxy]:
+async def make_proxy(master: Master, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[MakeProxy]:
     """Starts proxies in this process, for the master unless told otherwise."""
     monkeypatch.setattr("rosproxy.app.TICK", 0.05)
     made: list[Proxy] = []

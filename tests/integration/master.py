@@ -10,7 +10,7 @@ from xmlrpc.client import Fault
 
 from rosproxy.demo.book import Book
 from tests.integration.http_fake import Answer, HttpFake, Request, ok, value
-from tests.integration.net import MASTER, rpc
+from tests.integration.net import MASTER, bracketed, rpc
 
 Triple = list[Any]
 ODD_PARAMETERS = (TypeError, AttributeError, LookupError, ValueError)
@@ -39,7 +39,7 @@ class Master:
     def uri(self) -> str:
         """Its URI."""
         host, port = self._http.address
-        return f"http://{host}:{port}"
+        return f"http://{bracketed(host)}:{port}"
 
     async def start(self, address: str = MASTER) -> None:
         """Listen; on the same port as before if there was one."""

@@ -45,6 +45,11 @@ def _is_free(port: int, address: str) -> bool:
     return True
 
 
+def bracketed(host: str) -> str:
+    """A host as it stands in a URI."""
+    return f"[{host}]" if ":" in host else host
+
+
 def where(uri: str) -> Where:
     """Host and port of a URI."""
     parts = urlsplit(uri)
@@ -233,7 +238,7 @@ async def rpc(
     ``host`` is what the caller calls the peer, for one that it reaches through NAT.
     """
     target = where(address) if isinstance(address, str) else address
-    host = host or "{}:{}".format(f"[{target[0]}]" if ":" in target[0] else target[0], target[1])
+    host = host or f"{bracketed(target[0])}:{target[1]}"
     body = xml(method, *params)
     lines = ["POST / HTTP/1.1", f"Host: {host}", f"Content-Length: {len(body)}"]
     request = "\r\n".join([*lines, "", ""]).encode() + body

@@ -7,7 +7,7 @@ from typing import Any
 from rosproxy.core.tcpros import decode_header, encode_header
 from rosproxy.demo.wire import STRING
 from tests.integration.http_fake import Answer, End, HttpFake, Request, value
-from tests.integration.net import NODE, Where, Wire, connect, rpc, where
+from tests.integration.net import NODE, Where, Wire, bracketed, connect, rpc, where
 
 Header = dict[str, str]
 Stream = Callable[["Node", Wire, Header], Awaitable[None]]
@@ -46,13 +46,12 @@ class Node:
     @property
     def uri(self) -> str:
         """What it calls itself."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.slave.address[1]}/"
+        return f"http://{bracketed(self.host)}:{self.slave.address[1]}/"
 
     @property
     def service_api(self) -> str:
         """Where it says its services are."""
-        return f"rosrpc://{self.host}:{self.tcpros_port}"
+        return f"rosrpc://{bracketed(self.host)}:{self.tcpros_port}"
 
     async def start(self) -> None:
         """Listen; the slave API on the same port as before if there was one."""

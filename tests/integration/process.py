@@ -31,23 +31,25 @@ def clean_environment(**more: str) -> dict[str, str]:
 
 
 class Process:
-    """A running ``rosproxy run``; ``log`` is what it has written to standard error so far."""
+    """A running ``rosproxy run``.
 
-    def __init__(self, options: dict[str, Any], **popen: Any) -> None:
+    ``log`` is what it has written to standard error so far. The option ``prefix`` is a command
+    that runs it.
+    """
+
+    def __init__(self, options: dict[str, Any]) -> None:
+        self.prefix = options.pop("prefix", [])
         self.options = options_for(**options)
         self.master: Where = (PROXY, int(self.options["master_port"]))
-        self._popen = popen
         self.log: list[str] = []
         self.start()
 
     def start(self) -> None:
         """Start it, the first time or again with the same options, and wait until it is ready."""
+        self._before = len(self.log)
+        command = [*self.prefix, *command_line(self.options)]
         self._process = subprocess.Popen(
-            command_line(self.options),
-            stderr=subprocess.PIPE,
-            text=True,
-            env=clean_environment(),
-            **self._popen,
+            command, stderr=subprocess.PIPE, text=True, env=clean_environment()
         )
         self._reader = threading.Thread(target=self._read, args=(self._process,))
         self._reader.start()
@@ -60,8 +62,8 @@ class Process:
 
     @property
     def text(self) -> str:
-        """The whole log."""
-        return "".join(self.log)
+        """The log since the last start."""
+        return "".join(self.log[self._before :])
 
     def wait_for_log(self, text: str, within: float = 10.0) -> None:
         """Wait until a line of the log holds ``text``."""
@@ -101,7 +103,7 @@ class Process:
         """End it if it still runs; a traceback in its log fails the test."""
         if self._process.poll() is None:
             self.kill()
-        assert "Traceback" not in self.text, self.text
+        assert "Traceback" not in "".join(self.log), "".join(self.log)
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr

@@ -306,7 +306,9 @@ async def test_a_port_that_another_program_holds_is_passed_over(make_proxy, make
     first = free_ports(6)
     with socket.create_server(("0.0.0.0", first)):
         proxy = await make_proxy(
-            port_range=f"{first}-{first + 2}", master_port=first + 3, admin_bind=f"127.0.0.1:{first + 4}"
+            port_range=f"{first}-{first + 2}",
+            master_port=first + 3,
+            admin_bind=f"127.0.0.1:{first + 4}",
         )
         nodes = [await make_node(f"/n{i}") for i in range(3)]
         codes = [(await node.publish(proxy.master))[0] for node in nodes]

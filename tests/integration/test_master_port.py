@@ -1,6 +1,9 @@
 """The master port: forwarding, rewriting, and the replies that ROS's clients insist on."""
 
+import asyncio
+import gzip
 import xmlrpc.client
+from contextlib import AsyncExitStack
 
 import pytest
 
@@ -154,8 +157,6 @@ async def test_a_multicall_is_rewritten_call_by_call(proxy, master, node):
 async def test_replies_have_a_length_and_are_neither_chunked_nor_compressed(
     proxy, master, node, offer, method
 ):
-    import gzip
-
     plain = xmlrpc.client.dumps(([1, "x" * 3000, []],), methodresponse=True).encode()
     master.answers[method] = ok(gzip.compress(plain), "Content-Encoding: gzip")
     body = xml(method, "/talker", "/chatter", "*", node.uri)
@@ -219,6 +220,21 @@ async def test_the_proxy_itself_never_waits_for_a_hanging_master(proxy, master, 
         await other.send(post(xml("getPid", "/n")))
         assert (await other.reply()).value[2] == 4711
         assert await wire.end() == "reset"
+
+
+async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, node, monkeypatch):
+    monkeypatch.setattr("rosproxy.upstream.MASTER_TIMEOUT", 0.4)
+    master.answers["getSystemState"] = End.HANG
+    proxy = await make_proxy()
+    started = asyncio.get_running_loop().time()
+    async with AsyncExitStack() as stack:
+        wires = [await stack.enter_async_context(connect(proxy.master, NODE)) for _ in range(8)]
+        for wire in wires:
+            await wire.send(post(xml("registerPublisher", "/talker", "/t", "*", node.uri)))
+        assert [await wire.end() for wire in wires] == ["reset"] * 8
+    assert asyncio.get_running_loop().time() - started < 1.5
+    del master.answers["getSystemState"]
+    assert (await node.publish(proxy.master))[0] == 1
 
 
 async def test_garbage_from_the_master_passes_where_nothing_is_rewritten(proxy, master):

@@ -213,3 +213,13 @@ def test_names_leave_out_what_is_said_of_others() -> None:
     graph = Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener", "/dead"]}, {})
     facts = make_facts(nodes=nodes, names=("/chatter",), graph=graph)
     assert [f.subject for f in check(facts)] == ["/dead"]
+
+
+def test_a_proxy_whose_advertised_name_is_unknown_here() -> None:
+    nodes = by_name(talker(attempt=Attempt(Reach.UNRESOLVABLE)))
+    assert "--advertise-host ADDRESS" in only(check(without_proxy(nodes=nodes))).fix
+
+
+def test_a_dead_node_on_the_proxys_own_machine() -> None:
+    found = inside(address="127.0.0.1:4", uri="http://localhost:4/", state="refused")
+    assert "has ended" in found.text

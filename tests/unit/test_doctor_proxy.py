@@ -75,7 +75,7 @@ def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
             "--master-uri http://HOST:11311",
         ),
         (
-            make_master(Reach.STRANGER, looped=True, proxied=True),
+            make_master(Reach.STRANGER, looped=True),
             "leads back to this proxy itself",
             "--master-uri http://HOST:11311",
         ),
@@ -107,14 +107,6 @@ def test_a_proxy_that_has_not_asked_its_master_yet_is_sound() -> None:
 
 def test_a_master_that_keeps_its_state_to_itself() -> None:
     assert "does not tell its state" in only(check(make_facts(graph=None))).text
-
-
-def test_a_master_behind_another_proxy_is_named() -> None:
-    (found,) = of("master", make_facts(master=make_master(proxied=True)))
-    assert (found.severity, found.text) == (
-        Severity.OK,
-        "http://robot:11311 answers in 2.0 ms, through another rosproxy",
-    )
 
 
 def test_a_loopback_address_is_advertised() -> None:
@@ -155,7 +147,7 @@ def test_an_advertised_name_that_is_unknown_here() -> None:
             ("refused", "missed"),
             Severity.ERROR,
             "The master does not get through either",
-            "docker run -p 46000-46099:45000-45099; or correct --advertise-host, now robot-host",
+            "docker run -p 46000-46099:45000-45099, and let it through the firewall",
         ),
         (("silent", "missed"), Severity.ERROR, "a firewall drops it", "docker run -p"),
         (("refused", "unknown"), Severity.WARNING, "only the way back is missing", "docker run -p"),

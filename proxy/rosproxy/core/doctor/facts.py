@@ -38,15 +38,13 @@ class Attempt:
 class Master:
     """The master as the doctor found it.
 
-    ``at_root``: it does answer at the path ``/``. ``proxied``: what answers is a rosproxy, and
-    ``looped`` is this very proxy. ``proxied`` alone may be a proxy in front of the real master.
+    ``at_root``: it does answer at the path ``/``. ``looped``: what answers is this very proxy.
     """
 
     uri: str
     attempt: Attempt = Attempt()
     addresses: tuple[str, ...] = ()
     at_root: bool = False
-    proxied: bool = False
     looped: bool = False
     round_trip: float | None = None
 

@@ -9,6 +9,7 @@ from rosproxy.core.text import clean, plural, wrap
 
 MOST_ALIKE = 10
 """Findings of one check with the same mending that are shown one by one."""
+INDENT = " " * 9
 
 
 class Severity(IntEnum):
@@ -51,24 +52,22 @@ def render(findings: Sequence[Finding], columns: int) -> str:
 
 
 def _grouped(findings: Sequence[Finding], columns: int) -> Iterator[str]:
-    shown: dict[tuple[str, str], int] = {}
+    """Findings of one kind that are mended alike stand together, and what mends them once."""
+    alike: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
-        alike = finding.check, finding.fix
-        shown[alike] = shown.get(alike, 0) + 1
-        if shown[alike] <= MOST_ALIKE:
+        alike.setdefault((finding.check, finding.fix), []).append(finding)
+    for (check, fix), group in alike.items():
+        for finding in group[:MOST_ALIKE]:
             yield from _block(finding, columns)
-    for (check, _), count in shown.items():
-        if count > MOST_ALIKE:
-            yield f"         ... and {count - MOST_ALIKE} more of this kind ({check}); see --json"
+        if len(group) > MOST_ALIKE:
+            yield f"{INDENT}... and {len(group) - MOST_ALIKE} more like this ({check}): see --json"
+        yield from wrap(clean(fix), columns, f"{INDENT}  ", f"{INDENT}> ")
 
 
-def _block(finding: Finding, columns: int) -> Iterator[str]:
-    indent = " " * 9
+def _block(finding: Finding, columns: int) -> list[str]:
     subject = f"{clean(finding.subject)}: " if finding.subject else ""
-    first = f"{_WORDS[finding.severity]:<9}"
-    yield from wrap(subject + clean(finding.text), columns, indent, first)
-    if finding.fix:
-        yield from wrap(clean(finding.fix), columns, f"{indent}  ", f"{indent}> ")
+    first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
+    return wrap(subject + clean(finding.text), columns, INDENT, first)
 
 
 _WORDS = {

@@ -12,6 +12,7 @@ from rosproxy.core.uris import (
     HostPort,
     is_address,
     is_loopback,
+    parse_host_port,
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
@@ -56,9 +57,9 @@ def _inside(facts: Facts) -> Iterator[Finding]:
 
 
 def _inside_node(facts: Facts, node: Mapping[str, Any], name: str) -> Iterator[Finding]:
-    state, address, where = node["state"], node["address"], parse_slave_uri(node["uri"])
+    state, address = node["state"], node["address"]
     after = facts.status["settings"]["cleanup_after"] if facts.status else 0
-    if state in ("refused", "silent", "failing") and where and is_loopback(where.host):
+    if state in ("refused", "silent", "failing") and _only_on_loopback(node):
         yield Finding(
             Severity.ERROR,
             INSIDE,
@@ -86,6 +87,12 @@ def _inside_node(facts: Facts, node: Mapping[str, Any], name: str) -> Iterator[F
         yield Finding(Severity.WARNING, INSIDE, name, text, "restart it")
     elif state == "ok":
         yield from _namesakes(facts, node, name)
+
+
+def _only_on_loopback(node: Mapping[str, Any]) -> bool:
+    """Whether a node gives a loopback address, and is somewhere else than the proxy."""
+    named, placed = parse_slave_uri(node["uri"]), parse_host_port(node["address"])
+    return bool(named and placed and is_loopback(named.host) and not is_loopback(placed.host))
 
 
 def _namesakes(facts: Facts, node: Mapping[str, Any], name: str) -> Iterator[Finding]:
@@ -123,6 +130,9 @@ def _elsewhere(facts: Facts, node: Node) -> Iterator[Finding]:
     if where is None:
         text = f"the master gives no usable address for it: {node.uri!r}"
         yield Finding(Severity.ERROR, OUTSIDE, node.name, text, "restart it")
+    elif node.attempt.failed and parse_inside_path(node.uri):
+        text = f"registered through a rosproxy as {node.uri}: {node.attempt.reach.value}"
+        yield Finding(Severity.ERROR, OUTSIDE, node.name, text, _fix_proxied(facts, node, where))
     elif is_loopback(where.host) and not (local_master(facts) and not node.attempt.failed):
         yield Finding(
             Severity.ERROR,
@@ -162,21 +172,19 @@ def _unresolvable(facts: Facts, node: Node, where: HostPort) -> Finding:
 
 
 def _unanswering(facts: Facts, node: Node, where: HostPort) -> Finding:
-    answer = node.attempt.reason if node.attempt.reach is Reach.STRANGER else ""
-    how = node.attempt.reach.value + (f" ({answer})" if answer else "")
-    if parse_inside_path(node.uri):
-        text = f"registered through a rosproxy as {node.uri}: {how}"
-        return Finding(Severity.ERROR, OUTSIDE, node.name, text, _fix_proxied(facts, where))
     if node.attempt.reach is Reach.SILENT:
         text = f"no answer at {node.uri}: it hangs, or its machine is off or cut off"
         fix = f"from here: nc -vz {where.host} {where.port}; if it is gone: {CLEANUP}"
         return Finding(Severity.ERROR, OUTSIDE, node.name, text, fix)
-    text = f"registered as {node.uri}, but gone: {how}"
+    who = f" ({node.attempt.reason})" if node.attempt.reason else ""
+    text = f"registered as {node.uri}, but gone: {node.attempt.reach.value}{who}"
     return Finding(Severity.ERROR, STALE, node.name, text, CLEANUP)
 
 
-def _fix_proxied(facts: Facts, where: HostPort) -> str:
+def _fix_proxied(facts: Facts, node: Node, where: HostPort) -> str:
     """Cleaning up would lose nodes that a proxy takes back when it starts again."""
+    if node.attempt.reach is Reach.UNRESOLVABLE:
+        return f"start its proxy with --advertise-host ADDRESS instead of the name {where.host}"
     if facts.status is None:
         return (
             f"on {where.host}: rosproxy doctor. Does the proxy run there, does the firewall let "

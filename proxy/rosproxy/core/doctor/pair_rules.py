@@ -6,6 +6,7 @@ from typing import Any
 
 from rosproxy.core.doctor.facts import Attempt, Facts, Node, Reach
 from rosproxy.core.doctor.findings import Finding, Severity
+from rosproxy.core.doctor.proxy_rules import local_master
 from rosproxy.core.text import listed, size
 from rosproxy.core.uris import is_loopback, parse_host_port
 
@@ -124,7 +125,8 @@ def _why_no_transport(facts: Facts, topic: str, giver: Node, taker: Node) -> tup
         what = f"{giver.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
         set_ip = f"where {giver.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
         return f"{what} ({attempt.reason})" if attempt.reason else what, set_ip
-    if where and is_loopback(where.host) and not facts.ours(giver.where):
+    elsewhere = not facts.ours(giver.where) and not local_master(facts)
+    if where and is_loopback(where.host) and elsewhere:
         text = f"{giver.name} gives {address} as its data port, which is loopback"
         return text, f"where {giver.name} runs: ROS_IP=ADDRESS, then restart it"
     if facts.ours(giver.where) and not facts.ours(taker.where) and giver.where:

@@ -53,8 +53,7 @@ def _master(facts: Facts) -> Iterator[Finding]:
         yield _error_of_master(text, _other_uri())
     elif master.attempt.reach is Reach.ANSWERED:
         trip = f" in {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
-        by = ", through another rosproxy" if master.proxied else ""
-        yield Finding(Severity.OK, "master", "master", f"{master.uri} answers{trip}{by}")
+        yield Finding(Severity.OK, "master", "master", f"{master.uri} answers{trip}")
         yield from _master_elsewhere(facts, master)
         if facts.graph is None:
             yield _error_of_master(
@@ -154,7 +153,7 @@ def _range(facts: Facts) -> Iterator[Finding]:
         port = probe["advertised"].rpartition(":")[2]
         outcomes.setdefault((probe["from_proxy"], probe["from_master"]), []).append(port)
     for (mine, masters), ports in outcomes.items():
-        at = f"{facts.advertise_host}, port {' and '.join(dict.fromkeys(ports))}"
+        at = f"{facts.advertise_host}, port {' and '.join(ports)}"
         yield _tried(facts, mine, masters, at, len(outcomes) == 1)
 
 
@@ -196,7 +195,10 @@ def _fix_range(facts: Facts, mine: str, whole: bool) -> str:
     publish = f"docker run -p {ports['advertise']}:{ports['listen']}"
     if not whole:
         return f"publish the whole range: {publish}"
-    return f"{publish}; or correct --advertise-host, now {facts.advertise_host}"
+    return (
+        f"{publish}, and let it through the firewall; or correct --advertise-host, now "
+        f"{facts.advertise_host}"
+    )
 
 
 def _ports(facts: Facts) -> Iterator[Finding]:
