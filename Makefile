@@ -31,6 +31,11 @@ demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; 
 test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS and Docker on Debian and Ubuntu as root
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
+.PHONY: bench
+bench: $(VENV)/.dev ## the proxy's speed and memory next to a direct connection and socat, in a minute
+	@scripts/install-bench.sh
+	@$(BIN)/python -m tests.bench
+
 .PHONY: check
 check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
 	$(BIN)/ruff format --check $(SOURCES)

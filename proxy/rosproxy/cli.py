@@ -12,6 +12,18 @@ from rosproxy import __version__
 Command = Callable[..., Any]
 
 
+class _OneLineErrors(click.Command):
+    """A command that tells what is wrong with its options in one line, for logs of containers."""
+
+    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
+        """Parse the command line. Exits with 2 if there is something wrong with it."""
+        try:
+            return super().make_context(*arguments, **more)
+        except click.UsageError as error:
+            click.echo(f"rosproxy: {error.format_message()}", err=True)
+            sys.exit(2)
+
+
 class UsageError(click.ClickException):
     """A mistake on the command line, told in one line."""
 
@@ -40,9 +52,9 @@ class Commands(click.Group):
 def _in_one_line() -> Iterator[None]:
     try:
         yield
-    except click.exceptions.NoArgsIsHelpError:
-        raise
     except click.UsageError as error:
+        if "\n" in error.format_message():  # the help, for want of a command
+            raise
         raise UsageError(error.format_message()) from None
 
 
@@ -54,7 +66,10 @@ def main() -> None:
     """Transparent proxy for ROS 1: nodes behind it and nodes outside talk both ways."""
 
 
-@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
+@main.command(
+    cls=_OneLineErrors,
+    context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
+)
 @click.option("--master-uri", envvar="ROS_MASTER_URI", metavar="URI", help="The real ROS master.")
 @click.option(
     "--advertise-host",
@@ -159,6 +174,7 @@ def _admin_option(command: Command) -> Command:
     return click.option(
         "--admin",
         envvar="ROSPROXY_ADMIN",
+        show_envvar=True,
         callback=_admin_client,
         metavar="URL",
         help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "

@@ -32,7 +32,11 @@ class MasterService:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
-        request = master_api.read_request(call.body, asker)
+        try:
+            request = master_api.read_request(call.body, asker)
+        except xmlrpc.XmlRpcError:
+            self._context.metrics.count("master", "other", "malformed")
+            raise
         try:
             reply = await self._reply(request)
         except Unreachable:
@@ -89,7 +93,6 @@ class MasterService:
         what = "a node's address"
         if call.loop_id == self._context.instance:
             what = f"--master-uri {self._context.settings.master_uri}"
-            log.error("%s leads back to this proxy", what)
         raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
 
 

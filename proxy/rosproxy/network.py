@@ -1,7 +1,7 @@
 """What the operating system knows of addresses: routes and interfaces."""
 
 import socket
-from ipaddress import ip_network
+from ipaddress import ip_address, ip_network
 from pathlib import Path
 
 from rosproxy.core.addressing import Network
@@ -40,8 +40,8 @@ def _ipv6_networks() -> list[Network]:
     networks: list[Network] = []
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
-        if interface != "lo":
-            address = socket.inet_ntop(socket.AF_INET6, bytes.fromhex(digits))
+        address = ip_address(bytes.fromhex(digits))
+        if interface != "lo" and not address.is_link_local:
             networks.append(ip_network(f"{address}/{int(prefix, 16)}", strict=False))
     return networks
 

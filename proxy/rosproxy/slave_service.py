@@ -35,7 +35,11 @@ class SlaveService:
             raise Unreachable("a node's address leads back to the proxy itself")
         if endpoint is None or not self._means(endpoint, call.path):
             raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
-        parsed = xmlrpc.parse_call(call.body)
+        try:
+            parsed = xmlrpc.parse_call(call.body)
+        except xmlrpc.XmlRpcError:
+            self._context.metrics.count("slave", "other", "malformed")
+            raise
         if parsed.method != multicall.MULTICALL:
             return await self._one(endpoint, parsed, call)
         calls = multicall.inner_calls(parsed)

@@ -33,6 +33,8 @@ class TcprosService:
     def __init__(self, context: Context, nodes: NodeClient) -> None:
         self._context, self._nodes = context, nodes
         self._relays: set[Relay] = set()
+        self._none_open = asyncio.Event()
+        self._none_open.set()
         self._ended = Traffic()
         self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
 
@@ -76,8 +78,7 @@ class TcprosService:
             relay.end()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STOP_TIMEOUT):
-                while self._relays:
-                    await asyncio.sleep(0.01)
+                await self._none_open.wait()
 
     async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
         """A connection to the node; its port is asked for anew if the known one refuses."""
@@ -117,6 +118,7 @@ class TcprosService:
         name = self._registered_name(endpoint, kind, fields.get(kind, ""))
         relay = Relay(endpoint.port, kind, name, fields.get("callerid", ""), peer, conn, inside)
         self._relays.add(relay)
+        self._none_open.clear()
         endpoint.connections += 1
         endpoint.idle_since = None
         loop = asyncio.get_running_loop()
@@ -129,6 +131,8 @@ class TcprosService:
 
     def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
         self._relays.discard(relay)
+        if not self._relays:
+            self._none_open.set()
         endpoint.connections -= 1
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 

@@ -98,8 +98,7 @@ class Upstream:
         for start in range(0, len(calls), MULTICALL_SIZE):
             part = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in part]
-            reply = _parsed(await self.master(xmlrpc.dump_call("system.multicall", body)))
-            results = xmlrpc.python_value(reply) if reply else None
+            results = _parsed(await self.master(xmlrpc.dump_call("system.multicall", body)))
             if not isinstance(results, list) or len(results) != len(part):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_batched(result) for result in results]
@@ -163,28 +162,32 @@ async def read_bounded(stream: aiohttp.StreamReader) -> bytes:
 def _unreachable(who: str, error: BaseException) -> Unreachable:
     cause = error.os_error if isinstance(error, aiohttp.ClientConnectorError) else error
     refused = isinstance(cause, ConnectionRefusedError)
-    if refused:
-        reason = "connection refused"
-    elif isinstance(error, TimeoutError):
+    if isinstance(error, TimeoutError):
         reason = "no answer in time"
+    elif isinstance(cause, OSError) and cause.strerror:
+        reason = cause.strerror.lower()
     else:
-        reason = str(error) or type(error).__name__
+        reason = str(cause) or type(cause).__name__
     return Unreachable(f"{who}: {reason}", refused)
 
 
-def _parsed(reply: bytes) -> xmlrpc.Value | None:
+def _parsed(reply: bytes) -> Any:
+    """A reply's value, a fault's too."""
     try:
-        return xmlrpc.parse_reply(reply)
+        return xmlrpc.python_value(xmlrpc.parse_response(reply)[0])
     except xmlrpc.XmlRpcError as error:
         raise Unreachable(f"no XML-RPC reply: {error}") from None
 
 
-def _value(method: str, value: xmlrpc.Value | None) -> Any:
-    triple = xmlrpc.python_value(value) if value else None
-    if not isinstance(triple, list) or len(triple) != 3 or triple[0] != 1:
-        message = triple[1] if isinstance(triple, list) and len(triple) == 3 else "fault"
-        raise MasterError(f"{method}: {message}")
-    return triple[2]
+def _value(method: str, reply: Any) -> Any:
+    match reply:
+        case [1, _, value]:
+            return value
+        case [_, str(message), _]:
+            raise MasterError(f"{method}: {message}")
+        case {"faultString": str(message)}:
+            raise MasterError(f"{method}: {message}")
+    raise MasterError(f"{method}: not a ROS status triple")
 
 
 def _batched(result: Any) -> Any:

@@ -10,7 +10,6 @@ import shutil
 import signal
 import sys
 from collections import defaultdict
-from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -43,17 +42,15 @@ def main() -> None:
 
 
 def compare(uri: str) -> None:
-    with ExitStack() as stack:
-        proxied = stack.enter_context(parts.proxied(uri))
+    with parts.proxied(uri) as proxied, parts.socat(proxied.direct) as through_socat:
         paths: dict[str, tuple[Where, int | None]] = {"direct": (proxied.direct, None)}
-        if shutil.which("socat"):
-            paths["socat"] = stack.enter_context(parts.socat(proxied.direct))
-        paths["rosproxy"] = proxied.lease, proxied.pid
+        paths |= {"socat": through_socat} if through_socat else {}
+        paths |= {"rosproxy": (proxied.lease, proxied.pid)}
+        outside = OUTSIDE, "/bench_outside", f"http://{OUTSIDE}:9/"
         for _ in range(ROUNDS):
             for measure in (measures.stream, measures.ping_pong):
                 for path, way in paths.items():
                     add(path, measure(*way))
-            outside = OUTSIDE, "/bench_outside", f"http://{OUTSIDE}:9/"
             add("direct", measures.register(where(uri), *outside))
             add("rosproxy", measures.register(proxied.master, NODE, NAME, proxied.node_uri))
 
@@ -73,25 +70,25 @@ def row(name: str, path: str) -> dict[str, Any]:
 
 
 def show(rows: list[dict[str, Any]]) -> None:
-    print(f"\n{ROUNDS} rounds:{'median':>38}{'lowest .. highest':>21}{'to direct':>12}")
+    print(f"\n{ROUNDS} rounds{'median':>39}{'lowest .. highest':>22}{'to direct':>12}")
     for held in rows:
         low, middle, high = (f"{held[key]:.4g}" for key in ("lowest", "median", "highest"))
         ratio = f"{held['to_direct']:8.2f} x" if held["to_direct"] else ""
-        print(f"{held['row']:<28}{held['path']:<9}{middle:>10}{low:>9} .. {high:<9}{ratio}")
+        print(f"{held['row']:<28}{held['path']:<9}{middle:>9}{low:>11} .. {high:<9}{ratio}")
 
 
 def describe() -> dict[str, str]:
     """The machine before it is put to work, and what runs on it."""
-    loop = "uvloop" if find_spec("uvloop") else "asyncio"
-    dpkg = "dpkg-query -W python3-rosmaster 2>/dev/null || echo rosmaster"
+    dpkg, model = "dpkg-query -W python3-rosmaster", "sed -n '/^model name/{s/.*: //p;q}'"
+    with_socat = shutil.which("socat")
     return {
-        "rosproxy": getoutput("git describe --always --dirty 2>/dev/null || echo unknown"),
-        "machine": f"{os.cpu_count()} cores, {getoutput('grep -m1 name /proc/cpuinfo')}",
+        "rosproxy": getoutput("git describe --always --dirty"),
+        "machine": f"{os.cpu_count()} cores, {getoutput(model + ' /proc/cpuinfo')}",
         "kernel": platform.platform(),
         "load": f"{os.getloadavg()[0]:.2f} before",
-        "python": f"{platform.python_version()}, event loop {loop}",
-        "master": getoutput(dpkg) if os.path.exists(parts.ROSMASTER) else "embedded, no rosmaster",
-        "socat": getoutput("socat -V | grep version") if shutil.which("socat") else "not installed",
+        "python": f"{sys.version.split()[0]}, {'uvloop' if find_spec('uvloop') else 'asyncio'}",
+        "master": getoutput(dpkg) if os.path.exists(parts.ROSMASTER) else "the embedded one",
+        "socat": getoutput("socat -V | sed -n 2p") if with_socat else "not installed: not compared",
     }
 
 

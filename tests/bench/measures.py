@@ -4,21 +4,21 @@ import os
 import socket
 from contextlib import ExitStack
 from http.client import HTTPConnection
-from itertools import cycle
 from pathlib import Path
 from statistics import median, quantiles
 from time import perf_counter
+from types import SimpleNamespace
+from typing import Any
 from xmlrpc.client import loads
 
 from rosproxy.demo.wire import receive
-from tests.bench.node import OFFERED
-from tests.bench.parts import Proxied, subscribe
+from tests.bench.node import FRAME, FRAMES
+from tests.bench.parts import subscribe
 from tests.integration.net import Where, xml
 
 Numbers = dict[str, float]
 WARM_UP, STREAM_SECONDS, CALL_SECONDS, STALL_SECONDS = 0.1, 1.0, 0.5, 0.5
 CONNECTIONS = 200
-MESSAGE = b"x" * 1024
 
 
 def stream(address: Where, pid: int | None) -> Numbers:
@@ -60,50 +60,46 @@ def ping_pong(address: Where, _: int | None) -> Numbers:
 
 
 def bounce(sock: socket.socket) -> None:
-    sock.sendall(MESSAGE)
-    receive(sock, len(MESSAGE))
+    sock.sendall(b"x" * 1024)
+    receive(sock, 1024)
 
 
 def register(master: Where, source: str, caller: str, api: str) -> Numbers:
     """registerPublisher for 100 topics over and over, on one kept connection."""
-    topics = [f"/bench/{number}" for number in range(100)]
-    bodies = cycle([xml("registerPublisher", caller, t, "std_msgs/String", api) for t in topics])
     http = HTTPConnection(*master, timeout=10, source_address=(source, 0))
     http.connect()
-    sock, times, end = http.sock, [], perf_counter() + CALL_SECONDS
-    while (started := perf_counter()) < end:
-        http.request("POST", "/", next(bodies), {"Content-Type": "text/xml"})
+    sock, times, end = http.sock, list[float](), perf_counter() + CALL_SECONDS
+    while perf_counter() < end:
+        topic = f"/bench/{len(times) % 100}"
+        body = xml("registerPublisher", caller, topic, "std_msgs/String", api)
+        started = perf_counter()
+        http.request("POST", "/", body, {"Content-Type": "text/xml"})
         reply = http.getresponse().read()
         times.append(perf_counter() - started)
+        triple: Any = loads(reply)[0][0]
+        assert triple[0] == 1, triple
         assert http.sock is sock, "the connection was not kept"
-        assert loads(reply)[0][0][0] == 1, reply  # type: ignore[index]
     http.close()
     rate, middle = len(times) / sum(times), median(times) * 1e6
     return {"registerPublisher, 1/s": rate, "registerPublisher p50, us": middle}
 
 
-def memory(proxied: Proxied) -> Numbers:
+def memory(proxied: SimpleNamespace) -> Numbers:
     """Of a new proxy. First the reader: later it could live on what 200 connections left."""
-    idle = resident(proxied.pid)
-    stalled = while_stalled(proxied)
+    idle = most = resident(proxied.pid)
+    with subscribe(proxied.lease, "/offer") as sock:
+        end = perf_counter() + STALL_SECONDS
+        while perf_counter() < end:
+            most = max(most, resident(proxied.pid))
+        size = sum(iter(lambda: len(sock.recv(2**20)), 0))
+    assert size == FRAMES * len(FRAME), f"{size} bytes arrived"
     before = resident(proxied.pid)
     with ExitStack() as stack:
         for _ in range(CONNECTIONS):
             bounce(stack.enter_context(subscribe(proxied.lease, "/echo")))
-        added = resident(proxied.pid) - before
-    grown = {"a stalled reader adds, KiB": stalled - idle}
-    return {"idle, MiB": idle / 1024, "a connection adds, KiB": added / CONNECTIONS, **grown}
-
-
-def while_stalled(proxied: Proxied) -> int:
-    """The most memory while a reader reads nothing; it then reads all, to the last byte."""
-    with subscribe(proxied.lease, "/offer") as sock:
-        most, end = 0, perf_counter() + STALL_SECONDS
-        while perf_counter() < end:
-            most = max(most, resident(proxied.pid))
-        size = sum(iter(lambda: len(sock.recv(2**20)), 0))
-    assert size == OFFERED, f"{size} bytes arrived"
-    return most
+        added = (resident(proxied.pid) - before) / CONNECTIONS
+    stalled = {"a stalled reader adds, KiB": float(most - idle)}
+    return {"idle, MiB": idle / 1024, "a connection adds, KiB": added, **stalled}
 
 
 def resident(pid: int) -> int:

@@ -103,7 +103,7 @@ async def test_probes_of_a_hanging_node_leak_nothing(start_process, make_node):
     hung.hang = True
     await until(lambda: "does not answer" in process.text, "the node counts as silent")
     before, threads, probes = process.descriptors(), process.threads(), hung.slave.connections
-    await until(lambda: hung.slave.connections >= probes + 10, "ten more probes")
+    await until(lambda: hung.slave.connections >= probes + 6, "six more probes")
     assert process.descriptors() <= before + 1
     assert process.threads() <= threads
 

@@ -301,5 +301,5 @@ async def test_a_proxy_that_is_its_own_master_says_so(make_proxy, caplog):
     proxy = await make_proxy(master_uri=f"http://127.0.0.1:{port}", master_port=port)
     with pytest.raises(xmlrpc.client.Fault, match="leads back"):
         await rpc(proxy.master, "getPid", "/n")
-    assert "leads back to this proxy" in caplog.text
+    await until(lambda: "leads back to the proxy itself" in caplog.text, "the log says so")
     assert not await refuses(proxy.master)

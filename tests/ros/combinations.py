@@ -19,6 +19,16 @@ each_direction = pytest.mark.parametrize(
 each_library = pytest.mark.parametrize("library", LIBRARIES)
 each_side = pytest.mark.parametrize("side", ["c1", "out"], ids=["inside", "outside"])
 
+VIEWS = {
+    "inside-about-itself": ("c1", "c1"),
+    "inside-about-inside": ("c1", "c2"),
+    "inside-about-outside": ("c1", "out"),
+    "outside-about-inside": ("out", "c1"),
+}
+"""Where a tool runs, and where the node is that it is asked about."""
+
+each_view = pytest.mark.parametrize(("side", "where"), VIEWS.values(), ids=VIEWS.keys())
+
 
 def each_pair(first: str, second: str) -> pytest.MarkDecorator:
     """Every pair of libraries, as arguments with the two names."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import signal
 import socket
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from tests.ros.combinations import LIBRARIES, each_library, each_pair
+from tests.ros.combinations import LIBRARIES, each_library
 from tests.ros.lab import Lab
 from tests.ros.processes import Process, wait_until
 from tests.ros.topology import MASTER_PORT
@@ -17,6 +20,8 @@ PROXY_OPTIONS = (
     *("--probe-interval", "0.5", "--probe-timeout", "1"),
     *("--cleanup-after", "3", "--linger", "2", "--master-interval", "0.5"),
 )
+
+Measure = Callable[[str, float], None]
 
 ROLES = {"publisher": "pub", "subscriber": "sub", "server": "serve"}
 each_role = pytest.mark.parametrize("role", ROLES.values(), ids=ROLES.keys())
@@ -64,46 +69,40 @@ def test_a_node_ended_by_sigint_leaves_nothing(lab: Lab, library: str, role: str
 
 
 @pytest.mark.boundary
-@each_role
 @each_library
-def test_a_node_ended_by_sigkill_is_cleaned_up(lab: Lab, library: str, role: str, measure) -> None:
-    node, name = start(lab, library, role)
-    port = port_of(lab, name)
-    node.kill()
-    wait_until("the port refuses", lambda: refuses(lab, port), timeout=4)
-    lab.wait_unregistered(name, timeout=10)
-    assert lab.node_uri(name) is None
+def test_nodes_ended_by_sigkill_are_cleaned_up(lab: Lab, library: str, measure: Measure) -> None:
+    started = [start(lab, library, role) for role in ROLES.values()]
+    ports = [port_of(lab, name) for _, name in started]
+    for node, _ in started:
+        node.kill()
+    killed = time.time()
+    for port in ports:
+        wait_until("the port refuses", partial(refuses, lab, port), timeout=4)
+    for _, name in started:
+        lab.wait_unregistered(name, timeout=10)
+        assert lab.node_uri(name) is None
+    measure("cleaned up, --cleanup-after 3", time.time() - killed)
 
 
 @pytest.mark.boundary
 @each_library
-def test_a_stopped_node_that_goes_on_is_registered_and_served_again(lab: Lab, library: str) -> None:
-    node, name = start(lab, library, "pub")
-    node.send(signal.SIGSTOP)
-    lab.wait_unregistered(name, timeout=12)
-    node.send(signal.SIGCONT)
-    lab.wait_registered(name, timeout=8)
-    for listener in LIBRARIES:
-        lab.node(listener, "out", "sub", topic=f"/{name}/topic").wait_for_count("^got ", 3)
-    assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
-
-
-@pytest.mark.boundary
-@each_library
-def test_a_stopped_subscriber_and_server_are_served_again(lab: Lab, library: str) -> None:
-    subscriber, sub_name = start(lab, library, "sub")
-    server, srv_name = start(lab, library, "serve")
-    for node in (subscriber, server):
+def test_stopped_nodes_that_go_on_are_registered_and_served_again(lab: Lab, library: str) -> None:
+    started = [start(lab, library, role) for role in ROLES.values()]
+    (publisher, pub), (subscriber, sub), (_, serve) = started
+    for node, _ in started:
         node.send(signal.SIGSTOP)
-    for name in (sub_name, srv_name):
+    for _, name in started:
         lab.wait_unregistered(name, timeout=12)
-    for node in (subscriber, server):
+    for node, _ in started:
         node.send(signal.SIGCONT)
-    lab.wait_registered(srv_name, timeout=8)
-    lab.node(library, "out", "call", service=f"/{srv_name}/service").wait_for("^reply ask 0 ")
-    lab.wait_registered(sub_name, timeout=8)
-    lab.node(library, "out", "pub", topic=f"/{sub_name}/topic")
+    for _, name in started:
+        lab.wait_registered(name, timeout=8)
+    lab.node(library, "out", "pub", topic=f"/{sub}/topic")
+    for peer in LIBRARIES:
+        lab.node(peer, "out", "sub", topic=f"/{pub}/topic").wait_for_count("^got ", 3)
+        lab.node(peer, "out", "call", service=f"/{serve}/service").wait_for("^reply ask 0 ")
     subscriber.wait_for_count("^got ", 3)
+    assert f"Pid: {publisher.pid}" in lab.run("out", "rosnode", "info", pub).output
 
 
 @pytest.mark.boundary
@@ -131,22 +130,24 @@ WAYS_TO_END = {
 
 @pytest.mark.parametrize("way", WAYS_TO_END.values(), ids=WAYS_TO_END.keys())
 @pytest.mark.parametrize("where", ["c1", "c2"], ids=["same-address", "another-address"])
-@each_pair("library", "peer")
+@each_library
 def test_a_restart_under_the_same_name(
-    lab: Lab, library: str, peer: str, where: str, way: signal.Signals | None
+    lab: Lab, library: str, where: str, way: signal.Signals | None
 ) -> None:
-    """Peers outside that were connected before hear the new node, and can call it."""
+    """Subscribers that heard the old node hear the new one, without being told."""
     name = lab.unique("phoenix")
     topic = f"/{name}/topic"
     old = lab.node(library, "c1", "pub", name=name, topic=topic, word="old")
-    receiver = lab.node(peer, "out", "sub", topic=topic)
-    receiver.wait_for("^got old ")
+    receivers = [lab.node(peer, "out", "sub", topic=topic) for peer in LIBRARIES]
+    for receiver in receivers:
+        receiver.wait_for("^got old ")
     if way is signal.SIGINT:
         assert old.stop() == 0
     elif way is signal.SIGKILL:
         old.kill()
     new = lab.node(library, where, "pub", name=name, topic=topic, word="new")
-    receiver.wait_for_count("^got new ", 3)
+    for receiver in receivers:
+        receiver.wait_for_count("^got new ", 3)
     if way is None:
         old.wait(timeout=8)
     assert f"Pid: {new.pid}" in lab.run("out", "rosnode", "info", name).output

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.ros.combinations import each_direction, each_pair
+from tests.ros.combinations import each_direction
 from tests.ros.lab import Lab
 from tests.ros.topology import ADVERTISED_NAME, PUBLISHED_MASTER_PORT, SHARED
 
@@ -17,23 +17,27 @@ MASTER_ROLE = "c1"
 ADVERTISE_HOST = ADVERTISED_NAME
 PROXY_OPTIONS = ("--publish-master", str(PUBLISHED_MASTER_PORT))
 
+each_mixed_pair = pytest.mark.parametrize(
+    ("first", "second"), [("rospy", "roscpp"), ("roscpp", "rospy")], ids=lambda word: word
+)
+
 
 @each_direction
-@each_pair("publisher", "subscriber")
-def test_topics(lab: Lab, publisher: str, subscriber: str, source: str, sink: str) -> None:
+@each_mixed_pair
+def test_topics(lab: Lab, first: str, second: str, source: str, sink: str) -> None:
     topic = f"/{lab.unique('topic')}"
-    receiver = lab.node(subscriber, sink, "sub", topic=topic)
+    receiver = lab.node(second, sink, "sub", topic=topic)
     receiver.wait_for("^ready")
-    lab.node(publisher, source, "pub", topic=topic)
+    lab.node(first, source, "pub", topic=topic)
     receiver.wait_for_count("^got hello ", 5)
 
 
 @each_direction
-@each_pair("server", "client")
-def test_services(lab: Lab, server: str, client: str, source: str, sink: str) -> None:
+@each_mixed_pair
+def test_services(lab: Lab, first: str, second: str, source: str, sink: str) -> None:
     service = f"/{lab.unique('service')}"
-    lab.node(server, source, "serve", service=service)
-    lab.node(client, sink, "call", service=service).wait_for("^reply ask 0 ")
+    lab.node(first, source, "serve", service=service)
+    lab.node(second, sink, "call", service=service).wait_for("^reply ask 0 ")
 
 
 def test_the_published_master_tells_its_published_address(lab: Lab) -> None:

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
-from tests.ros.combinations import each_library, each_side
+from tests.ros.combinations import each_library, each_side, each_view
 from tests.ros.lab import Lab
 from tests.ros.processes import Process
-
-each_subject = pytest.mark.parametrize(
-    "where", ["c1", "c2", "out"], ids=["about-inside", "about-another-inside", "about-outside"]
-)
 
 
 def talker(lab: Lab, library: str, where: str) -> tuple[Process, str]:
@@ -32,10 +26,9 @@ def test_list_names_the_nodes_of_both_sides(lab: Lab, side: str) -> None:
         assert re.search(rf"^http://\S+:\d+/\S*\s+{name}$", with_uris, re.MULTILINE), with_uris
 
 
-@each_side
-@each_subject
+@each_view
 @each_library
-def test_info_reaches_the_node(lab: Lab, library: str, where: str, side: str) -> None:
+def test_info_reaches_the_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "info", name).output
     assert f"Pid: {node.pid}" in output
@@ -55,10 +48,9 @@ def test_info_shows_connections_across_the_boundary(lab: Lab, library: str, side
     assert "transport: TCPROS" in output
 
 
-@each_side
-@each_subject
+@each_view
 @each_library
-def test_ping_is_answered(lab: Lab, library: str, where: str, side: str) -> None:
+def test_ping_is_answered(lab: Lab, library: str, side: str, where: str) -> None:
     _, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "ping", "-c", "2", name).output
     assert len(re.findall(r"^xmlrpc reply from http://\S+\s+time=", output, re.MULTILINE)) == 2
@@ -74,10 +66,9 @@ def test_ping_all_reaches_every_node(lab: Lab, side: str) -> None:
     assert "connection to" not in output
 
 
-@each_side
-@each_subject
+@each_view
 @each_library
-def test_kill_ends_the_node(lab: Lab, library: str, where: str, side: str) -> None:
+def test_kill_ends_the_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "kill", name).output
     assert f"killing {name}" in output
@@ -95,10 +86,9 @@ def test_machine_lists_the_hosts_and_their_nodes(lab: Lab, side: str) -> None:
         assert any(name in nodes for nodes in found.values()), found
 
 
-@each_side
-@each_subject
+@each_view
 @each_library
-def test_cleanup_removes_a_killed_node(lab: Lab, library: str, where: str, side: str) -> None:
+def test_cleanup_removes_a_killed_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     _, living = talker(lab, "roscpp", "c1")
     node.kill()

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
-from tests.ros.combinations import each_library, each_side
+from tests.ros.combinations import each_library, each_side, each_view
 from tests.ros.lab import Lab
-
-each_origin = pytest.mark.parametrize(
-    "where", ["c1", "c2", "out"], ids=["of-inside", "of-another-inside", "of-outside"]
-)
 
 
 def server(lab: Lab, where: str, library: str = "roscpp") -> tuple[str, str]:
@@ -35,10 +29,9 @@ def test_list_find_and_node(lab: Lab, side: str) -> None:
         assert lab.run(side, "rosservice", "node", service).output == f"{name}\n"
 
 
-@each_side
-@each_origin
+@each_view
 @each_library
-def test_info_type_args_and_uri(lab: Lab, library: str, where: str, side: str) -> None:
+def test_info_type_args_and_uri(lab: Lab, library: str, side: str, where: str) -> None:
     name, service = server(lab, where, library)
     info = lab.run(side, "rosservice", "info", service).output
     assert f"Node: {name}\n" in info
@@ -51,18 +44,16 @@ def test_info_type_args_and_uri(lab: Lab, library: str, where: str, side: str) -
     assert f"URI: {uri}" in info
 
 
-@each_side
-@each_origin
+@each_view
 @each_library
-def test_call_prints_the_answer(lab: Lab, library: str, where: str, side: str) -> None:
+def test_call_prints_the_answer(lab: Lab, library: str, side: str, where: str) -> None:
     _, service = server(lab, where, library)
     output = lab.run(side, "rosservice", "call", service, "tool 7 x").output
     assert output == 'prev_topic: "echo tool 7 x"\n'
 
 
-@each_side
-@each_origin
-def test_list_works_for_the_services_that_every_node_has(lab: Lab, where: str, side: str) -> None:
+@each_view
+def test_list_works_for_the_services_that_every_node_has(lab: Lab, side: str, where: str) -> None:
     name, _ = server(lab, where, "rospy")
     assert f"{name}/get_loggers" in lab.run(side, "rosservice", "list", name).output.split()
     loggers = lab.run(side, "rosservice", "call", f"{name}/get_loggers").output

@@ -6,14 +6,10 @@ import re
 
 import pytest
 
-from tests.ros.combinations import each_direction, each_library, each_side
+from tests.ros.combinations import each_direction, each_library, each_side, each_view
 from tests.ros.lab import Lab
 
 STAMPED = ("geometry_msgs/PointStamped", "{header: auto, point: {x: 1.0, y: 2.0, z: 3.0}}")
-
-each_origin = pytest.mark.parametrize(
-    "where", ["c1", "c2", "out"], ids=["of-inside", "of-another-inside", "of-outside"]
-)
 
 
 def talker(lab: Lab, where: str, library: str = "roscpp", **options: int) -> tuple[str, str]:
@@ -40,11 +36,10 @@ def test_list_by_host(lab: Lab, side: str) -> None:
     assert re.search(rf"^Host \[\S+\]:(\n  .*)*\n  {topic}$", output, re.MULTILINE), output
 
 
-@each_side
-@each_origin
+@each_view
 @each_library
 def test_info_names_publishers_with_their_address(
-    lab: Lab, library: str, where: str, side: str
+    lab: Lab, library: str, side: str, where: str
 ) -> None:
     name, topic = talker(lab, where, library)
     output = lab.run(side, "rostopic", "info", topic).output
@@ -59,10 +54,9 @@ def test_type_and_find(lab: Lab, side: str) -> None:
     assert topic in lab.run(side, "rostopic", "find", "std_msgs/String").output.split()
 
 
-@each_side
-@each_origin
+@each_view
 @each_library
-def test_echo_prints_messages(lab: Lab, library: str, where: str, side: str) -> None:
+def test_echo_prints_messages(lab: Lab, library: str, side: str, where: str) -> None:
     _, topic = talker(lab, where, library)
     output = lab.run(side, "rostopic", "echo", "-n", "3", topic).output
     assert len(re.findall(r'^data: "hello \d+ "$', output, re.MULTILINE)) == 3
@@ -79,18 +73,16 @@ def test_pub_once_and_at_a_rate(lab: Lab, source: str, sink: str) -> None:
     listener.wait_for_count("^got often 1 ", 10)
 
 
-@each_side
-@each_origin
-def test_hz_measures_the_rate(lab: Lab, where: str, side: str) -> None:
+@each_view
+def test_hz_measures_the_rate(lab: Lab, side: str, where: str) -> None:
     _, topic = talker(lab, where)
     tool = lab.start(side, "rostopic", "hz", topic)
     rates = [float(match[1]) for match in tool.wait_for_count(r"average rate: ([\d.]+)", 2)]
     assert rates[-1] == pytest.approx(20, rel=0.25)
 
 
-@each_side
-@each_origin
-def test_bw_measures_the_bandwidth(lab: Lab, where: str, side: str) -> None:
+@each_view
+def test_bw_measures_the_bandwidth(lab: Lab, side: str, where: str) -> None:
     _, topic = talker(lab, where, size=10_000)
     tool = lab.start(side, "rostopic", "bw", topic)
     tool.wait_for_count(r"average: [\d.]+KB/s", 2)

@@ -109,7 +109,8 @@ def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
 
 def test_problems_stand_at_the_end() -> None:
     problem = {"age": 125.0, "subject": "/talker", "text": "does not answer"}
-    lines = lines_of(make_node(), problems=[problem])
+    masters = {"age": 3.0, "subject": "master", "text": "told by the master's line"}
+    lines = lines_of(make_node(), problems=[problem, masters])
     assert lines[-3:] == [
         "",
         "problems (rosproxy doctor looks into them):",

@@ -144,9 +144,10 @@ def _connection(connection: Status) -> str:
 
 
 def _problems(status: Status, columns: int) -> Iterator[str]:
-    if status["problems"]:
-        yield ""
-        yield "problems (rosproxy doctor looks into them):"
-    for problem in status["problems"]:
+    """All problems but the master's, which its own line tells."""
+    problems = [problem for problem in status["problems"] if problem["subject"] != "master"]
+    if problems:
+        yield from ("", "problems (rosproxy doctor looks into them):")
+    for problem in problems:
         text = f"{clean(problem['subject'])}: {clean(problem['text'])}"
         yield from wrap(f"{duration(problem['age'])} ago  {text}", columns, INDENT, "  ")

@@ -39,6 +39,12 @@ def say(*words: object) -> None:
     print(*words, flush=True)
 
 
+def spin() -> None:
+    """Waits for the end; rospy.spin takes half a second to see it."""
+    while not rospy.is_shutdown():
+        time.sleep(0.02)
+
+
 def payload(word: str, number: int, size: int) -> str:
     """`word number` filled up to `size` characters."""
     head = f"{word} {number} "
@@ -69,14 +75,14 @@ def publish(options: Options) -> None:
         say("sent", describe(text))
         number += 1
         rate.sleep()
-    rospy.spin()
+    spin()
 
 
 def subscribe(options: Options) -> None:
     """Prints every message."""
     rospy.Subscriber(options.text("topic"), String, lambda m: say("got", describe(m.data)))
     say("ready")
-    rospy.spin()
+    spin()
 
 
 def serve(options: Options) -> None:
@@ -88,7 +94,7 @@ def serve(options: Options) -> None:
 
     rospy.Service(options.text("service"), MuxSelect, answer)
     say("ready")
-    rospy.spin()
+    spin()
 
 
 def call(options: Options) -> None:
@@ -137,7 +143,7 @@ def action_server(options: Options) -> None:
     server = actionlib.SimpleActionServer(options.text("action"), TwoIntsAction, execute, False)
     server.start()
     say("ready")
-    rospy.spin()
+    spin()
 
 
 def action_client(options: Options) -> None:
