@@ -12,20 +12,22 @@ import os
 import socket
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 log = logging.getLogger(__name__)
 
 COPY_SIZE = 16 * 1024
 """Bytes read at once while copying; a full read switches the direction to splice."""
-PIPE_SIZE = 256 * 1024
+PIPE_SIZE = 1024 * 1024
 """Bytes that a splice pipe should hold; the kernel may give an unprivileged process less."""
-STACK_SIZE = 256 * 1024
+LEAST_PIPE = 64 * 1024
+"""A pipe that holds fewer bytes is not spliced through."""
+BLOCK_SIZE = 256 * 1024
+"""Bytes copied at once where there is no pipe."""
 RESET_GRACE = 0.1
 """Seconds that the other direction gets to notice a reset before its peer is shut down."""
 
-_CAN_SPLICE = hasattr(os, "splice")
 _LINGER_RESET = struct.pack("ii", 1, 0)
 
 
@@ -170,28 +172,29 @@ class _Pump:
         self, source: socket.socket, target: socket.socket, count: Callable[[int], None]
     ) -> None:
         self._source, self._target, self._count = source, target, count
-        self._pipe: tuple[int, int] | None = None
 
     def run(self) -> None:
-        try:
-            while self._copy() and self._splice():
-                pass
-        finally:
-            for end in self._pipe or ():
-                os.close(end)
+        while self._copy() and self._bulk():
+            pass
 
     def _copy(self) -> bool:
         """Copy until a read is full; False at the end."""
         while data := self._source.recv(COPY_SIZE):
             self._target.sendall(data)
             self._count(len(data))
-            if len(data) == COPY_SIZE and _CAN_SPLICE:
+            if len(data) == COPY_SIZE:
                 return True
         return False
 
-    def _splice(self) -> bool:
-        """Splice until a read is small; False at the end."""
-        read_end, write_end = self._pipe = self._pipe or _open_pipe()
+    def _bulk(self) -> bool:
+        """Move many bytes at once until a read is small; False at the end.
+
+        The pipe is held no longer than that: pipes are scarce for an unprivileged user.
+        """
+        with _pipe() as pipe:
+            return self._splice(*pipe) if pipe else self._copy_blocks()
+
+    def _splice(self, read_end: int, write_end: int) -> bool:
         source, target = self._source.fileno(), self._target.fileno()
         while True:
             size = left = os.splice(source, write_end, PIPE_SIZE)
@@ -201,9 +204,31 @@ class _Pump:
             if size < COPY_SIZE:
                 return size > 0
 
+    def _copy_blocks(self) -> bool:
+        block = memoryview(bytearray(BLOCK_SIZE))
+        while True:
+            size = self._source.recv_into(block)
+            self._target.sendall(block[:size])
+            self._count(size)
+            if size < COPY_SIZE:
+                return size > 0
 
-def _open_pipe() -> tuple[int, int]:
+
+@contextlib.contextmanager
+def _pipe() -> Iterator[tuple[int, int] | None]:
+    """A pipe that is worth splicing through, or None.
+
+    An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they hold
+    two pages each, and copying is faster.
+    """
+    if not hasattr(os, "splice"):
+        yield None
+        return
     ends = os.pipe()
-    with contextlib.suppress(OSError, AttributeError):
-        fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-    return ends
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+        yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
+    finally:
+        for end in ends:
+            os.close(end)

@@ -260,3 +260,13 @@ async def test_stopping_the_proxy_ends_its_connections(make_proxy, node):
             assert await ends.outside.end() == "closed"
             assert await ends.inside.end() == "closed"
         await asyncio.gather(flood, return_exceptions=True)
+
+
+async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):
+    """An unprivileged user's pipes shrink to two pages; splicing through them would crawl."""
+    monkeypatch.setattr(relay, "LEAST_PIPE", 2 * relay.PIPE_SIZE)
+    payload = random.Random(7).randbytes(3 * relay.BLOCK_SIZE + 17)
+    async with relayed(node, lease) as ends:
+        sending = asyncio.create_task(ends.inside.send(payload))
+        assert await ends.outside.exactly(len(payload)) == payload
+        await sending
