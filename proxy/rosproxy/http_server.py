@@ -71,6 +71,7 @@ class XmlRpcServer:
         self._service, self._greeting = service, greeting
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
         self._by_port: dict[int, list[web.RequestHandler]] = {}
+        self._busy: set[web.RequestHandler] = set()
 
     async def serve(self, conn: socket.socket) -> None:
         """Take over a connection. Raises OSError if it has ended already."""
@@ -82,13 +83,23 @@ class XmlRpcServer:
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
         for handler in self._by_port.pop(port, []):
-            handler.close()
+            if handler in self._busy:
+                handler.close()
+            else:
+                handler.force_close()
 
     async def close(self) -> None:
         """Close all connections."""
         await self._server.shutdown(STOP_TIMEOUT)
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        self._busy.add(request.protocol)
+        try:
+            return await self._respond(request)
+        finally:
+            self._busy.discard(request.protocol)
+
+    async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
         if request.method in ("GET", "HEAD"):
             return web.Response(text=self._greeting)
         if request.method != "POST":

@@ -221,10 +221,14 @@ def _pipe() -> Iterator[tuple[int, int] | None]:
     An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they hold
     two pages each, and copying is faster.
     """
-    if not hasattr(os, "splice"):
+    try:
+        ends = os.pipe() if hasattr(os, "splice") else None
+    except OSError as error:  # no file descriptor left
+        log.debug("no pipe: %s", error)
+        ends = None
+    if ends is None:
         yield None
         return
-    ends = os.pipe()
     try:
         with contextlib.suppress(OSError):
             fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, PIPE_SIZE)

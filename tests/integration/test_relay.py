@@ -1,6 +1,7 @@
 """The relay: every byte, in order, both ways; ends, resets and back-pressure passed on."""
 
 import asyncio
+import errno
 import hashlib
 import os
 import random
@@ -17,7 +18,7 @@ from tests.integration.net import Wire, connect, refuses, until
 from tests.integration.node import read_header, topic_header
 
 BOTH_LOOPS = True
-THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.PIPE_SIZE]
+THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.BLOCK_SIZE, relay.PIPE_SIZE]
 
 
 class Ends:
@@ -142,7 +143,11 @@ async def digest(wire: Wire) -> str:
 
 
 @pytest.mark.parametrize("seed", range(4))
-async def test_bytes_arrive_intact_both_ways_at_once(proxy, node, lease, seed):
+@pytest.mark.parametrize("least_pipe", [relay.LEAST_PIPE, 1 << 40], ids=["splice", "copies"])
+async def test_bytes_arrive_intact_both_ways_at_once(
+    proxy, node, lease, seed, least_pipe, monkeypatch
+):
+    monkeypatch.setattr(relay, "LEAST_PIPE", least_pipe)
     outward, inward = random.Random(seed).randbytes(3_000_001), os.urandom(2_000_003)
     async with relayed(node, lease) as ends, asyncio.timeout(10):
         *_, got_outside, got_inside = await asyncio.gather(
@@ -157,6 +162,17 @@ async def test_bytes_arrive_intact_both_ways_at_once(proxy, node, lease, seed):
     traffic = proxy.app._tcpros.traffic()
     assert traffic.sent[("topic", "/chatter")] == len(outward)
     assert traffic.received[("topic", "/chatter")] == len(inward)
+
+
+async def test_without_a_descriptor_for_a_pipe_bytes_are_copied(node, lease, monkeypatch):
+    def fail() -> None:
+        raise OSError(errno.EMFILE, "no descriptor left")
+
+    monkeypatch.setattr(os, "pipe", fail)
+    async with relayed(node, lease) as ends:
+        data = os.urandom(500_000)
+        _, got = await asyncio.gather(ends.inside.send(data), ends.outside.exactly(len(data)))
+        assert got == data
 
 
 async def test_single_messages_of_every_size_around_the_thresholds(node, lease):

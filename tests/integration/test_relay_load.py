@@ -4,16 +4,18 @@ ROSPROXY_TEST_STALL is the time in seconds for which a reader stalls; 60 for a t
 """
 
 import asyncio
+import gzip
 import os
+import selectors
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, ExitStack, contextmanager
+from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from time import monotonic
 from typing import Any
 
 from rosproxy.core.tcpros import encode_header
-from tests.integration.net import OUTSIDE, Where, connect, until, where
+from tests.integration.net import OUTSIDE, Where, connect, exchange, post, until, where
 from tests.integration.node import read_header, topic_header
 
 STALL = float(os.environ.get("ROSPROXY_TEST_STALL", "2"))
@@ -84,7 +86,7 @@ def subscribe(address: Where) -> socket.socket:
     conn = socket.create_connection(address, 10, (OUTSIDE, 0))
     conn.sendall(topic_header())
     receive(conn, int.from_bytes(receive(conn, 4), "little"))
-    conn.settimeout(30)
+    conn.settimeout(STALL + 30)
     return conn
 
 
@@ -143,36 +145,58 @@ async def test_a_stalled_node_does_not_move_the_proxys_memory(start_process, mas
     assert grown < 4 * MIB
 
 
+class Streams:
+    """Many connections written to, or read from, in turns by one thread: nobody is favoured."""
+
+    def __init__(self, conns: list[socket.socket], event: int, turn: Any) -> None:
+        self.moved = dict.fromkeys(conns, 0)
+        self._selector = selectors.DefaultSelector()
+        for conn in conns:
+            conn.setblocking(False)
+            self._selector.register(conn, event)
+        self._turn, self._stop = turn, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; the connections stay open."""
+        self._stop.set()
+        self._thread.join()
+        self._selector.close()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            for key, _ in self._selector.select(0.1):
+                conn: Any = key.fileobj
+                with suppress(BlockingIOError):
+                    self.moved[conn] += self._turn(conn)
+
+
 async def test_a_hundred_streams_all_make_progress(start_process, master, node):
-    process, go, stop = start_process(), threading.Event(), threading.Event()
+    process, over = start_process(), threading.Event()
     lease = await lease_of(process, master, node)
-    received: dict[int, int] = {}
+    inside: list[socket.socket] = []
+    buffer = bytearray(65536)
 
-    def flood(conn: socket.socket) -> None:
-        go.wait(20)
-        while not stop.is_set():
-            conn.sendall(BLOCK[:65536])
+    def hold(conn: socket.socket) -> None:
+        inside.append(conn)
+        over.wait(30)
 
-    def read(index: int, conn: socket.socket) -> None:
-        buffer = bytearray(65536)
-        while not stop.is_set():
-            received[index] = received.get(index, 0) + conn.recv_into(buffer)
-
-    with blocking_node(node, flood), ExitStack() as stack:
-        conns = [stack.enter_context(await asyncio.to_thread(subscribe, lease)) for _ in range(100)]
-        threads = [threading.Thread(target=read, args=item) for item in enumerate(conns)]
-        for thread in threads:
-            thread.start()
-        go.set()
+    with blocking_node(node, hold), ExitStack() as stack:
+        outside = [
+            stack.enter_context(await asyncio.to_thread(subscribe, lease)) for _ in range(100)
+        ]
+        stack.callback(over.set)
+        await until(lambda: len(inside) == 100, "all arrive")
+        writing = Streams(inside, selectors.EVENT_WRITE, lambda conn: conn.send(buffer))
+        stack.callback(writing.close)
+        reading = Streams(outside, selectors.EVENT_READ, lambda conn: conn.recv_into(buffer))
+        stack.callback(reading.close)
         await asyncio.sleep(0.7)
-        before = dict(received)
+        before = dict(reading.moved)
         await asyncio.sleep(1)
-        after = dict(received)
-        stop.set()
-        for thread in threads:
-            await asyncio.to_thread(thread.join)
-    assert len(after) == 100
-    assert min(after[index] - before.get(index, 0) for index in after) > 0
+        moved = [reading.moved[conn] - before[conn] for conn in outside]
+    assert min(moved) > sum(moved) / len(moved) / 10, sorted(moved)
 
 
 async def test_250_connections_leave_neither_descriptors_nor_threads(start_process, master, node):
@@ -194,6 +218,15 @@ async def test_250_connections_leave_neither_descriptors_nor_threads(start_proce
     await use(250)
     await until(lambda: process.threads() <= before[1], "all threads end")
     assert process.descriptors() <= before[0] + 2
+
+
+async def test_a_decompression_bomb_costs_little_memory(start_process):
+    process = start_process()
+    bomb = gzip.compress(bytes(300 * MIB), 1)
+    before = process.most_memory()
+    reply = await exchange(process.master, post(bomb, "Content-Encoding: gzip"))
+    assert reply.status == 413
+    assert process.most_memory() - before < 100 * MIB
 
 
 async def test_the_soft_limit_of_descriptors_is_no_limit(start_process, master, node):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosproxy.core.methods import MASTER_METHODS
-from tests.integration.net import NODE, Where, connect, exchange, post, rpc, xml
+from tests.integration.net import HOST, NODE, Where, connect, exchange, free_ports, post, rpc, xml
 
 BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
@@ -30,12 +30,14 @@ class Door:
         return await rpc(self.address, "getPid", "/n", source=NODE) == [1, "", self.pid]
 
 
-@pytest.fixture(params=["master port", "node port"])
-async def door(request: Any, proxy: Any, master: Any, node: Any) -> Door:
-    if request.param == "master port":
-        return Door(proxy.master, master.pid)
-    await node.publish(proxy.master)
-    return Door(proxy.lease(node), node.pid)
+@pytest.fixture(params=["master port", "published master", "node port"])
+async def door(request: Any, make_proxy: Any, master: Any, node: Any) -> Door:
+    published = free_ports(1)
+    proxy = await make_proxy(publish_master=published)
+    if request.param == "node port":
+        await node.publish(proxy.master)
+        return Door(proxy.lease(node), node.pid)
+    return Door(proxy.master if request.param == "master port" else (HOST, published), master.pid)
 
 
 async def raw(door: Door, request: bytes, slices: int = 0) -> Any:
