@@ -39,6 +39,12 @@ Answer = bytes | End
 Respond = Callable[[Request], Awaitable[Answer]]
 
 
+async def settle() -> None:
+    """Let connections end that were accepted in the moment in which a server stopped."""
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
 def ok(body: bytes, *headers: str) -> bytes:
     """A whole response with status 200."""
     lines = ["HTTP/1.1 200 OK", "Content-Type: text/xml", *headers]
@@ -82,6 +88,7 @@ class HttpFake:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await settle()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()

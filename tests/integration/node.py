@@ -6,7 +6,7 @@ from typing import Any
 
 from rosproxy.core.tcpros import decode_header, encode_header
 from rosproxy.demo.wire import STRING
-from tests.integration.http_fake import Answer, End, HttpFake, Request, value
+from tests.integration.http_fake import Answer, End, HttpFake, Request, settle, value
 from tests.integration.net import NODE, Where, Wire, bracketed, connect, rpc, where
 
 Header = dict[str, str]
@@ -77,6 +77,7 @@ class Node:
         for task in self._streams:
             task.cancel()
         await asyncio.gather(*self._streams, return_exceptions=True)
+        await settle()
 
     async def call(self, master: Where, method: str, *params: Any) -> Any:
         """Call its master, under its own name and from its own address."""
