@@ -9,6 +9,7 @@ import errno
 import logging
 import socket
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from rosproxy.core.tcpros import header_length
 from rosproxy.core.uris import plain_address
@@ -50,7 +51,8 @@ class Acceptor:
                 conn, peer = self.sock.accept()
                 conn.setblocking(False)
                 source = plain_address(peer[0])
-                self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
+                task = self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
+                task.add_done_callback(partial(_close_if_cancelled, conn))
         except BlockingIOError:
             return
         except OSError as error:
@@ -73,6 +75,12 @@ class Acceptor:
             log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
         self._loop.remove_reader(self.sock)
         self._pause = self._loop.call_later(0.1, self._listen)
+
+
+def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:
+    """A task that is cancelled before it has begun never gets to close its connection."""
+    if task.cancelled():
+        conn.close()
 
 
 async def first_bytes(conn: socket.socket) -> bytes:

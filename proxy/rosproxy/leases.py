@@ -177,7 +177,7 @@ class Leases:
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid
         log.info("%s at %s is %s", caller_id, endpoint.uri, self._advertised(endpoint))
-        if answer.probe is Probe.ANSWERED:
+        if answer.probe is Probe.ANSWERED and not _on_loopback(endpoint):
             return
         text = _unreachable_text(endpoint, answer.reason)
         self._context.problems.add(caller_id, text, endpoint.port)
@@ -187,8 +187,17 @@ class Leases:
         return self._context.addressing.advertised_uri(endpoint)
 
 
+def _on_loopback(endpoint: Endpoint) -> bool:
+    """Whether a node of another machine gives a loopback address.
+
+    Then roscpp, too, accepts TCPROS connections on loopback only, though its slave API answers
+    (transport_tcp.cpp, isOnlyLocalhostAllowed).
+    """
+    return is_loopback(endpoint.node.host) and not is_loopback(endpoint.place.address)
+
+
 def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
-    if is_loopback(endpoint.node.host):
+    if _on_loopback(endpoint):
         return (
             f"gives its address as {endpoint.uri}, a loopback address, and listens only there: no "
             "other machine can reach it. Unset ROS_IP and ROS_HOSTNAME where it runs, or set "

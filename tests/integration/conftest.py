@@ -63,7 +63,7 @@ async def master() -> AsyncIterator[Master]:
 @pytest.fixture
 async def make_proxy(master: Master, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[MakeProxy]:
     """Starts proxies in this process, for the master unless told otherwise."""
-    monkeypatch.setattr("rosproxy.app.TICK", 0.05)
+    monkeypatch.setattr("rosproxy.app.TICK", 0.03)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:

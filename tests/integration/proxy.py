@@ -1,6 +1,7 @@
 """The proxy of a test, in the test's own event loop."""
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rosproxy.app import App
@@ -49,6 +50,14 @@ class Proxy:
     async def start(self) -> None:
         """Begin."""
         await self.app.start()
+
+    async def restart(self, while_down: Callable[[], Awaitable[None]] | None = None) -> None:
+        """Lose all memory: end, and begin anew with the same settings."""
+        await self.app.stop()
+        if while_down:
+            await while_down()
+        self.app = App(self.settings)
+        await self.start()
 
     async def stop(self) -> None:
         """End; the second time nothing."""

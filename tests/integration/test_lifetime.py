@@ -18,7 +18,7 @@ from tests.integration.net import (
 )
 from tests.integration.node import greet, read_header, topic_header
 
-FAST = {"probe_interval": 0.1, "probe_timeout": 0.15, "cleanup_after": 0.5, "linger": 0.3}
+FAST = {"probe_interval": 0.1, "probe_timeout": 0.15, "cleanup_after": 0.25, "linger": 0.2}
 
 
 def descriptors() -> int:
@@ -66,7 +66,7 @@ async def test_nobody_is_cleaned_up_where_that_is_off(make_proxy, master, node):
     uri = proxy.uri(node)
     await node.stop()
     await until(lambda: refuses(proxy.lease(node)), "the port refuses")
-    await asyncio.sleep(0.8)
+    await asyncio.sleep(0.5)
     assert master.holds("publishers", "/chatter") == [uri]
 
 
@@ -75,7 +75,7 @@ async def test_clean_up_waits_for_a_master_that_is_down(make_proxy, master, node
     await node.publish(proxy.master)
     await node.stop()
     await master.stop()
-    await asyncio.sleep(0.8)
+    await asyncio.sleep(0.5)
     await master.start()
     await until(lambda: not master.book.nodes, "the master forgets it")
 
@@ -234,11 +234,11 @@ async def test_a_restart_under_the_same_name_elsewhere_ends_the_old_process(
 
 
 async def test_a_lease_lingers_and_ends(make_proxy, node):
-    proxy = await make_proxy(**{**FAST, "linger": 0.6})
+    proxy = await make_proxy(**{**FAST, "linger": 0.4})
     await node.publish(proxy.master)
     lease = proxy.lease(node)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-    await asyncio.sleep(0.3)
+    await asyncio.sleep(0.15)
     assert await rpc_works(lease)
     await until(lambda: refuses(lease), "the lease ends", 2)
 
@@ -251,7 +251,7 @@ async def test_a_lease_with_a_connection_does_not_end(make_proxy, node):
         await wire.send(topic_header())
         await read_header(wire)
         await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-        await asyncio.sleep(0.7)
+        await asyncio.sleep(0.3)
         assert not await refuses(lease)
         await wire.send(b"x")
         assert await wire.exactly(1) == b"x"
@@ -260,7 +260,7 @@ async def test_a_lease_with_a_connection_does_not_end(make_proxy, node):
 
 async def test_a_lease_does_not_end_while_its_registration_is_on_its_way(make_proxy, master, node):
     proxy = await make_proxy(**{**FAST, "linger": 0.0})
-    master.delay = 0.8
+    master.delay = 0.3
     await node.publish(proxy.master)
     master.delay = 0.0
     assert await rpc_works(proxy.lease(node))
@@ -283,7 +283,7 @@ async def test_many_short_lives_leak_nothing(make_proxy, make_node):
     node = await make_node()
     for round_ in range(2):
         before = descriptors()
-        for _ in range(15):
+        for _ in range(8):
             await node.publish(proxy.master)
             await rpc(proxy.uri(node), "getPid", "/outside")
             await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)

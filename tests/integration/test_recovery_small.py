@@ -101,75 +101,68 @@ async def test_a_killed_proxy_serves_the_same_nodes_on_the_same_ports_within_2_s
     assert not [call for node in nodes for call, _ in node.calls if call == "shutdown"]
 
 
-async def test_publishers_that_came_and_went_meanwhile_are_made_up_for(
-    start_process, master, nodes
-):
-    process = start_process()
+async def test_publishers_that_came_and_went_meanwhile_are_made_up_for(proxy, master, nodes):
     await rpc(master.uri, "registerPublisher", "/old", "/news", "std_msgs/String", FAR)
-    await populate(process, *nodes)
+    await populate(proxy, *nodes)
     near = f"http://{OUTSIDE}:4001/"
 
     async def change() -> None:
         await rpc(master.uri, "unregisterPublisher", "/old", "/news", FAR)
         await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", near)
 
-    await restart(process, change)
+    await proxy.restart(change)
     await until(partial(all_were_told, nodes, near), "they are told")
 
 
 async def test_outside_subscribers_are_told_again_of_publishers_inside(
-    start_process, master, nodes, make_node
+    proxy, master, nodes, make_node
 ):
-    process = start_process()
     far: Node = await make_node("/far", OUTSIDE)
-    await populate(process, *nodes)
+    await populate(proxy, *nodes)
     await rpc(master.uri, "registerSubscriber", "/far", "/a/out", "std_msgs/String", far.uri)
     uri = uri_of(master, "/a")
-    await restart(process)
+    await proxy.restart()
     # A publisher whose connection broke is tried again only when it is new.
     await until(lambda: far.updates("/a/out")[-1:] == [[uri]], "the subscriber is told")
     assert [] in far.updates("/a/out")
 
 
-async def test_a_node_that_registers_during_recovery_does_not_move(start_process, master, nodes):
-    process = start_process()
-    await populate(process, *nodes)
+async def test_a_node_that_registers_during_recovery_does_not_move(proxy, master, nodes):
+    await populate(proxy, *nodes)
     before = {node.name: uri_of(master, node.name) for node in nodes}
     master.delay = 0.2
-    await restart(process)
+    await proxy.restart()
     for node in nodes:
-        assert (await node.publish(process.master, "/more"))[0] == 1
+        assert (await node.publish(proxy.master, "/more"))[0] == 1
     master.delay = 0.0
-    fresh = await nodes[0].subscribe(process.master, "/a/out")
+    fresh = await nodes[0].subscribe(proxy.master, "/a/out")
     assert fresh[2] == [nodes[0].uri]
     assert {node.name: uri_of(master, node.name) for node in nodes} == before
     assert not [call for node in nodes for call, _ in node.calls if call == "shutdown"]
 
 
-async def test_a_new_node_gets_no_port_that_belongs_to_another(
-    start_process, master, nodes, make_node
-):
-    process = start_process()
-    await populate(process, *nodes)
+async def test_a_new_node_gets_no_port_that_belongs_to_another(proxy, master, nodes, make_node):
+    await populate(proxy, *nodes)
     master.delay = 0.2
-    await restart(process)
+    await proxy.restart()
     late: Node = await make_node("/late", OTHER_NODE)
-    await late.publish(process.master)
+    await late.publish(proxy.master)
     ports = {where(uri)[1] for uri in master.book.nodes.values()}
     assert len(ports) == 4
 
 
 async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
-    start_process, master, nodes
+    make_proxy, master, nodes
 ):
-    process = start_process(probe_timeout=1.0, cleanup_after=60)
-    await populate(process, *nodes)
+    proxy = await make_proxy(probe_timeout=1.0, cleanup_after=60)
+    await populate(proxy, *nodes)
     nodes[0].hang = True
 
     async def news() -> None:
         await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", FAR)
 
-    started = await restart(process, news)
+    started = monotonic()
+    await proxy.restart(news)
     await until(lambda: answers(uri_of(master, "/b")), "the others are served")
     assert monotonic() - started < 2
     await until(lambda: nodes[1].updates("/news")[-1:] == [[FAR]], "the others are told")
@@ -179,10 +172,9 @@ async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     await until(lambda: nodes[0].updates("/news")[-1:] == [[FAR]], "it is told as well")
 
 
-async def test_a_node_that_ended_meanwhile_is_cleaned_up(start_process, master, nodes):
-    process = start_process()
-    await populate(process, *nodes)
-    await restart(process, nodes[0].stop)
+async def test_a_node_that_ended_meanwhile_is_cleaned_up(proxy, master, nodes):
+    await populate(proxy, *nodes)
+    await proxy.restart(nodes[0].stop)
     # Of parameters a master tells nobody who subscribes to them.
     kinds = ("publishers", "subscribers", "services")
     tables = [master.book.tables[kind] for kind in kinds]
@@ -195,14 +187,13 @@ async def test_a_node_that_ended_meanwhile_is_cleaned_up(start_process, master, 
     assert left("/c")
 
 
-async def test_recovery_waits_for_a_master_that_is_down(start_process, master, nodes):
-    process = start_process()
-    await populate(process, *nodes)
+async def test_recovery_waits_for_a_master_that_is_down(proxy, master, nodes):
+    await populate(proxy, *nodes)
     uri = uri_of(master, "/a")
-    await restart(process, master.stop)
-    assert await knock(process.master, b"") in ("silent", "closed")
+    await proxy.restart(master.stop)
+    assert await knock(proxy.master, b"") in ("silent", "closed")
     with pytest.raises(ConnectionResetError):
-        await nodes[0].publish(process.master, "/more")
+        await nodes[0].publish(proxy.master, "/more")
     await master.start()
     await until(lambda: answers(uri), "it is served")
     assert uri_of(master, "/a") == uri

@@ -18,7 +18,7 @@ from rosproxy.core.tcpros import encode_header
 from tests.integration.net import OUTSIDE, Where, connect, exchange, post, until, where
 from tests.integration.node import read_header, topic_header
 
-STALL = float(os.environ.get("ROSPROXY_TEST_STALL", "2"))
+STALL = float(os.environ.get("ROSPROXY_TEST_STALL", "1"))
 OFFERED = 1 << 30
 MIB = 1 << 20
 WELCOME = encode_header({"callerid": "/talker"})
@@ -192,9 +192,9 @@ async def test_a_hundred_streams_all_make_progress(start_process, master, node):
         stack.callback(writing.close)
         reading = Streams(outside, selectors.EVENT_READ, lambda conn: conn.recv_into(buffer))
         stack.callback(reading.close)
-        await asyncio.sleep(0.7)
+        await asyncio.sleep(0.4)
         before = dict(reading.moved)
-        await asyncio.sleep(1)
+        await asyncio.sleep(0.6)
         moved = [reading.moved[conn] - before[conn] for conn in outside]
     assert min(moved) > sum(moved) / len(moved) / 10, sorted(moved)
 

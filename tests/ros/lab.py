@@ -168,6 +168,10 @@ class Lab:
             raise AssertionError(f"{process.title} ended {code}:\n{process.output()}")
         return Result(code, process.output())
 
+    def rosproxy(self, *argv: str, check: bool = True) -> Result:
+        """Runs a subcommand of rosproxy where the proxy is."""
+        return self.run("px", sys.executable, "-m", "rosproxy", *argv, check=check)
+
     def environment(self, role: str) -> dict[str, str]:
         """All that a ROS program on this machine gets: no ROS_IP, no ROS_HOSTNAME."""
         home = self.folder / role

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 
@@ -154,6 +155,37 @@ def test_a_node_that_died_while_the_proxy_was_away_is_not_served(lab: Lab) -> No
     output = lab.run("out", "sh", "-c", "yes | rosnode cleanup").output
     assert f" * /{name}\n" in output
     assert not lab.registered(name)
+
+
+@each_library
+def test_nodes_that_start_while_the_proxy_is_away_are_there_when_it_is_back(
+    lab: Lab, library: str
+) -> None:
+    topic = f"/{lab.unique('waiting')}"
+    assert lab.proxy is not None
+    lab.proxy.kill()
+    receiver = lab.node(library, "c1", "sub", topic=topic)
+    sender = lab.node(library, "out", "pub", topic=topic)
+    sender.wait_for("^sent ")
+    lab.start_proxy()
+    receiver.wait_for_count("^got ", 3, timeout=20)
+
+
+@each_library
+def test_a_proxy_ended_by_sigterm_is_followed_by_another(lab: Lab, library: str) -> None:
+    """An upgrade: the old one ends cleanly and takes back no registration."""
+    name = lab.unique("kept")
+    sender = lab.node(library, "c1", "pub", name=name, topic=f"/{name}/topic")
+    receiver = lab.node(library, "out", "sub", topic=f"/{name}/topic")
+    receiver.wait_for("^got ")
+    uri = lab.node_uri(name)
+    assert lab.proxy is not None
+    assert lab.proxy.stop(signal.SIGTERM) == 0
+    assert lab.node_uri(name) == uri
+    lab.start_proxy()
+    receiver.wait_for_count("^got ", 5, since=receiver.mark())
+    assert lab.node_uri(name) == uri
+    assert sender.returncode is None
 
 
 @each_library

@@ -64,9 +64,17 @@ def test_a_node_that_listens_on_loopback_only() -> None:
     assert found.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
 
 
-def test_a_node_that_gives_loopback_but_is_reached_is_sound() -> None:
-    status = make_status(make_node(uri="http://localhost:40001/"))
-    assert not faults(make_facts(status=status))
+def test_a_roscpp_node_on_loopback_answers_probes_and_is_a_fault_all_the_same() -> None:
+    """Its slave API listens everywhere, its TCPROS server on loopback only."""
+    found = inside(uri="http://localhost:40001/", state="ok")
+    assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
+    assert "listens on loopback only" in found.text
+
+
+def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
+    node = make_node(uri="http://localhost:40001/", address="127.0.0.1:40001")
+    node["advertised_uri"] = make_node()["advertised_uri"]
+    assert not faults(make_facts(status=make_status(node)))
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def _inside(facts: Facts) -> Iterator[Finding]:
 def _inside_node(facts: Facts, node: Mapping[str, Any], name: str) -> Iterator[Finding]:
     state, address = node["state"], node["address"]
     after = facts.status["settings"]["cleanup_after"] if facts.status else 0
-    if state in ("refused", "silent", "failing") and _only_on_loopback(node):
+    if state in ("refused", "silent", "failing", "ok") and _only_on_loopback(node):
         yield Finding(
             Severity.ERROR,
             INSIDE,
