@@ -24,6 +24,8 @@ BODY_TIMEOUT = 60.0
 """Seconds in which a request's body must arrive."""
 
 
+HEADER_TIMEOUT = 30.0
+"""Seconds in which the header of a connection's first request must arrive."""
 STOP_TIMEOUT = 0.5
 """Seconds that calls under way get to end when the server stops."""
 
@@ -72,11 +74,14 @@ class XmlRpcServer:
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
         self._by_port: dict[int, list[web.RequestHandler]] = {}
         self._busy: set[web.RequestHandler] = set()
+        self._mute: set[web.RequestHandler] = set()
 
     async def serve(self, conn: socket.socket) -> None:
         """Take over a connection. Raises OSError if it has ended already."""
         port, loop = conn.getsockname()[1], asyncio.get_running_loop()
         _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
+        self._mute.add(handler)
+        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
         alive = [known for known in self._by_port.get(port, []) if known.transport is not None]
         self._by_port[port] = [*alive, handler]
 
@@ -92,7 +97,13 @@ class XmlRpcServer:
         """Close all connections."""
         await self._server.shutdown(STOP_TIMEOUT)
 
+    def _close_mute(self, handler: web.RequestHandler) -> None:
+        if handler in self._mute:
+            self._mute.discard(handler)
+            handler.force_close()
+
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        self._mute.discard(request.protocol)
         self._busy.add(request.protocol)
         try:
             return await self._respond(request)

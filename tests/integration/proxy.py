@@ -15,9 +15,14 @@ PORTS = 8
 
 
 def options_for(**options: Any) -> dict[str, Any]:
-    """Command-line options for a test: free ports, and patience measured in tenths of seconds."""
+    """Command-line options for a test: free ports, and patience measured in tenths of seconds.
+
+    ``publish_master`` may be True: on a free port.
+    """
     count = options.pop("ports", PORTS)
-    first = free_ports(count + 2)
+    first = free_ports(count + 3)
+    if options.get("publish_master") is True:
+        options["publish_master"] = first + count + 2
     return {
         "advertise_host": HOST,
         "master_port": first + count,

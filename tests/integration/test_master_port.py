@@ -13,7 +13,6 @@ from tests.integration.net import (
     PROXY,
     connect,
     exchange,
-    free_ports,
     post,
     rpc,
     xml,
@@ -236,9 +235,9 @@ async def test_garbage_from_the_master_is_a_fault_where_it_would_be_rewritten(
 
 
 async def test_the_published_master_forwards_unchanged_apart_from_its_uri(master, make_proxy, node):
-    port = free_ports(1)
-    proxy = await make_proxy(publish_master=port)
-    published = (HOST, port)
+    proxy = await make_proxy(publish_master=True)
+    port = proxy.settings.publish_master
+    published = HOST, port
     await node.publish(proxy.master)
     assert (await rpc(published, "getUri", "/far"))[2] == f"http://{HOST}:{port}/"
     assert (await rpc(published, "lookupNode", "/far", "/talker"))[2] == proxy.uri(node)

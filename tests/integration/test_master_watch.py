@@ -60,8 +60,13 @@ async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, no
 
 
 async def test_a_proxy_that_is_its_own_master_says_so(make_proxy, caplog):
-    port = free_ports(1)
-    proxy = await make_proxy(master_uri=f"http://127.0.0.1:{port}", master_port=port)
+    first = free_ports(4)
+    proxy = await make_proxy(
+        master_uri=f"http://127.0.0.1:{first}",
+        master_port=first,
+        admin_bind=f"127.0.0.1:{first + 1}",
+        port_range=f"{first + 2}-{first + 3}",
+    )
     with pytest.raises(xmlrpc.client.Fault, match="leads back"):
         await rpc(proxy.master, "getPid", "/n")
     await until(lambda: "leads back to the proxy itself" in caplog.text, "the log says so")

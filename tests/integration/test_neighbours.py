@@ -1,5 +1,7 @@
 """Inside nodes among themselves and with outside: whose address is given to whom."""
 
+import asyncio
+
 import pytest
 
 from tests.integration.http_fake import HttpFake, value
@@ -116,6 +118,18 @@ async def test_a_parameter_reaches_its_subscriber(proxy, node):
     await node.call(proxy.master, "subscribeParam", node.uri, "/p")
     await rpc(proxy.uri(node), "paramUpdate", "/master", "/p", {"a": [1, 2.5, True]})
     assert node.calls[-1] == ("paramUpdate", ("/master", "/p", {"a": [1, 2.5, True]}))
+
+
+async def test_an_update_does_not_overtake_the_registration_before_it(proxy, master, node):
+    await node.subscribe(proxy.master, "/other")
+    uri, master.delay = proxy.uri(node), 0.2
+    registering = asyncio.create_task(node.subscribe(proxy.master))
+    await until(lambda: proxy.endpoint(node).pending, "the registration is on its way")
+    far = f"http://{OUTSIDE}:4000/"
+    await rpc(uri, "publisherUpdate", "/master", "/chatter", [far])
+    assert registering.done()
+    assert await registering == [1, "subscribed", []]
+    assert node.updates() == [[far]]
 
 
 async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_proxy, make_node):

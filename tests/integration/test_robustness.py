@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosproxy.core.methods import MASTER_METHODS
-from tests.integration.net import HOST, NODE, Where, connect, exchange, free_ports, post, rpc, xml
+from tests.integration.net import HOST, NODE, Where, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
@@ -32,12 +32,12 @@ class Door:
 
 @pytest.fixture(params=["master port", "published master", "node port"])
 async def door(request: Any, make_proxy: Any, master: Any, node: Any) -> Door:
-    published = free_ports(1)
-    proxy = await make_proxy(publish_master=published)
+    proxy = await make_proxy(publish_master=True)
     if request.param == "node port":
         await node.publish(proxy.master)
         return Door(proxy.lease(node), node.pid)
-    return Door(proxy.master if request.param == "master port" else (HOST, published), master.pid)
+    published = HOST, proxy.settings.publish_master
+    return Door(proxy.master if request.param == "master port" else published, master.pid)
 
 
 async def raw(door: Door, request: bytes, slices: int = 0) -> Any:
@@ -71,6 +71,17 @@ async def test_connections_that_end_early_are_survived(door, how):
 async def test_requests_in_tiny_slices(door):
     for size in (1, 3, 7):
         assert (await raw(door, post(CALL), slices=size)).value == [1, "", door.pid]
+
+
+async def test_a_header_that_never_ends_costs_a_time_out(door, monkeypatch):
+    monkeypatch.setattr("rosproxy.http_server.HEADER_TIMEOUT", 0.1)
+    async with connect(door.address) as mute, connect(door.address) as kept:
+        await mute.send(b"POST / HTTP/1.1\r\nX: ")
+        await kept.send(post(CALL))
+        await kept.reply()
+        assert await mute.outcome() == "closed"
+        await kept.send(post(CALL))
+        assert (await kept.reply()).value == [1, "", door.pid]
 
 
 async def test_several_requests_on_one_connection(door):
