@@ -13,6 +13,8 @@ from rosproxy.upstream import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
+LOOK_TIMEOUT = 5.0
+"""Seconds in which a sound master answers getPid."""
 LOOKS_PER_CHECK = 5
 """How many looks at the master go by between two checks of what it knows."""
 
@@ -55,13 +57,17 @@ class MasterWatch:
         """Ask the master for its pid; recover or restore where that is due."""
         started = self._context.now()
         try:
-            pid = await self._context.upstream.ask_master("getPid")
+            async with asyncio.timeout(LOOK_TIMEOUT):
+                pid = await self._context.upstream.ask_master("getPid")
             self.round_trip = self._context.now() - started
             await self.recovered()
             await self._check(pid)
             self._mark(True)
         except (Unreachable, MasterError) as error:
             self._mark(False, str(error))
+        except TimeoutError:
+            uri = self._context.settings.master_uri
+            self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
 
     async def _check(self, pid: int) -> None:
         restarted = not self.up or pid != self.pid

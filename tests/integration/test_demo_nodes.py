@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -21,7 +22,8 @@ from rosproxy.demo.subscriber import Subscription
 FREE = Boundary()
 HERE = "127.0.0.1"
 separated = pytest.mark.skipif(
-    bool(layout.detect().note), reason="this system has no loopback addresses but 127.0.0.1"
+    bool(layout.detect().note) and os.environ.get("CI") != "true",
+    reason="this system has no loopback addresses but 127.0.0.1",
 )
 
 

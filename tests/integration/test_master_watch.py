@@ -71,3 +71,16 @@ async def test_a_proxy_that_is_its_own_master_says_so(make_proxy, caplog):
         await rpc(proxy.master, "getPid", "/n")
     await until(lambda: "leads back to the proxy itself" in caplog.text, "the log says so")
     assert not await refuses(proxy.master)
+
+
+async def test_a_master_that_hangs_is_noticed_long_before_its_calls_time_out(
+    master, make_proxy, monkeypatch
+):
+    monkeypatch.setattr("rosproxy.master_watch.LOOK_TIMEOUT", 0.2)
+    proxy = await make_proxy(master_interval=0.05)
+    await until(lambda: proxy.app.status()["master"]["up"], "the master is up")
+    master.answers["getPid"] = End.HANG
+    await until(lambda: not proxy.app.status()["master"]["up"], "the proxy says that it is not")
+    assert "no answer in 0.2 s" in proxy.app.status()["master"]["error"]
+    del master.answers["getPid"]
+    await until(lambda: proxy.app.status()["master"]["up"], "the master is up again")

@@ -212,6 +212,20 @@ def test_inside_nodes_are_registered_again_after_roscore_was_killed(
         receiver.wait_for_count(f"^got new-{peer} ", 3)
 
 
+@pytest.mark.parametrize("restart", [restart_proxy, restart_master], ids=["proxy", "roscore"])
+def test_a_subscribed_parameter_is_updated_after_a_restart(
+    lab: Lab, restart: Callable[[Lab], float]
+) -> None:
+    name = lab.unique("watcher")
+    lab.ask_master("setParam", f"/{name}/key", "before")
+    watcher = lab.node("roscpp", "c1", "watchparam", name=name, key=f"/{name}/key")
+    watcher.wait_for("^param before$")
+    restart(lab)
+    lab.wait_registered(name, HARD_LIMIT)
+    lab.ask_master("setParam", f"/{name}/key", "after")
+    watcher.wait_for("^param after$", HARD_LIMIT)
+
+
 @each_library
 def test_inside_nodes_hear_each_other_all_the_time_while_roscore_is_away(
     lab: Lab, library: str
