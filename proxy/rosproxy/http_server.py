@@ -22,8 +22,6 @@ log = logging.getLogger(__name__)
 
 BODY_TIMEOUT = 60.0
 """Seconds in which a request's body must arrive."""
-
-
 HEADER_TIMEOUT = 30.0
 """Seconds in which the header of a connection's first request must arrive."""
 STOP_TIMEOUT = 0.5

@@ -98,7 +98,7 @@ class Keeper:
                 await self._upkeep.announce([endpoint])
             return
         if endpoint.health.cleaned:
-            await self._upkeep.come_back(endpoint)
+            await self._upkeep.come_back(endpoint, pid)
         elif endpoint.health.pid not in (None, pid):
             await self._upkeep.audit(endpoint)
         endpoint.health.pid = pid

@@ -27,6 +27,7 @@ class Upkeep:
 
     def __init__(self, context: Context, nodes: NodeClient) -> None:
         self._context, self._nodes = context, nodes
+        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
 
     async def register(self, held: Sequence[Held]) -> None:
         """Register again what the master has lost. Raises Unreachable.
@@ -104,18 +105,20 @@ class Upkeep:
             [upkeep.unregister_call(endpoint, one, addressing) for one in held]
         )
 
-    async def come_back(self, endpoint: Endpoint) -> None:
-        """Register a node again that was cleaned up and answers after all. Raises Unreachable."""
-        pid = endpoint.health.pid
+    async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
+        """Register a node again that was cleaned up and answers after all, as process ``pid``.
+
+        Raises Unreachable.
+        """
         said = await self._nodes.describe(endpoint.slave)
-        answer = await self._nodes.probe(endpoint.slave)
         if said is None:
             return
-        kept = upkeep.still_held(endpoint, said.published, said.subscribed, answer.pid == pid)
+        same = pid == endpoint.health.pid
+        kept = upkeep.still_held(endpoint, said.published, said.subscribed, same)
         for held in list(endpoint.registrations.values()):
             if held not in kept and held.since < endpoint.health.cleaned_at:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
-        endpoint.health.pid, endpoint.health.cleaned = answer.pid, False
+        endpoint.health.pid, endpoint.health.cleaned = pid, False
         await self.register([(endpoint, held) for held in kept])
         log.info("%s is back: %d registrations made again", endpoint.label, len(kept))
 
@@ -140,43 +143,38 @@ class Upkeep:
         graph = await read_graph(self._context.upstream)
         publishers = graph.by_topic(Kind.PUBLISHER)
         subscribers = graph.by_topic(Kind.SUBSCRIBER)
-        limit = asyncio.Semaphore(PARALLEL_CALLS)
         calls = [
-            self._tell(limit, topic, uri, publishers.get(topic, []))
+            self._tell(topic, uri, publishers.get(topic, []))
             for topic in topics
             for uri in subscribers.get(topic, [])
         ]
         await asyncio.gather(*calls)
 
-    async def _tell(
-        self, limit: asyncio.Semaphore, topic: str, subscriber: str, publishers: list[str]
-    ) -> None:
+    async def _tell(self, topic: str, subscriber: str, publishers: list[str]) -> None:
         endpoint = self._context.addressing.stands_for(subscriber)
         where = endpoint.slave if endpoint else parse_slave_uri(subscriber)
         if where is None:
             return
         asker = self._context.node_asker(endpoint) if endpoint else OUTSIDER
         left = upkeep.reached_directly(publishers, asker, self._context.addressing)
-        async with limit:
-            await self._update(where, topic, left)
+        await self._update(where, topic, left)
 
     async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
-        limit = asyncio.Semaphore(PARALLEL_CALLS)
-        await asyncio.gather(*(self._tell_all(limit, item, uris) for item, uris in updates))
+        await asyncio.gather(*(self._tell_all(item, uris) for item, uris in updates))
 
-    async def _tell_all(self, limit: asyncio.Semaphore, item: Held, uris: list[str]) -> None:
+    async def _tell_all(self, item: Held, uris: list[str]) -> None:
         endpoint, held = item
         asker = self._context.node_asker(endpoint)
         publishers = self._context.addressing.import_slaves(uris, asker)
-        async with limit:
-            await self._update(endpoint.slave, held.name, publishers)
+        await self._update(endpoint.slave, held.name, publishers)
 
     async def _update(self, where: HostPort, topic: str, publishers: list[str]) -> None:
         body = xmlrpc.dump_call("publisherUpdate", "/master", topic, publishers)
-        try:
-            await self._context.upstream.node(where, body, self._context.settings.probe_timeout)
-        except Unreachable as error:
-            log.debug("publisherUpdate of %s: %s", topic, error)
+        async with self._limit:
+            try:
+                await self._context.upstream.node(where, body, self._context.settings.probe_timeout)
+            except Unreachable as error:
+                log.debug("publisherUpdate of %s: %s", topic, error)
 
 
 def _current(item: Held) -> bool:
