@@ -50,7 +50,7 @@ class AdminClient:
     def _ask(self, method: str, path: str, within: float) -> str:
         connection = http.client.HTTPConnection(self.where.host, self.where.port, timeout=within)
         try:
-            connection.request(method, path)
+            connection.request(method, path, headers=_authorization())
             reply = connection.getresponse()
             text = reply.read(MAX_REPLY).decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
@@ -77,6 +77,12 @@ class AdminClient:
             "(docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
             "http://HOST:PORT or ROSPROXY_ADMIN"
         )
+
+
+def _authorization() -> dict[str, str]:
+    """What lets callers change things that are not on the proxy's own loopback."""
+    token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
+    return {"Authorization": f"Bearer {token}"} if token.isascii() and token.isprintable() else {}
 
 
 def default_url() -> str:

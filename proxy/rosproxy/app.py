@@ -8,7 +8,9 @@ from typing import Any
 from rosproxy import limits, listeners
 from rosproxy.acceptor import Acceptor, first_bytes
 from rosproxy.admin import Admin
+from rosproxy.containers import Containers, Parts
 from rosproxy.context import make_context
+from rosproxy.core.admin_bodies import read_master_address
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.settings import SettingError, Settings
 from rosproxy.core.tcpros import speaks_http
@@ -19,10 +21,12 @@ from rosproxy.leases import Leases
 from rosproxy.master_service import MasterService, PublishedMaster
 from rosproxy.master_watch import MasterWatch
 from rosproxy.metrics import StateCollector
+from rosproxy.mirror import TIDY_INTERVAL, Mirror
 from rosproxy.node_client import NodeClient
 from rosproxy.range_probe import probe_range
 from rosproxy.slave_service import SlaveService
 from rosproxy.status import describe
+from rosproxy.strays import Strays
 from rosproxy.tcpros_service import RATE_INTERVAL, TcprosService
 from rosproxy.upkeep import Upkeep
 
@@ -41,22 +45,27 @@ class App:
         nodes = NodeClient(context.upstream, settings.probe_timeout)
         self._tcpros = TcprosService(context, nodes)
         self._leases = Leases(context, nodes, self._connection, self._close_port)
-        self._upkeep = Upkeep(context, nodes)
+        self._mirror = Mirror(context)
+        self._upkeep = Upkeep(context, nodes, self._mirror)
         self._keeper = Keeper(context, self._leases, nodes, self._upkeep)
         self._watch = MasterWatch(context, self._keeper, self._upkeep)
+        self._strays = Strays(context, self._leases, nodes, self._upkeep)
         self._slaves = XmlRpcServer(
-            SlaveService(context, self._leases), "rosproxy: slave API of a ROS node behind it\n"
+            SlaveService(context, self._leases, self._mirror, self._strays.spared),
+            "rosproxy: slave API of a ROS node behind it\n",
         )
         self._servers = [self._slaves]
         self._acceptors: list[Acceptor] = []
-        self._admin = Admin(context.metrics.registry, self.status, self._unready, self._probe)
+        self._admin = self._make_admin(nodes)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         self._check_bind()
         self._reserve_range()
         settings = self.settings
-        master = MasterService(self.context, self._leases, self._watch.recovered)
+        master = MasterService(
+            self.context, self._leases, self._mirror, self._watch.recovered, self._strays.heed
+        )
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
@@ -68,6 +77,7 @@ class App:
         repeat(self._watch.look, settings.master_interval, "watching the master")
         repeat(self._keeper.look, TICK, "looking after nodes")
         repeat(self._leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
+        repeat(self._mirror.tidy, TIDY_INTERVAL, "looking after mirrored ports")
         repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
@@ -79,22 +89,59 @@ class App:
         for endpoint in self.context.registry:
             self._leases.close(endpoint)
         self.context.bank.close_all()
+        self._mirror.close()
         await self.context.tasks.cancel()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), *servers)
+        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), self._mirror.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return describe(self.context, self._watch, self._tcpros)
+        return describe(self.context, self._watch, self._tcpros, self._mirror)
+
+    def _make_admin(self, nodes: NodeClient) -> Admin:
+        parts = Parts(
+            self.context,
+            self._leases,
+            nodes,
+            self._upkeep,
+            self._strays,
+            self._watch.recovered,
+            self._tcpros.cut,
+        )
+        containers = Containers(parts)
+        actions = {
+            "/probe": self._probe,
+            "/containers": containers.hear,
+            "/master-address": self._set_master_address,
+            "/retire": containers.retire,
+        }
+        return Admin(
+            self.context.metrics.registry,
+            self.status,
+            self._unready,
+            actions,
+            self.settings.admin_token,
+        )
 
     def _unready(self) -> str | None:
+        if self.context.retired:
+            return "retired: nothing is registered any more"
         if self._watch.up:
             return None
         return self._watch.error or f"master {self.settings.master_uri} was not asked yet"
 
-    async def _probe(self) -> dict[str, Any]:
+    async def _probe(self, body: Any) -> dict[str, Any]:
         return await probe_range(self.context)
+
+    async def _set_master_address(self, body: Any) -> dict[str, Any]:
+        """``POST /master-address``: where the master is looked for from now on."""
+        address, upstream = read_master_address(body), self.context.upstream
+        if address != upstream.master_address:
+            log.info("master %s is looked for at %s", self.settings.master_uri, address)
+            upstream.master_address = address
+            self.context.tasks.spawn(self._watch.look(), "looking for the master")
+        return {"address": address}
 
     async def _connection(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
         """Serve a connection to a lease: XML-RPC or TCPROS, by its first bytes."""
@@ -155,6 +202,7 @@ class App:
             self.context.registry,
             self._tcpros.traffic,
             lambda: len(self._tcpros.relays),
+            lambda: len(self._mirror),
             lambda: bool(self._watch.up),
         )
 

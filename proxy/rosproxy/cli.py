@@ -72,6 +72,11 @@ def main() -> None:
 )
 @click.option("--master-uri", envvar="ROS_MASTER_URI", metavar="URI", help="The real ROS master.")
 @click.option(
+    "--master-address",
+    metavar="ADDRESS",
+    help="IP address of the master's host, to use instead of resolving its name.",
+)
+@click.option(
     "--advertise-host",
     metavar="HOST",
     help="Name or address under which outside nodes and the master reach this host.",
@@ -102,6 +107,12 @@ def main() -> None:
     default="127.0.0.1:11312",
     metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz, /metrics and /status are served.",
+)
+@click.option(
+    "--admin-token",
+    metavar="TOKEN",
+    help="Lets callers that know it change things at --admin-bind, not only those on loopback. "
+    "Better given as a variable: command lines can be seen by everybody.",
 )
 @click.option(
     "--inside-network",
@@ -232,6 +243,13 @@ def health(admin: Any) -> None:
     help="The advertised host if the proxy can't be asked for it.",
 )
 @click.option(
+    "--master-address",
+    envvar="ROSPROXY_MASTER_ADDRESS",
+    default="",
+    metavar="ADDRESS",
+    help="The IP address of the master's host if the proxy can't be asked for it.",
+)
+@click.option(
     "--outside",
     is_flag=True,
     help="Look from here as a machine outside does, for example from a robot; ask no proxy.",
@@ -242,6 +260,7 @@ def doctor(
     admin: Any,
     master_uri: str,
     advertise_host: str,
+    master_address: str,
     outside: bool,
     as_json: bool,
 ) -> None:
@@ -255,7 +274,7 @@ def doctor(
     is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
     something is.
     """
-    from rosproxy.core.uris import parse_slave_uri
+    from rosproxy.core.uris import parse_address, parse_slave_uri
     from rosproxy.doctor import examine
     from rosproxy.survey import Patient
 
@@ -264,7 +283,11 @@ def doctor(
     if master_uri and parse_slave_uri(master_uri) is None:
         raise click.UsageError(f"--master-uri: {master_uri!r} is not of the form http://host:11311")
     absolute = tuple(f"/{name.strip('/')}" for name in names)
-    patient = Patient(None if outside else admin, master_uri, advertise_host, absolute)
+    if master_address and parse_address(master_address) is None:
+        raise click.UsageError(f"--master-address: {master_address!r} is not an IP address")
+    patient = Patient(
+        None if outside else admin, master_uri, advertise_host, absolute, master_address or None
+    )
     sys.exit(examine(patient, as_json))
 
 

@@ -30,7 +30,7 @@ def watch_status(admin: AdminClient) -> None:
                 text = render(admin.status(), columns, lines)
             except AdminError as error:
                 text = f"{time.strftime('%H:%M:%S')} {error}"
-            _draw(text)
+            draw(text)
             time.sleep(WATCH_INTERVAL)
     except KeyboardInterrupt:
         write("")
@@ -43,7 +43,7 @@ def write(text: str) -> None:
     sys.stdout.flush()
 
 
-def _draw(text: str) -> None:
+def draw(text: str) -> None:
     """Draw over the last drawing where that is possible, without flicker."""
     if not sys.stdout.isatty():
         write(text + "\n")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.core.addressing import Addressing, Asker, Network
+from rosproxy.core.recovery import allowed
 from rosproxy.core.registry import Endpoint, Registry
 from rosproxy.core.settings import Settings
 from rosproxy.listeners import PortBank
@@ -32,21 +33,29 @@ class Context:
     tasks: Tasks
     instance: str
     problems: Problems = field(default_factory=Problems)
+    retired: bool = False
+    """Whether nothing is registered any more, neither for nodes nor by the proxy itself."""
     _networks: tuple[float, Sequence[Network]] = (0.0, ())
 
     def now(self) -> float:
         """Seconds of the monotonic clock."""
         return time.monotonic()
 
-    def refresh_networks(self) -> None:
-        """Take in the networks that the proxy's interfaces are in now."""
-        if self.settings.inside_networks:
-            self.addressing.networks = self.settings.inside_networks
-            return
+    def refresh_networks(self, source: str = "") -> None:
+        """Take in the networks that the proxy's interfaces are in now.
+
+        They are read every few seconds, and at once where a call comes from a ``source`` in none
+        of them: containers join networks while they run.
+        """
         read, _ = self._networks
-        if self.now() - read > NETWORKS_TTL:
-            self._networks = (self.now(), interface_networks())
-            self.addressing.networks = self._networks[1]
+        unknown = source and not allowed(source, self.addressing.networks)
+        if unknown or self.now() - read > NETWORKS_TTL:
+            self.read_networks()
+
+    def read_networks(self) -> None:
+        """The same at once."""
+        self._networks = (self.now(), self.settings.inside_networks or interface_networks())
+        self.addressing.networks = self._networks[1]
 
     def node_asker(self, endpoint: Endpoint) -> Asker:
         """The node of an endpoint as somebody who is given addresses."""
@@ -64,7 +73,7 @@ def make_context(settings: Settings) -> Context:
         registry=registry,
         addressing=Addressing(registry, settings.advertise_host, settings.ports),
         bank=PortBank(settings.bind),
-        upstream=Upstream(settings.master_uri, instance, metrics),
+        upstream=Upstream(settings.master_uri, instance, metrics, settings.master_address),
         metrics=metrics,
         tasks=Tasks(),
         instance=instance,

@@ -83,6 +83,10 @@ class XmlRpcServer:
         alive = [known for known in self._by_port.get(port, []) if known.transport is not None]
         self._by_port[port] = [*alive, handler]
 
+    def connections(self, port: int) -> int:
+        """How many connections are open that came in on a port."""
+        return sum(handler.transport is not None for handler in self._by_port.get(port, ()))
+
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
         for handler in self._by_port.pop(port, []):

@@ -2,11 +2,12 @@
 
 import asyncio
 import logging
+from dataclasses import replace
 
 from rosproxy.context import Context
 from rosproxy.core.liveness import Change, Probe
 from rosproxy.core.recovery import Claim, allowed, confirmed_by
-from rosproxy.core.registry import Endpoint, Place
+from rosproxy.core.registry import Endpoint
 from rosproxy.core.uris import HostPort
 from rosproxy.leases import Leases
 from rosproxy.names import resolve
@@ -21,6 +22,9 @@ TICK = 0.25
 FORGET_AFTER = 3600.0
 """Seconds after which a node that was cleaned up while it was silent is forgotten."""
 PARALLEL_PROBES = 64
+DIRECT_INTERVAL = 2.0
+"""Seconds between probes, at most, of a node that registered around the proxy."""
+AT_ONCE = 0.001
 
 
 class Keeper:
@@ -33,6 +37,8 @@ class Keeper:
 
     async def look(self) -> None:
         """Look after all endpoints once."""
+        if self._context.retired:
+            return
         for endpoint in self._context.registry:
             self._probe_if_due(endpoint)
             self._maybe_end(endpoint)
@@ -61,7 +67,10 @@ class Keeper:
 
     async def probe(self, endpoint: Endpoint) -> None:
         """Probe an endpoint and act on the result."""
-        answer = await self._nodes.probe(endpoint.slave)
+        where = endpoint.slave
+        answer = await self._nodes.probe(where)
+        if endpoint.slave != where:
+            return  # it has moved meanwhile
         failing = endpoint.health.failures > 0
         change = endpoint.health.note(answer.probe, self._context.now())
         if answer.probe is Probe.ANSWERED:
@@ -71,14 +80,26 @@ class Keeper:
         elif change is Change.DOWN:
             self._report_down(endpoint, answer.reason)
             self._leases.close(endpoint)
-        if endpoint.health.clean_up(self._context.now(), self._context.settings.cleanup_after):
+        if endpoint.health.clean_up(self._context.now(), self._patience(endpoint)):
             await self._upkeep.clean_up(endpoint)
 
     def _probe_if_due(self, endpoint: Endpoint) -> None:
-        due = endpoint.health.due(self._context.now(), self._context.settings.probe_interval)
+        interval = self._context.settings.probe_interval
+        if endpoint.direct:
+            interval = min(interval, DIRECT_INTERVAL)
+        due = endpoint.health.due(self._context.now(), interval)
         if due and endpoint not in self._probing:
             self._probing.add(endpoint)
             self._context.tasks.spawn(self._probe(endpoint), f"probe of {endpoint.uri}")
+
+    def _patience(self, endpoint: Endpoint) -> float:
+        """Seconds for which a node that is down keeps its registrations; 0: for ever.
+
+        One that registered around the proxy has unregistered there as well, to no effect; so it
+        keeps nothing once it has ended.
+        """
+        after = self._context.settings.cleanup_after
+        return min(after, AT_ONCE) if endpoint.direct and endpoint.health.refused else after
 
     async def _probe(self, endpoint: Endpoint) -> None:
         try:
@@ -101,6 +122,8 @@ class Keeper:
             await self._upkeep.come_back(endpoint, pid)
         elif endpoint.health.pid not in (None, pid):
             await self._upkeep.audit(endpoint)
+        elif endpoint.direct:
+            await self._upkeep.reconcile(endpoint)
         endpoint.health.pid = pid
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label)
@@ -113,9 +136,10 @@ class Keeper:
 
     async def _name(self, endpoint: Endpoint) -> None:
         """Find out whether neighbours can use a recovered node's host name."""
-        place = endpoint.place
-        named = place.address in await resolve(endpoint.node.host)
-        endpoint.place = Place(place.address, named, place.confirmed)
+        address = endpoint.place.address
+        addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
+        if endpoint.place.address == address:
+            endpoint.place = replace(endpoint.place, named=address in addresses)
 
     def _maybe_end(self, endpoint: Endpoint) -> None:
         now, health = self._context.now(), endpoint.health
@@ -125,7 +149,7 @@ class Keeper:
         if endpoint.idle_since is None:
             endpoint.idle_since = now
         linger = self._context.settings.linger
-        if health.cleaned and not health.refused:
+        if health.cleaned and not (health.refused or health.over):
             linger = FORGET_AFTER
         if now - endpoint.idle_since >= linger:
             log.info("port %d is free again: %s", endpoint.port, endpoint.uri)

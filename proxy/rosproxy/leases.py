@@ -18,6 +18,7 @@ from rosproxy.node_client import NodeClient
 
 log = logging.getLogger(__name__)
 
+RETIRED = "rosproxy: this proxy has been retired and registers nothing any more"
 Connection = Callable[[Endpoint, socket.socket, str], Awaitable[None]]
 """Serves a connection to an endpoint's port; the last argument is the peer's address."""
 
@@ -51,6 +52,8 @@ class Leases:
         uri = registering_uri(call)
         if uri is None:
             return None
+        if self._context.retired:
+            return Refusal(RETIRED)
         endpoint = self._context.registry.admitted(uri, asker.address)
         if endpoint is not None:
             self._welcome_back(endpoint, asker)
@@ -113,15 +116,21 @@ class Leases:
 
     async def _admit_new(self, uri: str, node: HostPort, asker: Asker) -> Admission:
         place = await self._place(node, asker.address)
+        endpoint = self.take_in(uri, node, place, asker)
+        if isinstance(endpoint, Endpoint):
+            greeting = self._greet(endpoint, asker.caller_id)
+            self._context.tasks.spawn(greeting, f"first probe of {uri}")
+        return endpoint
+
+    def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
+        """The endpoint of a node found at a place, its port open; a refusal if none is left."""
         try:
-            endpoint = self._lease(uri, node, place, asker.address)
+            return self._lease(uri, node, place, asker.address)
         except RangeExhausted as error:
             self._context.metrics.exhausted.inc()
             self._context.problems.add(asker.caller_id, str(error))
             log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
             return Refusal(str(error))
-        self._context.tasks.spawn(self._greet(endpoint, asker.caller_id), f"first probe of {uri}")
-        return endpoint
 
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
         """A node that registers is alive, whatever was believed of it."""
@@ -160,7 +169,7 @@ class Leases:
 
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""
-        addresses = await resolve(node.host)
+        addresses = await resolve(self._context.upstream.reach(node).host)
         elsewhere = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not elsewhere:
             return Place(source, named=source in addresses)

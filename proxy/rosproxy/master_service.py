@@ -5,12 +5,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from rosproxy.context import Context
-from rosproxy.core import master_api, xmlrpc
+from rosproxy.core import master_api, mirror, xmlrpc
 from rosproxy.core.addressing import Asker
 from rosproxy.core.master_api import Answer, Request
 from rosproxy.core.registry import Endpoint
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
+from rosproxy.mirror import Mirror
 from rosproxy.upstream import Unreachable
 
 log = logging.getLogger(__name__)
@@ -20,13 +21,20 @@ class MasterService:
     """Forwards master API calls, rewritten, and keeps the registry in step with the master.
 
     ``recovered`` waits until the registry is rebuilt: a node that registered before would get
-    another port, and the master would shut it down for having moved.
+    another port, and the master would shut it down for having moved. ``heed`` is told of each
+    name that is going to register at an endpoint.
     """
 
     def __init__(
-        self, context: Context, leases: Leases, recovered: Callable[[], Awaitable[None]]
+        self,
+        context: Context,
+        leases: Leases,
+        mirror: Mirror,
+        recovered: Callable[[], Awaitable[None]],
+        heed: Callable[[Endpoint, str], Awaitable[None]],
     ) -> None:
-        self._context, self._leases, self._recovered = context, leases, recovered
+        self._context, self._leases, self._mirror = context, leases, mirror
+        self._recovered, self._heed = recovered, heed
 
     async def __call__(self, call: Call) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
@@ -49,7 +57,7 @@ class MasterService:
         if request.plain:
             return await self._context.upstream.master(request.body)
         await self._recovered()
-        self._context.refresh_networks()
+        self._context.refresh_networks(request.asker.address)
         pending: list[Endpoint] = []
         try:
             for call in request.calls:  # one after the other: they may register the same new node
@@ -57,6 +65,7 @@ class MasterService:
                 request.admissions.append(admission)
                 if isinstance(admission, Endpoint):
                     pending.append(admission)
+                    await self._heed(admission, call.string(0) or "" if call else "")
             return await self._forward(request)
         finally:
             for endpoint in pending:
@@ -70,6 +79,7 @@ class MasterService:
         reply = await self._context.upstream.master(body)
         answer = master_api.read_answer(request, reply)
         self._note(answer, request.asker)
+        await self._mirror.hand_over(mirror.answered(answer))
         return master_api.import_answer(request, answer, self._context.addressing)
 
     def _note(self, answer: Answer, asker: Asker) -> None:

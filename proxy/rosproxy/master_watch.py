@@ -142,6 +142,9 @@ class MasterWatch:
             if endpoint.trusted and not endpoint.health.cleaned and not endpoint.health.down
         }
         lost = recovery.lost(list(ours), state, started)
+        unsettled = [e for e in self._context.registry if e.unsettled and not e.health.down]
+        if unsettled:
+            await self._upkeep.resettle(unsettled)
         if lost:
             log.warning("the master has lost %d registrations; making them again", len(lost))
             await self._upkeep.register([(ours[held], held) for held in lost])

@@ -125,10 +125,12 @@ class StateCollector(Collector):
         registry: Registry,
         totals: Callable[[], Traffic],
         open_connections: Callable[[], int],
+        mirrored: Callable[[], int],
         master_up: Callable[[], bool],
     ) -> None:
         self._registry, self._totals = registry, totals
-        self._open_connections, self._master_up = open_connections, master_up
+        self._open_connections, self._mirrored = open_connections, mirrored
+        self._master_up = master_up
 
     def collect(self) -> Iterable[Metric]:
         """All state metrics."""
@@ -137,6 +139,11 @@ class StateCollector(Collector):
         yield _gauge("leases_free", "Ports left for inside nodes.", pool.free)
         yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
         yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())
+        yield _gauge(
+            "mirrored_ports",
+            "Ports that stand in for nodes on the master's host.",
+            self._mirrored(),
+        )
         yield _gauge("master_up", "Whether the master answers.", int(self._master_up()))
         yield self._endpoints()
         yield self._bytes()

@@ -34,7 +34,10 @@ async def resolve(host: str) -> list[str]:
 
 
 class Resolver(AbstractResolver):
-    """The same for aiohttp's client."""
+    """The same for aiohttp's client; ``last`` is the address that it found last."""
+
+    def __init__(self) -> None:
+        self.last: str | None = None
 
     async def resolve(
         self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_UNSPEC
@@ -43,6 +46,7 @@ class Resolver(AbstractResolver):
         addresses = await resolve(host)
         if not addresses:
             raise OSError(None, f"host name {host} can't be resolved")
+        self.last = addresses[0]
         return [_result(host, port, address) for address in addresses]
 
     async def close(self) -> None:

@@ -43,10 +43,10 @@ class NodeClient:
     def __init__(self, upstream: Upstream, within: float) -> None:
         self._upstream, self._within = upstream, within
 
-    async def probe(self, where: HostPort) -> Answer:
+    async def probe(self, where: HostPort, within: float | None = None) -> Answer:
         """Call ``getPid``; anything but a ROS triple with a number is no node."""
         try:
-            pid = await self._upstream.ask_node(where, self._within, "getPid")
+            pid = await self._upstream.ask_node(where, within or self._within, "getPid")
         except Unreachable as error:
             return Answer(error.probe, reason=str(error))
         except MasterError as error:

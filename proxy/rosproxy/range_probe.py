@@ -92,16 +92,16 @@ async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
     result = {"port": trial.port, "advertised": str(trial.where)}
     acceptor = Acceptor(context.tasks, context.bank.open(trial.port), trial.greet)
     try:
-        mine, masters = await asyncio.gather(_dial(trial), _ask_master(context, trial))
+        mine, masters = await asyncio.gather(_dial(context, trial), _ask_master(context, trial))
     finally:
         acceptor.stop()
         context.bank.close(trial.port, acceptor.sock)
     return {**result, "from_proxy": mine, "from_master": masters}
 
 
-async def _dial(trial: _Trial) -> str:
+async def _dial(context: Context, trial: _Trial) -> str:
     """Connect through the advertised address and see who answers."""
-    addresses = await resolve(trial.where.host)
+    addresses = await resolve(context.upstream.reach(trial.where).host)
     if not addresses:
         return "unresolvable"
     try:

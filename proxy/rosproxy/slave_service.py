@@ -2,10 +2,10 @@
 
 import asyncio
 import logging
-from urllib.parse import urlsplit
+from collections.abc import Awaitable, Callable
 
 from rosproxy.context import Context
-from rosproxy.core import multicall, slave_api, xmlrpc
+from rosproxy.core import mirror, multicall, slave_api, strays, xmlrpc
 from rosproxy.core.liveness import Change, Probe
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
@@ -13,7 +13,7 @@ from rosproxy.core.slave_api import TopicPort, Visit
 from rosproxy.core.uris import HostPort, parse_inside_path
 from rosproxy.http_server import Call
 from rosproxy.leases import Leases
-from rosproxy.names import resolve
+from rosproxy.mirror import Mirror
 from rosproxy.upstream import Unreachable
 
 log = logging.getLogger(__name__)
@@ -23,10 +23,20 @@ REGISTRATION_GRACE = 0.5
 
 
 class SlaveService:
-    """Forwards slave API calls to the node behind the port at which they arrive."""
+    """Forwards slave API calls to the node behind the port at which they arrive.
 
-    def __init__(self, context: Context, leases: Leases) -> None:
-        self._context, self._leases = context, leases
+    ``spared`` tells whether a node is to be kept from a ``shutdown`` by somebody for a reason.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases,
+        mirror: Mirror,
+        spared: Callable[[Endpoint, str, str], Awaitable[bool]],
+    ) -> None:
+        self._context, self._leases, self._mirror = context, leases, mirror
+        self._spared = spared
 
     async def __call__(self, call: Call) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
@@ -76,18 +86,29 @@ class SlaveService:
         return reply
 
     async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+        if await self._is_void(endpoint, parsed):
+            return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.rewritten(parsed):
             return await self._ask(endpoint, call.body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
+            await self._mirror.hand_over(mirror.announced(parsed))
         self._context.refresh_networks()
         visit = self._visit(endpoint, call)
         addressing = self._context.addressing
-        reply = await self._ask(
-            endpoint, slave_api.import_call(call.body, parsed, visit, addressing)
-        )
+        body = self._mirror.toward_inside(call.body, parsed)
+        reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
         self._note_port(endpoint, slave_api.topic_port(parsed, reply))
         return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
+        """Whether a call only follows from how a node came to be behind the proxy."""
+        if parsed.method == "shutdown":
+            return await self._spared(endpoint, parsed.string(0) or "", parsed.string(1) or "")
+        if parsed.method != "publisherUpdate":
+            return False
+        topic, uris = parsed.string(1) or "", mirror.announced(parsed)
+        return strays.outdated(topic, uris, self._context.addressing, self._context.now())
 
     async def _after_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach the node first.
@@ -132,7 +153,7 @@ class SlaveService:
         return Visit(self._context.node_asker(endpoint), reached, self._context.settings.master_uri)
 
     async def _may(self, method: str, source: str) -> bool:
-        settings = self._context.settings
-        if settings.slave_control == "any" or method not in slave_api.MASTER_ONLY:
+        anybody = self._context.settings.slave_control == "any"
+        if anybody or method not in slave_api.MASTER_ONLY:
             return True
-        return source in await resolve(urlsplit(settings.master_uri).hostname or "")
+        return source in await self._context.upstream.master_addresses()

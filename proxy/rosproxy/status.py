@@ -10,12 +10,15 @@ from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.master_watch import MasterWatch
 from rosproxy.metrics import state_of
+from rosproxy.mirror import Mirror
 from rosproxy.problems import Problem
 from rosproxy.relay import Relay
 from rosproxy.tcpros_service import TcprosService
 
 
-def describe(context: Context, watch: MasterWatch, tcpros: TcprosService) -> dict[str, Any]:
+def describe(
+    context: Context, watch: MasterWatch, tcpros: TcprosService, mirror: Mirror
+) -> dict[str, Any]:
     """Everything that ``rosproxy status`` and ``rosproxy doctor`` show.
 
     Times are seconds, rates bytes per second; ``sent`` is what went outside.
@@ -28,10 +31,12 @@ def describe(context: Context, watch: MasterWatch, tcpros: TcprosService) -> dic
         "version": __version__,
         "pid": os.getpid(),
         "instance": context.instance,
+        "retired": context.retired,
         "uptime": round(context.now() - context.metrics.started, 1),
         "settings": _settings(context),
         "master": _master(context, watch),
         "ports": _ports(context),
+        "mirrored": mirror.status(),
         "nodes": [_node(context, e, relays.get(e.port, [])) for e in endpoints],
         "problems": [_problem(problem) for problem in context.problems.all()],
     }
@@ -53,6 +58,8 @@ def _settings(context: Context) -> dict[str, Any]:
 def _master(context: Context, watch: MasterWatch) -> dict[str, Any]:
     return {
         "uri": context.settings.master_uri,
+        "address": context.upstream.reached_at,
+        "pinned": context.upstream.master_address is not None,
         "up": bool(watch.up),
         "error": watch.error,
         "pid": watch.pid,

@@ -41,13 +41,15 @@ Result = TypeVar("Result")
 class Patient:
     """What to look at: the admin endpoint, and what is known in case that it doesn't answer.
 
-    Without ``admin`` no proxy is asked: the look of an outside machine.
+    Without ``admin`` no proxy is asked: the look of an outside machine. ``master_address`` is the
+    IP address at which the master's host is reached whatever its name leads to.
     """
 
     admin: AdminClient | None
     master_uri: str = ""
     advertise_host: str = ""
     names: tuple[str, ...] = ()
+    master_address: str | None = None
 
 
 async def survey(patient: Patient) -> Facts:
@@ -59,19 +61,23 @@ async def survey(patient: Patient) -> Facts:
         names=patient.names,
     )
     if patient.admin is None:
-        return await _beyond(facts, patient.master_uri, "")
+        return await _beyond(facts, _Target(patient.master_uri))
     try:
         return await _with_proxy(facts, patient.admin)
     except AdminError as error:
         facts = replace(facts, admin_error=str(error))
-        return await _beyond(facts, patient.master_uri, "")
+        return await _beyond(facts, _Target(patient.master_uri, "", patient.master_address))
 
 
 async def _with_proxy(facts: Facts, admin: AdminClient) -> Facts:
     status = await asyncio.to_thread(admin.status)
     host = status["settings"]["advertise_host"]
     facts = replace(facts, admin=admin.url, status=status, advertise_host=host)
-    beyond = asyncio.create_task(_beyond(facts, status["master"]["uri"], status["instance"]))
+    master = status["master"]
+    target = _Target(
+        master["uri"], status["instance"], master["address"] if master["pinned"] else None
+    )
+    beyond = asyncio.create_task(_beyond(facts, target))
     probe, reason = await _probe(admin)
     return replace(await beyond, probe=probe, probe_error=reason)
 
@@ -84,11 +90,21 @@ async def _probe(admin: AdminClient) -> tuple[dict[str, Any] | None, str]:
         return None, str(error)
 
 
-async def _beyond(facts: Facts, master_uri: str, instance: str) -> Facts:
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """The master to ask, in the name of which proxy, and its host's address if that is given."""
+
+    uri: str
+    instance: str = ""
+    address: str | None = None
+
+
+async def _beyond(facts: Facts, target: _Target) -> Facts:
     """What the master and the nodes say."""
-    if not master_uri:
+    if not target.uri:
         return facts
-    async with _upstream(master_uri, instance) as master, _upstream(master_uri, "doctor") as nodes:
+    as_doctor = replace(target, instance="doctor")
+    async with _upstream(target) as master, _upstream(as_doctor) as nodes:
         survey = _Survey(master, nodes)
         facts = replace(
             facts,
@@ -102,8 +118,8 @@ async def _beyond(facts: Facts, master_uri: str, instance: str) -> Facts:
 
 
 @contextlib.asynccontextmanager
-async def _upstream(master_uri: str, instance: str) -> AsyncIterator[Upstream]:
-    upstream = Upstream(master_uri, instance, Metrics())
+async def _upstream(target: _Target) -> AsyncIterator[Upstream]:
+    upstream = Upstream(target.uri, target.instance, Metrics(), target.address)
     try:
         yield upstream
     finally:
@@ -124,8 +140,7 @@ class _Survey:
     async def master(self) -> Master:
         """Look at the master: its name, its answer, its path, and whether it is the proxy."""
         uri = self._master.master_uri
-        host = urlsplit(uri).hostname or ""
-        found = Master(uri, addresses=tuple(await resolve(host)))
+        found = Master(uri, addresses=tuple(await self._master.master_addresses()))
         if not found.addresses:
             return replace(found, attempt=Attempt(Reach.UNRESOLVABLE))
         started = time.monotonic()
@@ -222,7 +237,7 @@ class _Survey:
         if where is None or facts.ours(where):
             return node
         async with self._limit:
-            addresses = tuple(await resolve(where.host))
+            addresses = tuple(await resolve(self._nodes.reach(where).host))
             attempt = await self._pid(where) if addresses else Attempt(Reach.UNRESOLVABLE)
         return replace(node, addresses=addresses, attempt=attempt)
 
@@ -267,7 +282,7 @@ class _Survey:
         if facts.ours(node.where):
             return str(target), Attempt()
         probe = {"callerid": CALLER_ID, "topic": topic, "type": "*", "md5sum": "*"}
-        return str(target), await _shake_hands(target, probe)
+        return str(target), await _shake_hands(self._nodes.reach(target), probe)
 
     async def _service(self, facts: Facts, service: str) -> Attempt:
         """Ask a service for its type, as rosservice does."""
@@ -279,7 +294,7 @@ class _Survey:
         if where is None:
             return Attempt(Reach.REFUSED, "its port is not held by a node")
         header = {"callerid": CALLER_ID, "service": service, "md5sum": "*", "probe": "1"}
-        return await _shake_hands(where, header)
+        return await _shake_hands(self._nodes.reach(where), header)
 
 
 def _door(facts: Facts, node: Node) -> HostPort | None:

@@ -1,26 +1,24 @@
 """TCPROS through a lease: read the connection header, find the node's port, relay."""
 
 import asyncio
-import contextlib
 import logging
 import socket
-from collections.abc import Callable
 
 from rosproxy.acceptor import read_header
 from rosproxy.context import Context
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.tcpros import HeaderError, decode_header, encode_header
-from rosproxy.core.uris import is_loopback
+from rosproxy.core.uris import HostPort, is_loopback
+from rosproxy.dialing import CONNECT_TIMEOUT, dial
 from rosproxy.metrics import Traffic
 from rosproxy.node_client import NodeClient
+from rosproxy.open_relays import OpenRelays
 from rosproxy.relay import Relay, reset_on_close
 
 log = logging.getLogger(__name__)
 
-CONNECT_TIMEOUT = 5.0
 RATE_INTERVAL = 2.0
-STOP_TIMEOUT = 1.0
 
 
 class TcprosService:
@@ -32,9 +30,7 @@ class TcprosService:
 
     def __init__(self, context: Context, nodes: NodeClient) -> None:
         self._context, self._nodes = context, nodes
-        self._relays: set[Relay] = set()
-        self._none_open = asyncio.Event()
-        self._none_open.set()
+        self._relays = OpenRelays()
         self._ended = Traffic()
         self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
 
@@ -72,13 +68,15 @@ class TcprosService:
             return
         self._start(endpoint, fields, conn, inside, peer)
 
+    def cut(self, port: int) -> None:
+        """End the connections through a port."""
+        for relay in self._relays:
+            if relay.port == port:
+                relay.end()
+
     async def stop(self) -> None:
         """End all connections."""
-        for relay in self.relays:
-            relay.end()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(STOP_TIMEOUT):
-                await self._none_open.wait()
+        await self._relays.stop()
 
     async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
         """A connection to the node; its port is asked for anew if the known one refuses."""
@@ -117,12 +115,9 @@ class TcprosService:
         kind = "service" if "service" in fields else "topic"
         name = self._registered_name(endpoint, kind, fields.get(kind, ""))
         relay = Relay(endpoint.port, kind, name, fields.get("callerid", ""), peer, conn, inside)
-        self._relays.add(relay)
-        self._none_open.clear()
         endpoint.connections += 1
         endpoint.idle_since = None
-        loop = asyncio.get_running_loop()
-        relay.start(lambda ended: _call_in(loop, lambda: self._finished(endpoint, ended)))
+        self._relays.start(relay, lambda ended: self._finished(endpoint, ended))
 
     def _registered_name(self, endpoint: Endpoint, kind: str, name: str) -> str:
         """The name if the node has registered it: a label that outsiders can't multiply."""
@@ -130,9 +125,6 @@ class TcprosService:
         return name if name in endpoint.names(wanted) else "unregistered"
 
     def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
-        self._relays.discard(relay)
-        if not self._relays:
-            self._none_open.set()
         endpoint.connections -= 1
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
@@ -164,20 +156,11 @@ class TcprosService:
 
 
 async def _dial(address: str, port: int) -> socket.socket | None:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_STREAM)
-    sock.setblocking(False)
     try:
-        async with asyncio.timeout(CONNECT_TIMEOUT):
-            await asyncio.get_running_loop().sock_connect(sock, (address, port))
+        return await dial(HostPort(address, port))
     except (OSError, TimeoutError) as error:
         log.debug("connecting to %s:%d: %s", address, port, error)
-        sock.close()
         return None
-    except BaseException:
-        sock.close()
-        raise
-    return sock
 
 
 async def _hand_on(header: bytes, inside: socket.socket) -> bool:
@@ -193,11 +176,3 @@ async def _hand_on(header: bytes, inside: socket.socket) -> bool:
         inside.close()
         raise
     return True
-
-
-def _call_in(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
-    """Run a function in the loop from a thread; not at all if the loop has ended."""
-    try:
-        loop.call_soon_threadsafe(function)
-    except RuntimeError:
-        log.debug("the event loop has ended before a relay")

@@ -2,22 +2,29 @@
 
 import asyncio
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from rosproxy.context import Context
-from rosproxy.core import upkeep, xmlrpc
+from rosproxy.core import strays, upkeep, xmlrpc
 from rosproxy.core.addressing import Asker
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
 from rosproxy.core.uris import HostPort, parse_slave_uri
 from rosproxy.master_graph import read_graph
+from rosproxy.mirror import Mirror
 from rosproxy.node_client import NodeClient, SelfDescription
+from rosproxy.reclaim import Reclaim
 from rosproxy.upstream import CALLER_ID, Unreachable
 
 log = logging.getLogger(__name__)
 
 Held = tuple[Endpoint, Registration]
+Former = Mapping[str, tuple[Endpoint, str]]
+"""Names with their endpoints, and the former URIs by which the master has them."""
 PARALLEL_CALLS = 32
+SETTLE_TIME = 2.0
+"""Seconds in which the master's news of a publisher that is registered anew come in."""
 OUTSIDER = Asker("", "")
 """A subscriber outside, who is given addresses as the master holds them."""
 
@@ -25,17 +32,44 @@ OUTSIDER = Asker("", "")
 class Upkeep:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, nodes: NodeClient) -> None:
-        self._context, self._nodes = context, nodes
+    def __init__(self, context: Context, nodes: NodeClient, mirror: Mirror) -> None:
+        self._context, self._nodes, self._mirror = context, nodes, mirror
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
+        self._reclaim = Reclaim(context)
 
     async def register(self, held: Sequence[Held]) -> None:
-        """Register again what the master has lost. Raises Unreachable.
+        """Register again what the master has lost. Raises Unreachable, MasterError.
 
-        A name that somebody else holds by now is left to them. Subscribers are handed the
-        publishers that the replies name.
+        A name that somebody else holds by now is left to them; what it holds with a former URI
+        of the same node is taken back first.
         """
-        wanted = [item for item in await self._not_superseded(held) if _current(item)]
+        await self._make(await self._not_superseded(held))
+
+    async def reclaim(self, former: Former) -> None:
+        """Register nodes anew that the master has by former URIs. Raises Unreachable, MasterError.
+
+        What it has of them that the registry has not is taken in.
+        """
+        await self._make(await self._reclaimed(former))
+
+    async def resettle(self, endpoints: Iterable[Endpoint]) -> None:
+        """Register nodes anew that have moved to another address. Raises Unreachable, MasterError.
+
+        Their own connections have lost their address: roscpp makes new ones if it is told that
+        the publishers have gone before it is told that they are there.
+        """
+        moved = list(endpoints)
+        topics = [(e, topic) for e in moved for topic in e.names(Kind.SUBSCRIBER)]
+        await asyncio.gather(*(self._update(e.slave, topic, []) for e, topic in topics))
+        await self.register([(e, held) for e in moved for held in e.registrations.values()])
+        for endpoint in moved:
+            endpoint.unsettled = False
+
+    async def _make(self, held: Sequence[Held]) -> None:
+        """Register at the master; subscribers are handed the publishers that the replies name."""
+        if self._context.retired:
+            return
+        wanted = sorted(filter(_current, held), key=lambda item: _ORDER.index(item[1].kind))
         calls = [upkeep.register_call(*item, self._context.addressing) for item in wanted]
         values = await self._context.upstream.batch(calls)
         updates = [
@@ -82,6 +116,18 @@ class Upkeep:
         self._context.metrics.cleanups.inc()
         log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
 
+    async def reconcile(self, endpoint: Endpoint) -> None:
+        """Make up for the calls that a node made around the proxy. Raises Unreachable, MasterError.
+
+        A service that it has unregistered stays until it ends: it can't be asked for those.
+        """
+        started = self._context.now()
+        said = await self._nodes.describe(endpoint.slave)
+        if said is not None:
+            gone = strays.vanished(endpoint, said.published, said.subscribed, started)
+            await self._forget(endpoint, gone)
+            await self.adopt(endpoint, said)
+
     async def audit(self, endpoint: Endpoint) -> None:
         """Take back what a former process left: topics that the node there does not have.
 
@@ -94,9 +140,12 @@ class Upkeep:
         endpoint.topic_ports.clear()
         endpoint.tcpros_port = said.tcpros_port
         stale = upkeep.left_over(endpoint, said.published, said.subscribed, started)
+        await self._forget(endpoint, stale)
+
+    async def _forget(self, endpoint: Endpoint, stale: Sequence[Registration]) -> None:
         await self._unregister(endpoint, stale)
         for held in stale:
-            log.info("%s is no longer at %s; taken back", held.caller_id, endpoint.uri)
+            log.info("%s of %s is no longer at %s", held.name, held.caller_id, endpoint.uri)
             self._context.registry.unregister(held.kind, held.name, held.caller_id)
 
     async def _unregister(self, endpoint: Endpoint, held: Sequence[Registration]) -> None:
@@ -128,15 +177,55 @@ class Upkeep:
             [("lookupNode", [CALLER_ID, name]) for name in names]
         )
         at_master = dict(zip(names, uris, strict=False))
-        kept = []
+        kept: list[Held] = []
+        former: dict[str, tuple[Endpoint, str]] = {}
         for endpoint, one in held:
             uri = at_master.get(one.caller_id)
             if uri in (None, self._context.addressing.advertised_uri(endpoint)):
                 kept.append((endpoint, one))
+            elif strays.known_as(endpoint, uri):
+                former[one.caller_id] = endpoint, uri
             else:
                 log.info("%s is registered as %s by now; left to it", one.caller_id, uri)
                 self._context.registry.drop_caller(endpoint, one.caller_id)
+        return kept + await self._reclaimed(former)
+
+    async def _reclaimed(self, former: Former) -> list[Held]:
+        """All that some names hold, once it is taken back at the master."""
+        if not former:
+            return []
+        (found, stuck), registry = await self._taken_back(former), self._context.registry
+        for name in stuck:
+            registry.drop_caller(former[name][0], name)
+        kept: list[Held] = []
+        for name, had in found.items():
+            endpoint = former[name][0]
+            for held in had:
+                if held.key not in endpoint.registrations:
+                    registry.register(endpoint, replace(held, since=self._context.now()))
+            mine = [held for held in endpoint.registrations.values() if held.caller_id == name]
+            kept += [(endpoint, held) for held in mine]
         return kept
+
+    async def _taken_back(self, former: Former) -> tuple[dict[str, list[Registration]], set[str]]:
+        """Take back what some names hold: what the master had of those now free, and the others."""
+        direct: dict[str, str] = {}
+        calls: list[upkeep.MethodCall] = []
+        for name, (endpoint, uri) in former.items():
+            endpoint.former_uris.add(uri)
+            if self._context.addressing.identify(uri) is None:
+                direct[name] = uri
+                endpoint.settles_at = self._context.now() + SETTLE_TIME
+                continue
+            service = self._context.addressing.advertised_service(endpoint)
+            mine = [held for held in endpoint.registrations.values() if held.caller_id == name]
+            calls += [upkeep.unregistering(held, uri, service) for held in mine]
+        await self._context.upstream.batch(calls)
+        moved: dict[str, list[Registration]] = {n: [] for n in former if n not in direct}
+        if not direct:
+            return moved, set()
+        found, stuck = await self._reclaim.take_back(direct)
+        return moved | found, stuck
 
     async def _withdraw(self, topics: Iterable[str]) -> None:
         """Tell the subscribers of topics that none but directly reached publishers are left."""
@@ -157,6 +246,8 @@ class Upkeep:
             return
         asker = self._context.node_asker(endpoint) if endpoint else OUTSIDER
         left = upkeep.reached_directly(publishers, asker, self._context.addressing)
+        if endpoint:
+            await self._mirror.hand_over(left)
         await self._update(where, topic, left)
 
     async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
@@ -166,6 +257,7 @@ class Upkeep:
         endpoint, held = item
         asker = self._context.node_asker(endpoint)
         publishers = self._context.addressing.import_slaves(uris, asker)
+        await self._mirror.hand_over(uris)
         await self._update(endpoint.slave, held.name, publishers)
 
     async def _update(self, where: HostPort, topic: str, publishers: list[str]) -> None:
@@ -175,6 +267,10 @@ class Upkeep:
                 await self._context.upstream.node(where, body, self._context.settings.probe_timeout)
             except Unreachable as error:
                 log.debug("publisherUpdate of %s: %s", topic, error)
+
+
+_ORDER = (Kind.PUBLISHER, Kind.SERVICE, Kind.SUBSCRIBER, Kind.PARAM)
+"""Subscribers come after publishers, so that they are handed all of them at once."""
 
 
 def _current(item: Held) -> bool:

@@ -10,9 +10,9 @@ import aiohttp
 
 from rosproxy.core import xmlrpc
 from rosproxy.core.liveness import Probe
-from rosproxy.core.uris import HostPort, slave_uri
+from rosproxy.core.uris import HostPort, is_address, slave_uri
 from rosproxy.metrics import Metrics
-from rosproxy.names import Resolver
+from rosproxy.names import Resolver, resolve
 
 CALLER_ID = "/rosproxy"
 """The node name under which the proxy itself calls."""
@@ -50,15 +50,24 @@ class Upstream:
 
     The master's connections are kept alive. A node's are not: roscpp's server and a node's end
     make reuse unsafe, and calls to nodes are rare.
+
+    ``master_address``, which may be changed at any time, is the IP address at which the host of
+    ``master_uri`` is reached; None: where its name leads. In a container network that name may
+    lead to the proxy itself. It holds for the nodes that run on the master's host as well.
     """
 
-    def __init__(self, master_uri: str, instance: str, metrics: Metrics) -> None:
-        self.master_uri = master_uri
-        self._metrics = metrics
+    def __init__(
+        self, master_uri: str, instance: str, metrics: Metrics, master_address: str | None = None
+    ) -> None:
+        self.master_uri, self.master_address = master_uri, master_address
+        self._metrics, self._resolver = metrics, Resolver()
         parts = urlsplit(master_uri)
-        self._master_url = f"http://{parts.netloc}{parts.path or '/'}"
+        self._master_path, self._netloc = parts.path or "/", parts.netloc
+        self._master_where = HostPort(parts.hostname or "", parts.port or 80)
         self._master = _session(
-            aiohttp.TCPConnector(resolver=Resolver(), limit=64, keepalive_timeout=MASTER_KEEPALIVE),
+            aiohttp.TCPConnector(
+                resolver=self._resolver, limit=64, keepalive_timeout=MASTER_KEEPALIVE
+            ),
             {LOOP_HEADER: instance},
         )
         self._nodes = _session(
@@ -69,6 +78,27 @@ class Upstream:
         """Close all connections."""
         await asyncio.gather(self._master.close(), self._nodes.close())
 
+    @property
+    def reached_at(self) -> str | None:
+        """The address at which the master is looked for; None before its name was resolved."""
+        host = self._master_where.host
+        return self.master_address or (host if is_address(host) else self._resolver.last)
+
+    async def master_addresses(self) -> list[str]:
+        """The addresses of the master's host; empty if its name can't be resolved."""
+        if self.master_address:
+            return [self.master_address]
+        return await resolve(self._master_where.host)
+
+    def reach(self, where: HostPort) -> HostPort:
+        """Where to connect to for a host and port that a URI from outside names.
+
+        That differs only for the master's host while its address is given.
+        """
+        if self.master_address and where.host.lower() == self._master_where.host:
+            return HostPort(self.master_address, where.port)
+        return where
+
     async def master(self, body: bytes) -> bytes:
         """The master's reply to a call. Raises Unreachable.
 
@@ -76,7 +106,7 @@ class Upstream:
         had closed costs one more try.
         """
         try:
-            return await _post(self._master, self._master_url, body, MASTER_TIMEOUT)
+            return await self._post_master(body)
         except aiohttp.ServerDisconnectedError:
             return await self._again(body)
         except _FAILURES as error:
@@ -104,10 +134,13 @@ class Upstream:
             values += [_batched(result) for result in results]
         return values
 
-    async def node(self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT) -> bytes:
+    async def node(
+        self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
+    ) -> bytes:
         """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
+        url = slave_uri(self.reach(where), path)
         try:
-            return await _post(self._nodes, slave_uri(where), body, within)
+            return await _post(self._nodes, url, body, within, str(where))
         except _FAILURES as error:
             raise _unreachable(f"node at {where}", error) from error
 
@@ -118,9 +151,14 @@ class Upstream:
 
     async def _again(self, body: bytes) -> bytes:
         try:
-            return await _post(self._master, self._master_url, body, MASTER_TIMEOUT)
+            return await self._post_master(body)
         except _FAILURES as error:
             raise self._master_gone(error) from error
+
+    async def _post_master(self, body: bytes) -> bytes:
+        """Kept connections are told apart by address, so a new address means new connections."""
+        url = slave_uri(self.reach(self._master_where), self._master_path)
+        return await _post(self._master, url, body, MASTER_TIMEOUT, self._netloc)
 
     def _master_gone(self, error: BaseException) -> Unreachable:
         return _unreachable(f"master {self.master_uri}", error)
@@ -139,10 +177,15 @@ def _session(connector: aiohttp.TCPConnector, headers: dict[str, str]) -> aiohtt
     )
 
 
-async def _post(session: aiohttp.ClientSession, url: str, body: bytes, within: float) -> bytes:
+async def _post(
+    session: aiohttp.ClientSession, url: str, body: bytes, within: float, host: str
+) -> bytes:
+    """A reply's body; ``host`` is what the peer is called by, whatever address ``url`` names."""
     timeout = aiohttp.ClientTimeout(total=within, sock_connect=min(CONNECT_TIMEOUT, within))
     # A peer that could redirect the proxy would make it fetch from any host that it reaches.
-    async with session.post(url, data=body, timeout=timeout, allow_redirects=False) as reply:
+    async with session.post(
+        url, data=body, headers={"Host": host}, timeout=timeout, allow_redirects=False
+    ) as reply:
         if reply.status != 200:
             raise ValueError(f"HTTP status {reply.status}")
         return await read_bounded(reply.content)

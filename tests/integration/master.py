@@ -13,6 +13,7 @@ from tests.integration.http_fake import Answer, HttpFake, Request, ok, value
 from tests.integration.net import MASTER, bracketed, rpc
 
 Triple = list[Any]
+NEW_NODE = "Reason: new node registered with same name"
 ODD_PARAMETERS = (TypeError, AttributeError, LookupError, ValueError)
 
 
@@ -109,7 +110,7 @@ class Master:
 
     def _replace(self, caller: str, old: str | None) -> None:
         if old:
-            self._told.append((old, "shutdown", (f"[{caller}] new node registered",)))
+            self._told.append((old, "shutdown", (f"[{caller}] {NEW_NODE}",)))
 
     def _announce(self, topic: str) -> None:
         publishers = self.holds("publishers", topic)
@@ -185,6 +186,9 @@ class Master:
 
     def _do_get_param(self, _caller: str, key: str) -> Triple:
         return [1, key, self.params[key]] if key in self.params else [-1, "not set", 0]
+
+    def _do_get_param_names(self, _caller: str) -> Triple:
+        return [1, "parameter names", sorted(self.params)]
 
 
 def _snake_case(name: str) -> str:

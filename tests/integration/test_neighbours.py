@@ -1,6 +1,7 @@
 """Inside nodes among themselves and with outside: whose address is given to whom."""
 
 import asyncio
+from ipaddress import ip_network
 
 import pytest
 
@@ -169,3 +170,15 @@ async def test_outside_nodes_are_never_touched(proxy, master, node):
     assert await knock((HOST, proxy.settings.ports.listen.last), b"x") == "refused"
     assert stranger.connections == 0
     await stranger.stop()
+
+
+async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(
+    make_proxy, make_node, monkeypatch: pytest.MonkeyPatch
+):
+    networks = [ip_network("127.0.5.0/24")]
+    monkeypatch.setattr("rosproxy.context.interface_networks", lambda: tuple(networks))
+    proxy = await make_proxy(inside_network=())
+    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    networks.append(ip_network("127.0.2.0/24"))
+    await talker.publish(proxy.master)
+    assert (await listener.subscribe(proxy.master))[2] == [talker.uri]

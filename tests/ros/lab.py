@@ -204,8 +204,8 @@ class Lab:
         return wire.call(self.place(role), address, port, method, CALLER, *arguments)
 
     def master_uri(self, role: str) -> str:
-        """ROS_MASTER_URI on a machine: inside it names the proxy."""
-        if self._is_inside(role):
+        """ROS_MASTER_URI on a machine: inside it names the proxy, if need be by an alias."""
+        if self._is_inside(role) and not self.topology.plan.alias:
             return f"http://rosproxy:{MASTER_PORT}"
         if self.master_role == "out":
             return MASTER_URI

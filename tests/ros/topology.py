@@ -64,6 +64,8 @@ class Plan:
 
     With `flat`, nothing separates the machines and every name resolves everywhere: nodes
     then work without a proxy, which shows that a test and its nodes are sound.
+    With `alias`, the master's host name leads inside to the proxy, as a network alias of
+    Docker does; in the proxy's own machine it does so, too.
     With `hairpin`, inside reaches the published ports at the host's address too, as it does
     with Docker's own proxy process; without, a wrong address handed to inside is found out.
     """
@@ -72,11 +74,13 @@ class Plan:
     networks: tuple[tuple[str, ...], ...]
     ports: PortMap
     flat: bool = False
+    alias: bool = False
     hairpin: bool = False
 
 
 SHARED = Plan("s", (("c1", "c2"),), PortMap(45000, 45099, 45000))
 SPLIT = Plan("d", (("c1",), ("c2",)), PortMap(45000, 45029, 46000))
+ALIAS = Plan("a", (("c1", "c2"),), PortMap(11500, 11599, 11500), alias=True)
 
 
 @dataclass
@@ -131,6 +135,8 @@ class Topology:
         for number, members in enumerate(self.plan.networks, start=1):
             self._join_inside(number, members)
         self._load_rules()
+        if self.plan.alias:
+            self._keep_ports_free()
         for place in self.places.values():
             self._write_names(place)
 
@@ -180,6 +186,11 @@ class Topology:
             rules = _rules(self.plan, self.places["px"].address)
             _run("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
+    def _keep_ports_free(self) -> None:
+        """Keeps the proxy's own connections off the ports that nodes on the robot may have."""
+        enter = ("ip", "netns", "exec", self.places["px"].namespace)
+        _run(*enter, "sysctl", "-q", "-w", "net.ipv4.ip_local_port_range=1024 11000")
+
     def _write_names(self, place: Place) -> None:
         folder = _NETNS_ETC / place.namespace
         folder.mkdir(parents=True, exist_ok=True)
@@ -193,7 +204,10 @@ class Topology:
         yield from ((other.address, other.hostname) for other in others)
         if not self.plan.flat:
             yield OUT_HOST, ADVERTISED_NAME
-            yield OUT_NODE, self.places["out"].hostname
+            inside = place.role == "px" or place.role.startswith("c")
+            hidden = self.plan.alias and inside
+            robot = self._proxy_address(place) if hidden else OUT_NODE
+            yield robot, self.places["out"].hostname
         if place.role.startswith("c"):
             yield self._proxy_address(place), "rosproxy"
 

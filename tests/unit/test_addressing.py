@@ -4,6 +4,7 @@ import pytest
 
 from rosproxy.core.addressing import Addressing
 from rosproxy.core.methods import Kind
+from rosproxy.core.registry import Place
 from rosproxy.core.uris import HostPort, InsidePath
 from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_asker
 
@@ -206,6 +207,20 @@ def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
     endpoint = addressing.registry.admit(uri, where, place, "10.0.0.254")
     exported = addressing.export_slave(uri, make_asker("10.0.0.254"))
     assert exported == addressing.advertised_uri(endpoint)
+
+
+def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> None:
+    """Not even its own machine; it itself goes on by its own URI, which tells it who it is."""
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    addressing.registry.move({endpoint: Place("10.0.0.9", named=False, stale=True)})
+    outside = "http://robot-host:45000/10.0.0.5:40001/10.0.0.9/"
+    assert addressing.advertised_uri(endpoint) == outside
+    relayed = f"http://{PROXY}:45000/10.0.0.5:40001/10.0.0.9/"
+    for asker in (NEIGHBOUR, make_asker("10.0.0.9"), make_asker("10.0.0.5"), STRANGER):
+        assert addressing.import_slave(outside, asker) == relayed
+    assert addressing.import_slave(outside, make_asker("10.0.0.9", endpoint=endpoint)) == LITERAL
+    assert addressing.export_slave(LITERAL, make_asker("10.0.0.9")) == outside
 
 
 def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_elses() -> None:

@@ -110,3 +110,17 @@ def test_the_grace_period_counts_from_the_first_failure_and_starts_anew() -> Non
         health.note(probe, moment)
     assert not health.clean_up(59.0, 30.0)
     assert health.clean_up(60.0, 30.0)
+
+
+def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
+    health = Health()
+    health.note(A, 1.0)
+    health.end(2.0)
+    assert (health.down, health.over) == (True, True)
+    assert health.clean_up(2.0, after=30.0)  # at the next look, if it could not be done at once
+    assert not health.clean_up(2.0, after=0.0)
+    health.note(S, 3.0)  # its address is silent, but it won't come back
+    assert (health.down, health.over) == (True, True)
+    assert health.note(A, 4.0) is Change.UP
+    assert (health.down, health.over) == (False, False)
+    assert not health.clean_up(99.0, after=30.0)

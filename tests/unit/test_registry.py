@@ -309,3 +309,51 @@ def test_endpoints_may_be_removed_while_they_are_gone_through() -> None:
     for endpoint in registry:
         registry.remove(endpoint)
     assert len(registry) == 0
+
+
+def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
+    registry = make_registry()
+    endpoint, port = node(registry, 5), 45000
+    held = register(registry, endpoint, PUB, "/a")
+    assert registry.move({endpoint: Place("10.0.0.9", False)}) == [endpoint]
+    assert (endpoint.key, endpoint.port, endpoint.uri) == (
+        ("10.0.0.9", 40001),
+        port,
+        own_uri("10.0.0.5"),
+    )
+    assert registry.at("10.0.0.9", 40001) is endpoint
+    assert registry.at("10.0.0.5", 40001) is None
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is None
+    assert endpoint.registrations == {held.key: held}
+    another = node(registry, 5)
+    assert another is not endpoint
+    assert another.port != port
+
+
+def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> None:
+    registry = make_registry()
+    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", source="10.0.0.1")
+    registry.move({endpoint: Place("10.0.0.9", False)})
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.1") is endpoint
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
+
+
+def test_two_nodes_may_swap_their_addresses() -> None:
+    registry = make_registry()
+    one, other = node(registry, 5), node(registry, 6)
+    places = {one: Place("10.0.0.6", False), other: Place("10.0.0.5", False)}
+    assert registry.move(places) == [one, other]
+    assert registry.at("10.0.0.6", 40001) is one
+    assert registry.at("10.0.0.5", 40001) is other
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.6") is one
+    assert registry.admitted(own_uri("10.0.0.6"), "10.0.0.5") is other
+
+
+def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
+    registry = make_registry()
+    one, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
+    places = {third: Place("10.0.0.5", False), one: Place("10.0.0.6", False)}
+    assert registry.move(places) == []
+    assert [e.place.address for e in (one, holder, third)] == ["10.0.0.5", "10.0.0.6", "10.0.0.7"]
+    assert registry.at("10.0.0.5", 40001) is one

@@ -63,6 +63,31 @@ class Registries(RuleBasedStateMachine):
         assert (found is not None) == (usable and not known)
         assert found is None or found.port == port
 
+    @rule(data=st.data(), addresses=st.lists(ADDRESSES, min_size=1, max_size=4))
+    def move(self, data: st.DataObject, addresses: list[str]) -> None:
+        places = {}
+        for address in addresses:
+            endpoint = self.draw(data)
+            if endpoint:
+                places[endpoint] = Place(address, False)
+        before = {endpoint: endpoint.key for endpoint in self.registry}
+        admitted = {endpoint: set(endpoint.admissions) for endpoint in self.registry}
+        ports = {endpoint: endpoint.port for endpoint in self.registry}
+        moved = self.registry.move(places)
+        assert {endpoint: endpoint.port for endpoint in self.registry} == ports
+        for endpoint, (old, port) in before.items():
+            if endpoint in moved:
+                new = places[endpoint].address
+                assert endpoint.key == (new, port)
+                for uri in [uri for uri, source in admitted[endpoint] if source == old]:
+                    assert self.registry.admitted(uri, new)
+                assert self.registry.admitted(endpoint.uri, new) in moved
+            else:
+                assert endpoint.key == (old, port)
+                wanted = places.get(endpoint)
+                taken = wanted and self.registry.at(wanted.address, port)
+                assert wanted is None or taken
+
     @rule(data=st.data())
     def remove(self, data: st.DataObject) -> None:
         endpoint = self.draw(data)

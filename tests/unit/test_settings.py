@@ -39,6 +39,7 @@ def test_the_defaults() -> None:
     assert settings.admin == HostPort("127.0.0.1", 11312)
     assert (settings.master_port, settings.publish_master) == (11311, None)
     assert settings.inside_networks == ()
+    assert (settings.master_address, settings.admin_token) == (None, None)
     assert (settings.probe_interval, settings.cleanup_after, settings.linger) == (5, 30, 30)
 
 
@@ -60,6 +61,12 @@ GOOD = [
     ("probe_interval", 0.05, "probe_interval", 0.05),
     ("probe_timeout", 86400, "probe_timeout", 86400.0),
     ("slave_control", "master", "slave_control", "master"),
+    ("master_address", "192.0.2.7", "master_address", "192.0.2.7"),
+    ("master_address", "::ffff:192.0.2.7", "master_address", "192.0.2.7"),
+    ("master_address", "FD00::9", "master_address", "fd00::9"),
+    ("master_address", "", "master_address", None),
+    ("admin_token", "0123456789abcdef", "admin_token", "0123456789abcdef"),
+    ("admin_token", "", "admin_token", None),
     (
         "inside_network",
         ("10.0.0.0/24", "fd00::/64", "10.1.2.3"),
@@ -101,6 +108,16 @@ BAD: list[tuple[str, Any, str]] = [
     ("master_uri", "https://robot:11311", "not of the form"),
     ("master_uri", "http://user@robot:11311", "not of the form"),
     ("master_uri", "http://[fd00::9:11311", "not of the form"),
+    ("master_address", "robot", "not an IP address"),
+    ("master_address", "192.0.2.7:11311", "not an IP address"),
+    ("master_address", "0.0.0.0", "not an IP address"),
+    ("master_address", "224.0.0.1", "not an IP address"),
+    ("master_address", "fe80::1%eth0", "not an IP address"),
+    ("admin_token", "short", "8 to 200"),
+    ("admin_token", "with a space", "8 to 200"),
+    ("admin_token", "new\nline-1234", "8 to 200"),
+    ("admin_token", "ümlaut-1234", "8 to 200"),
+    ("admin_token", "x" * 201, "8 to 200"),
     ("advertise_host", None, "missing"),
     ("advertise_host", "", "missing"),
     ("advertise_host", "robot:45000", "neither a host name nor an address"),

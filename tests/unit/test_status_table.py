@@ -37,6 +37,17 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
     assert lines[4] == "outside  ROS_MASTER_URI=http://robot-host:11411"
 
 
+def test_head_names_mirrored_ports() -> None:
+    status = make_status()
+    status["mirrored"] = []
+    assert "mirrored" not in render(status, 120)
+    status["mirrored"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
+    assert (
+        "mirrored 7 ports of nodes on the master's host (14 connections): "
+        "40001, 40002, 40003, 40004, 40005 and 2 more"
+    ) in render(status, 120).split("\n")
+
+
 @pytest.mark.parametrize(
     ("master", "line"),
     [

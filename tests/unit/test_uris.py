@@ -10,6 +10,7 @@ from rosproxy.core.uris import (
     inside_path,
     is_address,
     is_loopback,
+    parse_address,
     parse_host_port,
     parse_inside_path,
     parse_service_uri,
@@ -203,3 +204,28 @@ def test_hosts_that_mean_another_machine_to_everybody(host: str, loopback: bool)
 def test_plain_addresses(address: str, plain: str) -> None:
     assert plain_address(address) == plain
     assert is_address(plain) is (plain not in ("c1", ""))
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("10.0.0.5", "10.0.0.5"),
+        ("127.0.0.1", "127.0.0.1"),
+        ("::ffff:10.0.0.5", "10.0.0.5"),
+        ("FD00::05", "fd00::5"),
+        ("::1", "::1"),
+        ("0.0.0.0", None),
+        ("::", None),
+        ("224.0.0.1", None),
+        ("fe80::1%eth0", None),
+        ("10.0.0.5%eth0", None),
+        ("10.0.0.0/24", None),
+        ("10.0.0.5:80", None),
+        ("[fd00::5]", None),
+        ("c1", None),
+        (" 10.0.0.5", None),
+        ("", None),
+    ],
+)
+def test_an_address_that_something_may_be_reached_at(text: str, address: str | None) -> None:
+    assert parse_address(text) == address

@@ -116,6 +116,10 @@ class Addressing:
             return False
         return self._is_relayed(where, asker) or self.stands_for(uri) is not None
 
+    def advertises(self, where: HostPort) -> bool:
+        """Whether outside finds one of this proxy's own ports at a host and port."""
+        return self._listening(where) is not None
+
     def identify(self, uri: str) -> tuple[int, InsidePath] | None:
         """The listening port and inside address of an advertised slave URI of this proxy."""
         port, path = self._listening(parse_slave_uri(uri)), parse_inside_path(uri)
@@ -127,8 +131,10 @@ class Addressing:
         return slave_uri(HostPort(asker.proxy, endpoint.port), self._path(endpoint))
 
     def _direct(self, endpoint: Endpoint, asker: Asker) -> bool:
-        if endpoint is asker.endpoint or asker.address == endpoint.place.address:
+        if endpoint is asker.endpoint:
             return True
+        if asker.address == endpoint.place.address:
+            return not endpoint.place.stale
         return endpoint.place.named and self._neighbours(asker.address, endpoint.place.address)
 
     def _neighbours(self, one: str, other: str) -> bool:

@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from enum import Enum
 
+UNKNOWN_PID = (None, -1)
+"""What stands for a pid that is not known, or not relied on."""
+
 FAILURES_TO_CLOSE = 2
 """Failed probes in a row after which a node's port refuses."""
 
@@ -34,7 +37,7 @@ class Health:
     ``refused`` tells whether the last failure was a refused connection, which only a node that
     has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
     taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
-    again.
+    again. ``over``: it is known to have ended for good, even if its address is just silent.
     """
 
     answered: float | None = None
@@ -43,6 +46,7 @@ class Health:
     refused: bool = False
     cleaned: bool = False
     cleaned_at: float = 0.0
+    over: bool = False
     pid: int | None = None
     checked: float | None = None
 
@@ -72,12 +76,17 @@ class Health:
         self.checked = now
         if probe is Probe.ANSWERED:
             self.answered, self.failing_since, self.failures = now, None, 0
-            self.refused = False
+            self.refused = self.over = False
             return Change.UP if was_down else Change.NONE
         self.failures += 1
         self.refused = probe is Probe.REFUSED
         self.failing_since = now if self.failing_since is None else self.failing_since
         return Change.DOWN if self.down and not was_down else Change.NONE
+
+    def end(self, now: float) -> None:
+        """Note that the node has ended, whatever it is that its address answers."""
+        self.failures = max(self.failures, FAILURES_TO_CLOSE)
+        self.checked, self.failing_since, self.over = now, float("-inf"), True
 
     def due(self, now: float, interval: float) -> bool:
         """Whether to probe: idle for ``interval`` seconds, or under suspicion."""

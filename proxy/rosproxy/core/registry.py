@@ -4,7 +4,7 @@ Plain state without I/O. It is changed in place rather than copied: with a thous
 topics each a copy per call would make registration quadratic.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from rosproxy.core.liveness import Health
@@ -24,11 +24,13 @@ class Place:
     ``address`` is the IP address the proxy connects to. ``named``: the host that the node gives
     leads there, so that neighbours can use it. ``confirmed``: the address is the one that the
     registration came from; if not, the node's TCPROS port is believed only from the node itself.
+    ``stale``: the host that the node gives is an address that it no longer has.
     """
 
     address: str
     named: bool
     confirmed: bool = True
+    stale: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,11 @@ class Endpoint:
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
     ``trusted`` is False while only the master's data tell of the endpoint.
+
+    ``former_uris`` are those by which the master may have known it: the node's own, if it
+    registered around the proxy, and advertised ones of places where it was. ``unsettled``: what
+    the master has may still be registered with one of them. Until ``settles_at``, a time, a list
+    of publishers without this one is taken for one from before it was registered anew.
     """
 
     uri: str
@@ -74,6 +81,14 @@ class Endpoint:
     trusted: bool = True
     health: Health = field(default_factory=Health)
     admissions: set[tuple[str, str]] = field(default_factory=set)
+    former_uris: set[str] = field(default_factory=set)
+    unsettled: bool = False
+    settles_at: float = 0.0
+
+    @property
+    def direct(self) -> bool:
+        """Whether the node registered around the proxy, so that it may do so again."""
+        return self.uri in self.former_uris
 
     @property
     def key(self) -> tuple[str, int]:
@@ -170,6 +185,25 @@ class Registry:
         self._former[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
 
+    def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+        """Note that nodes are at other addresses now; ports and registrations stay.
+
+        What came from the old address means the node at the new one from now on, and what it
+        calls itself too. Those whose new address and port another endpoint holds are left where
+        they are; the others are returned.
+        """
+        moved = self._movable(places)
+        for endpoint in moved:
+            del self._by_key[endpoint.key], self._last_port[endpoint.key]
+        admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
+        for endpoint in moved:
+            endpoint.place = places[endpoint]
+            self._by_key[endpoint.key] = endpoint
+            self._remember(endpoint)
+        for endpoint, uri in admissions:
+            self._admit(endpoint, uri, endpoint.place.address)
+        return moved
+
     def reclaimable(self) -> Endpoint | None:
         """The endpoint to give up first when the range is short: idle for the longest time.
 
@@ -222,6 +256,10 @@ class Registry:
         former = [endpoint for endpoint in self._former.values() if endpoint.uri == uri]
         return self._by_uri.get(uri, []) + former
 
+    def at(self, address: str, port: int) -> Endpoint | None:
+        """The endpoint of the slave API at an address and port."""
+        return self._by_key.get((address, port))
+
     def by_caller(self, caller_id: str) -> Endpoint | None:
         """The endpoint of a node's name."""
         return self._by_caller.get(caller_id)
@@ -241,6 +279,30 @@ class Registry:
     def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
         """Everything that is registered, with its endpoint."""
         return [(e, held) for e in self for held in e.registrations.values()]
+
+    def _movable(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+        """Those whose new keys are free, or will be; of two for the same key the first."""
+        moved = list(places)
+        while True:
+            taken = {k for k, e in self._by_key.items() if e not in moved}
+            kept = []
+            for endpoint in moved:
+                key = places[endpoint].address, endpoint.node.port
+                if key not in taken:
+                    taken.add(key)
+                    kept.append(endpoint)
+            if len(kept) == len(moved):
+                return kept
+            moved = kept
+
+    def _take_admissions(self, endpoint: Endpoint) -> list[str]:
+        """The URIs that meant an endpoint if its own address gave them; they no longer do."""
+        address = endpoint.place.address
+        uris = [uri for uri, source in endpoint.admissions if source == address]
+        for uri in uris:
+            endpoint.admissions.discard((uri, address))
+            del self._admitted[uri, address]
+        return [*uris, endpoint.uri]
 
     def _port_for(self, place: Place, node: HostPort) -> int:
         port = self.pool.take(prefer=self._last_port.get((place.address, node.port)))

@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import Any, Literal
 
 from rosproxy.core.addressing import Network
 from rosproxy.core.ports import PortMap, PortRange
-from rosproxy.core.uris import HostPort, parse_host_port, parse_slave_uri
+from rosproxy.core.uris import HostPort, parse_address, parse_host_port, parse_slave_uri
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 
@@ -26,6 +26,8 @@ class Settings:
     """Everything that ``rosproxy run`` can be told. Times are in seconds.
 
     ``inside_networks`` empty means: the networks of the proxy's own interfaces.
+    ``master_address``: the IP address of the master's host where the proxy can't resolve its name
+    or would find itself. ``admin_token``: what callers that are not on loopback must know.
     """
 
     master_uri: str
@@ -42,6 +44,8 @@ class Settings:
     linger: float = 30.0
     master_interval: float = 2.0
     slave_control: Literal["any", "master"] = "any"
+    master_address: str | None = None
+    admin_token: str | None = field(default=None, repr=False)
 
 
 def parse_settings(options: Mapping[str, Any]) -> Settings:
@@ -68,6 +72,8 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
         admin=_admin(options["admin_bind"]),
         inside_networks=tuple(_network(text) for text in options.get("inside_network") or ()),
         slave_control=options["slave_control"],
+        master_address=_master_address(options.get("master_address")),
+        admin_token=_admin_token(options.get("admin_token")),
         **{name: _seconds(name, options[name]) for name in _TIMES},
     )
     _check_overlaps(settings)
@@ -75,6 +81,7 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
 
 
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
+_TOKEN = re.compile(r"[!-~]{8,200}")
 _TIMES = ("probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval")
 _MAY_BE_ZERO = ("cleanup_after", "linger")
 
@@ -99,6 +106,30 @@ def _master_uri(uri: str | None) -> str:
     if parse_slave_uri(uri) is None:
         raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
     return uri
+
+
+def _master_address(text: str | None) -> str | None:
+    if not text:
+        return None
+    address = parse_address(text)
+    if address is None:
+        raise SettingError(
+            "--master-address", f"{text[:40]!r} is not an IP address such as 192.0.2.7"
+        )
+    return address
+
+
+def _admin_token(text: str | None) -> str | None:
+    """It travels in a header: printable ASCII without spaces."""
+    if not text:
+        return None
+    if not _TOKEN.fullmatch(text):
+        raise SettingError(
+            "--admin-token",
+            "must be 8 to 200 letters, digits or signs without spaces, for example the output of "
+            "openssl rand -hex 16",
+        )
+    return text
 
 
 def _advertise_host(host: str | None) -> str:

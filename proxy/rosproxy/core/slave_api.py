@@ -78,37 +78,47 @@ def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing)
 
 def topic_port(call: Call, reply: bytes) -> TopicPort | None:
     """The port that a reply to ``requestTopic`` names, if it is one for TCPROS."""
-    triple = _triple(reply)
-    protocol = triple.items[2] if triple else None
-    topic = call.string(1)
-    if not topic or protocol is None or not _is_tcpros(protocol):
-        return None
-    port = protocol.items[2].integer()
-    return TopicPort(topic, port) if port and 0 < port < 65536 else None
+    triple, topic = _triple(reply), call.string(1)
+    said = tcpros_address(triple) if triple else None
+    return TopicPort(topic, said.port) if topic and said else None
 
 
-def _triple(reply: bytes) -> Value | None:
-    value = xmlrpc.parse_reply(reply)
+def ros_triple(value: Value | None) -> Value | None:
+    """The value of a reply if it is a ROS status triple, else None."""
     return value if value and value.kind == "array" and len(value.items) == 3 else None
 
 
-def _is_tcpros(protocol: Value) -> bool:
-    return len(protocol.items) == 3 and protocol.items[0].string() == "TCPROS"
+def tcpros_address(triple: Value) -> HostPort | None:
+    """Where a reply to ``requestTopic`` sends the subscriber, if that is for TCPROS."""
+    if not _is_tcpros(triple):
+        return None
+    _, host, port = triple.items[2].items
+    number = port.integer()
+    return HostPort(host.text, number) if number and 0 < number < 65536 else None
+
+
+def send_to(triple: Value, where: HostPort) -> list[Edit]:
+    """Edits by which such a reply sends the subscriber elsewhere."""
+    _, message, protocol = triple.items
+    _, host, port = protocol.items
+    edits = [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
+    before = f"{host.text}:{port.text}"
+    if message.kind == "string" and before in message.text:
+        edits.append(xmlrpc.replace(message, message.text.replace(before, str(where))))
+    return edits
+
+
+def _triple(reply: bytes) -> Value | None:
+    return ros_triple(xmlrpc.parse_reply(reply))
+
+
+def _is_tcpros(triple: Value) -> bool:
+    protocol = triple.items[2].items
+    return len(protocol) == 3 and protocol[0].string() == "TCPROS"
 
 
 def _export_topic(triple: Value, visit: Visit) -> list[Edit]:
-    protocol, message = triple.items[2], triple.items[1]
-    if not _is_tcpros(protocol):
-        return []
-    host, port = protocol.items[1], protocol.items[2]
-    edits = [
-        xmlrpc.replace(host, visit.reached.host),
-        xmlrpc.replace(port, str(visit.reached.port)),
-    ]
-    inside = f"{host.text}:{port.text}"
-    if message.kind == "string" and inside in message.text:
-        edits.append(xmlrpc.replace(message, message.text.replace(inside, str(visit.reached))))
-    return edits
+    return send_to(triple, visit.reached) if _is_tcpros(triple) else []
 
 
 def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:

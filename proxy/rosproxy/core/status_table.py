@@ -1,6 +1,6 @@
 """``/status`` as text for people."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rosproxy.core.text import (
@@ -51,6 +51,8 @@ def _head(status: Status) -> Iterator[str]:
     yield (
         f"inside   ROS_MASTER_URI=http://<this host>:{settings['master_port']}, networks {networks}"
     )
+    if mirrored := status.get("mirrored"):
+        yield f"mirrored {_mirrored(mirrored)}"
     if settings["publish_master"]:
         host = clean(settings["advertise_host"])
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings['publish_master']}"
@@ -72,6 +74,12 @@ def _ports(status: Status) -> str:
     mapped = "" if ports["advertise"] == ports["listen"] else f", here {ports['listen']}"
     blocked = f", {ports['blocked']} held by other programs" if ports["blocked"] else ""
     return f"{outside}{mapped}: {ports['used']} used, {ports['free']} free{blocked}"
+
+
+def _mirrored(ports: Sequence[Status]) -> str:
+    open_ones = plural(sum(port["connections"] for port in ports), "connection")
+    numbers = listed(str(port["port"]) for port in ports)
+    return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
 
 
 def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:

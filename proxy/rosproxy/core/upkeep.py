@@ -13,29 +13,37 @@ MethodCall = tuple[str, list[Any]]
 
 def register_call(endpoint: Endpoint, held: Registration, addressing: Addressing) -> MethodCall:
     """The call that makes a registration at the master."""
-    uri = addressing.advertised_uri(endpoint)
+    service = addressing.advertised_service(endpoint)
+    return registering(held, addressing.advertised_uri(endpoint), service)
+
+
+def unregister_call(endpoint: Endpoint, held: Registration, addressing: Addressing) -> MethodCall:
+    """The call that takes a registration back; the master wants the URI exactly as registered."""
+    service = addressing.advertised_service(endpoint)
+    return unregistering(held, addressing.advertised_uri(endpoint), service)
+
+
+def registering(held: Registration, uri: str, service: str) -> MethodCall:
+    """The call that makes a registration with a slave URI, and for a service with its URI."""
     match held.kind:
         case Kind.PUBLISHER:
             return "registerPublisher", [held.caller_id, held.name, held.type, uri]
         case Kind.SUBSCRIBER:
             return "registerSubscriber", [held.caller_id, held.name, held.type, uri]
         case Kind.SERVICE:
-            service = addressing.advertised_service(endpoint)
             return "registerService", [held.caller_id, held.name, service, uri]
         case Kind.PARAM:
             return "subscribeParam", [held.caller_id, uri, held.name]
 
 
-def unregister_call(endpoint: Endpoint, held: Registration, addressing: Addressing) -> MethodCall:
-    """The call that takes a registration back; the master wants the URI exactly as registered."""
-    uri = addressing.advertised_uri(endpoint)
+def unregistering(held: Registration, uri: str, service: str) -> MethodCall:
+    """The call that takes back a registration that was made with these URIs."""
     match held.kind:
         case Kind.PUBLISHER:
             return "unregisterPublisher", [held.caller_id, held.name, uri]
         case Kind.SUBSCRIBER:
             return "unregisterSubscriber", [held.caller_id, held.name, uri]
         case Kind.SERVICE:
-            service = addressing.advertised_service(endpoint)
             return "unregisterService", [held.caller_id, held.name, service]
         case Kind.PARAM:
             return "unsubscribeParam", [held.caller_id, uri, held.name]

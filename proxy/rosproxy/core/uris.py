@@ -112,6 +112,18 @@ def plain_address(address: str) -> str:
     return str(mapped or parsed)
 
 
+def parse_address(text: str) -> str | None:
+    """An IP address that something may be reached at, in its plain form; None if it is none.
+
+    The unspecified address, multicast and one with a zone are not.
+    """
+    address = plain_address(text)
+    if "%" in text or not is_address(address):
+        return None
+    parsed = ip_address(address)
+    return None if parsed.is_unspecified or parsed.is_multicast else str(parsed)
+
+
 def _authority(uri: str) -> HostPort | None:
     try:
         parts = urlsplit(uri)

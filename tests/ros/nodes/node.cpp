@@ -8,6 +8,7 @@
 #include <topic_tools/MuxSelect.h>
 
 #include <boost/crc.hpp>
+#include <fstream>
 #include <functional>
 #include <iomanip>
 #include <sstream>
@@ -54,6 +55,28 @@ static void publish(const Options& options) {
     rate.sleep();
   }
   ros::spin();
+}
+
+// Publishes; once the file `--when` is there, also to `--then`; `--last` ends the first topic then.
+static void publishMore(const Options& options) {
+  ros::NodeHandle node;
+  auto first = node.advertise<std_msgs::String>(options.text("topic"), 10);
+  ros::Publisher second;
+  ros::WallRate rate(20);
+  std_msgs::String message;
+  message.data = payload("more", 0, 0);
+  say("ready");
+  while (ros::ok()) {
+    if (!second && std::ifstream(options.text("when"))) {
+      second = node.advertise<std_msgs::String>(options.text("then"), 10);
+      if (options.number("last", 0) > 0) first.shutdown();
+      say("more");
+    }
+    if (first) first.publish(message);
+    if (second) second.publish(message);
+    ros::spinOnce();
+    rate.sleep();
+  }
 }
 
 static void onMessage(const std_msgs::String::ConstPtr& message) {
@@ -156,6 +179,7 @@ static void watchParameter(const Options& options) {
 
 static const std::map<std::string, std::function<void(const Options&)>> roles = {
     {"pub", publish},
+    {"more", publishMore},
     {"sub", subscribe},
     {"serve", serve},
     {"call", call},

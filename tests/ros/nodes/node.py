@@ -11,6 +11,7 @@ import json
 import sys
 import time
 import zlib
+from pathlib import Path
 
 import actionlib
 import rospy
@@ -76,6 +77,23 @@ def publish(options: Options) -> None:
         number += 1
         rate.sleep()
     spin()
+
+
+def publish_more(options: Options) -> None:
+    """Publishes; once the file `--when` is there, also to `--then`; `--last` ends the first."""
+    publishers = [rospy.Publisher(options.text("topic"), String, queue_size=10)]
+    say("ready")
+    more = False
+    while not rospy.is_shutdown():
+        if not more and Path(options.text("when")).exists():
+            more = True
+            publishers.append(rospy.Publisher(options.text("then"), String, queue_size=10))
+            if options.number("last", 0) > 0:
+                publishers.pop(0).unregister()
+            say("more")
+        for publisher in publishers:
+            publisher.publish(payload("more", 0, 0))
+        time.sleep(0.05)
 
 
 def subscribe(options: Options) -> None:
@@ -168,6 +186,7 @@ def action_client(options: Options) -> None:
 
 ROLES = {
     "pub": publish,
+    "more": publish_more,
     "sub": subscribe,
     "serve": serve,
     "call": call,

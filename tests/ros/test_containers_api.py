@@ -1,0 +1,419 @@
+"""What a controller tells the proxy of containers: gone, moved, arrived; and its end.
+
+Machines stand for containers. Inside, the master's host name leads to the proxy; a node that is
+started while it still leads to the real master registers around the proxy, as one does whose
+container starts before the proxy has joined its network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.ros.combinations import LIBRARIES, each_library
+from tests.ros.lab import Lab
+from tests.ros.processes import Process, wait_until
+from tests.ros.topology import ALIAS, OUT_NODE, Place
+
+pytestmark = pytest.mark.boundary
+
+PLAN = replace(ALIAS, name="k", networks=(("c1", "c2", "c3"),))
+PROXY_OPTIONS = ("--master-address", OUT_NODE)
+
+Measure = Callable[[str, float], None]
+ROLES = {"publisher": "pub", "subscriber": "sub", "server": "serve"}
+ADMIN = 11312
+
+
+def tell(lab: Lab, path: str, **body: Any) -> dict[str, int]:
+    """POSTs to the admin endpoint from where the proxy is."""
+    with lab.place("px").entered():
+        connection = HTTPConnection("127.0.0.1", ADMIN, timeout=20)
+        try:
+            connection.request("POST", path, json.dumps(body))
+            reply = connection.getresponse()
+            text = reply.read().decode()
+        finally:
+            connection.close()
+    assert reply.status == 200, text
+    answer: dict[str, int] = json.loads(text)
+    return answer
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+def names_file(place: Place) -> Path:
+    return Path("/etc/netns") / place.namespace / "hosts"
+
+
+@contextlib.contextmanager
+def before_the_proxy(lab: Lab, role: str) -> Iterator[None]:
+    """The time in which the master's name leads to the real master on a machine."""
+    names = names_file(lab.place(role))
+    before = names.read_text()
+    proxy = lab.place("px").address
+    names.write_text(before.replace(f"{proxy} robot\n", f"{OUT_NODE} robot\n"))
+    assert names.read_text() != before
+    try:
+        yield
+    finally:
+        names.write_text(before)
+
+
+@contextlib.contextmanager
+def off_the_network(place: Place) -> Iterator[None]:
+    """The machine's address answers nothing, as that of a container that has been removed."""
+    ip("-n", place.namespace, "link", "set", "eth0", "down")
+    try:
+        yield
+    finally:
+        ip("-n", place.namespace, "link", "set", "eth0", "up")
+        gateway = place.address.rpartition(".")[0] + ".1"
+        ip("-n", place.namespace, "route", "replace", "default", "via", gateway)
+
+
+@contextlib.contextmanager
+def reached_by_the_master(lab: Lab, role: str) -> Iterator[None]:
+    """The master reaches this machine's address, as it does on the containers' own host."""
+    host = lab.place("host").namespace
+    rule = ["ip", "netns", "exec", host, "nft", "-e", "-a"]
+    words = f"insert rule ip boundary forward ip daddr {lab.place(role).address} accept"
+    done = subprocess.run([*rule, *words.split()], check=True, capture_output=True, text=True)
+    handle = done.stdout.rpartition("handle ")[2].split()[0]
+    try:
+        yield
+    finally:
+        words = f"delete rule ip boundary forward handle {handle}"
+        subprocess.run([*rule, *words.split()], check=True, capture_output=True)
+
+
+def stray(lab: Lab, library: str, kind: str, role: str = "c1", **options: Any) -> Process:
+    """A node that registers around the proxy, with the machine's address as its host."""
+    env = options.pop("env", {"ROS_IP": lab.place(role).address})
+    with before_the_proxy(lab, role):
+        node = lab.node(library, role, kind, env=env, **options)
+        node.wait_for("^ready")
+        lab.wait_registered(options["name"])
+        time.sleep(0.3)  # its last registrations, for the logger, follow
+    return node
+
+
+def arrived(lab: Lab, role: str = "c1", names: Sequence[str] = ()) -> dict[str, int]:
+    container = {"address": lab.place(role).address, "names": [*names, lab.place(role).hostname]}
+    return tell(lab, "/containers", arrived=[container])
+
+
+def is_leased(lab: Lab, name: str) -> bool:
+    uri = lab.node_uri(name)
+    return uri is not None and uri.startswith(f"http://{lab.advertise_host}:115")
+
+
+@each_library
+def test_nodes_of_a_container_that_is_gone(lab: Lab, library: str, measure: Measure) -> None:
+    """Killed with its container: within a second the master knows none of them."""
+    names = {role: lab.unique("gone") for role in ROLES.values()}
+    nodes = [
+        lab.node(library, "c3", role, name=name, topic=f"/{name}/t", service=f"/{name}/s")
+        for role, name in names.items()
+    ]
+    for node, name in zip(nodes, names.values(), strict=True):
+        node.wait_for("^ready")
+        lab.wait_registered(name)
+    listener = lab.node("roscpp", "out", "sub", topic=f"/{names['pub']}/t")
+    listener.wait_for_count("^got ", 3)
+    for node in nodes:
+        node.kill()
+    with off_the_network(lab.place("c3")):
+        started = time.time()
+        assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 3
+        assert not any(lab.registered(name) for name in names.values())
+        assert not any(lab.node_uri(name) for name in names.values())
+        took = time.time() - started
+        measure("gone: 3 nodes unregistered", took)
+        assert took < 1.5
+        assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 0
+
+
+@each_library
+def test_a_node_that_answers_survives_the_news_that_it_is_gone(lab: Lab, library: str) -> None:
+    name = lab.unique("alive")
+    node = lab.node(library, "c3", "pub", name=name, topic=f"/{name}/t")
+    node.wait_for("^ready")
+    uri = lab.node_uri(name)
+    assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 0
+    lab.node(library, "out", "sub", topic=f"/{name}/t").wait_for_count("^got ", 3)
+    assert lab.node_uri(name) == uri
+
+
+@each_library
+def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) -> None:
+    """Heard outside and inside, by those who listened before and after; it lives on."""
+    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    before = {
+        (where, peer): lab.node(peer, where, "sub", topic=topic)
+        for where in ("out", "c2")
+        for peer in LIBRARIES
+    }
+    node = stray(lab, library, "pub", name=name, topic=topic)
+    for peer in LIBRARIES:
+        before["c2", peer].wait_for_count("^got ", 3)
+    assert not is_leased(lab, name)
+    started = time.time()
+    assert arrived(lab)["adopted"] == 1
+    assert is_leased(lab, name)
+    for peer in LIBRARIES:
+        before["out", peer].wait_for_count("^got ", 3)
+    measure("adopted: heard outside", time.time() - started)
+    for where in ("out", "c2", "c1"):
+        for peer in LIBRARIES:
+            lab.node(peer, where, "sub", topic=topic).wait_for_count("^got ", 3)
+    assert node.returncode is None
+    assert_no_gap(before["c2", "roscpp"])
+    assert_no_gap(before["c2", "rospy"])
+    assert arrived(lab)["adopted"] == 0
+
+
+def assert_no_gap(receiver: Process) -> None:
+    """Each message has come once: its connection was never dropped."""
+    numbers = [int(m[1]) for m in receiver.wait_for_count(r"^got hello (\d+) ", 3)]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), numbers
+
+
+@each_library
+def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
+    """It hears those that it could hear before without a gap, and those that come later."""
+    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    outside = lab.node("roscpp", "out", "pub", topic=topic)
+    outside.wait_for("^sent ")
+    node = stray(lab, library, "sub", name=name, topic=topic)
+    node.wait_for_count("^got hello ", 3)
+    assert arrived(lab)["adopted"] == 1
+    assert_no_gap(node)
+    for role in ("out", "c2", "c1"):
+        for peer in LIBRARIES:
+            word = lab.unique("word")
+            lab.node(peer, role, "pub", topic=topic, word=word)
+            node.wait_for_count(f"^got {word} ", 3)
+
+
+@each_library
+def test_a_stray_server_is_adopted(lab: Lab, library: str) -> None:
+    name = lab.unique("stray")
+    node = stray(lab, library, "serve", name=name, service=f"/{name}/s")
+    assert arrived(lab)["adopted"] == 1
+    for role in ("out", "c2", "c1"):
+        for peer in LIBRARIES:
+            client = lab.node(peer, role, "call", service=f"/{name}/s")
+            client.wait_for("^reply ask 0 ")
+    assert node.returncode is None
+
+
+@each_library
+def test_a_stray_under_a_name_that_only_its_container_knows(lab: Lab, library: str) -> None:
+    name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
+    stray(lab, library, "pub", name=name, topic=topic, env={})
+    assert "c1box" in (lab.node_uri(name) or "")
+    assert arrived(lab)["adopted"] == 1
+    for role in ("out", "c2"):
+        lab.node(library, role, "sub", topic=topic).wait_for_count("^got ", 3)
+
+
+@each_library
+def test_rosnode_kill_ends_an_adopted_node(lab: Lab, library: str) -> None:
+    name = lab.unique("stray")
+    node = stray(lab, library, "pub", name=name, topic=f"/{name}/t")
+    assert arrived(lab)["adopted"] == 1
+    assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
+    lab.run("out", "rosnode", "kill", name)
+    node.wait(timeout=5)
+    lab.wait_unregistered(name, timeout=6)
+
+
+@pytest.mark.parametrize("way", [signal.SIGINT, signal.SIGKILL], ids=["sigint", "sigkill"])
+@each_library
+def test_an_adopted_node_that_ends_leaves_nothing(
+    lab: Lab, library: str, way: signal.Signals, measure: Measure
+) -> None:
+    """It unregisters around the proxy, to no effect: its connection to the master is open yet."""
+    started = {role: lab.unique("stray") for role in ROLES.values()}
+    nodes = [
+        stray(lab, library, role, name=name, topic=f"/{name}/t", service=f"/{name}/s")
+        for role, name in started.items()
+    ]
+    assert arrived(lab)["adopted"] == 3
+    for node in nodes:
+        node.send(way)
+    ended = time.time()
+    for name in started.values():
+        lab.wait_unregistered(name, timeout=6)
+    measure("adopted, then ended: unregistered", time.time() - ended)
+
+
+@each_library
+def test_strays_that_the_master_reaches_are_not_shut_down(
+    lab: Lab, library: str, tmp_path: Path
+) -> None:
+    """Adopted while the master could end them; and then registering around the proxy again."""
+    name, more = lab.unique("stray"), tmp_path / "more"
+    with reached_by_the_master(lab, "c1"):
+        node = stray(
+            lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more
+        )
+        assert arrived(lab)["adopted"] == 1
+        lab.node(library, "out", "sub", topic=f"/{name}/a").wait_for_count("^got ", 3)
+        more.touch()
+        node.wait_for("^more")
+        for topic in ("a", "b"):
+            lab.node(library, "out", "sub", topic=f"/{name}/{topic}").wait_for_count("^got ", 3)
+        wait_until("it is behind the proxy again", lambda: is_leased(lab, name), timeout=5)
+        assert node.returncode is None
+
+
+@each_library
+def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> None:
+    """Half of its registrations go around the proxy after it has been adopted."""
+    nodes, names = [], [lab.unique("stray") for _ in range(4)]
+    with reached_by_the_master(lab, "c1"), before_the_proxy(lab, "c1"):
+        for name in names:
+            options = {"env": {"ROS_IP": lab.place("c1").address}, "topic": f"/{name}/t"}
+            nodes.append(lab.node(library, "c1", "pub", name=name, **options))
+        end = time.time() + 20
+        while not all(is_leased(lab, name) for name in names):
+            arrived(lab)
+            assert time.time() < end
+        for name in names:
+            lab.node(library, "out", "sub", topic=f"/{name}/t").wait_for_count("^got ", 3)
+        for service in (f"/{name}/get_loggers" for name in names):
+            found = f"the service {service} is behind the proxy"
+            wait_until(found, lambda s=service: ":115" in lab.ask_master("lookupService", s), 8)
+        assert [node.returncode for node in nodes] == [None] * 4
+        assert all(is_leased(lab, name) for name in names)
+
+
+@each_library
+def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
+    lab: Lab, library: str, tmp_path: Path
+) -> None:
+    name, more = lab.unique("stray"), tmp_path / "more"
+    node = stray(
+        lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more, last=1
+    )
+    assert arrived(lab)["adopted"] == 1
+    more.touch()
+    node.wait_for("^more")
+    lab.node(library, "out", "sub", topic=f"/{name}/b").wait_for_count("^got ", 3)
+    wait_until("the topic is gone", lambda: not lab.users(f"/{name}/a")[0], timeout=6)
+
+
+@each_library
+def test_a_stray_that_registers_through_the_proxy_before_the_news(
+    lab: Lab, library: str, tmp_path: Path
+) -> None:
+    """Its connection to the master is lost; the next registration takes the others along."""
+    name, more = lab.unique("stray"), tmp_path / "more"
+    with reached_by_the_master(lab, "c1"):
+        node = stray(
+            lab, library, "more", name=name, topic=f"/{name}/a", then=f"/{name}/b", when=more
+        )
+        end_connections(lab.place("c1"), OUT_NODE)
+        more.touch()
+        node.wait_for("^more")
+        for topic in ("a", "b"):
+            lab.node(library, "out", "sub", topic=f"/{name}/{topic}").wait_for_count("^got ", 3)
+        assert is_leased(lab, name)
+        assert arrived(lab)["adopted"] == 0
+        assert node.returncode is None
+
+
+def end_connections(place: Place, master: str) -> None:
+    """Ends the idle connections that the nodes of a machine keep to their master."""
+    ip("netns", "exec", place.namespace, "ss", "-K", "dst", master, "dport", "=", ":11311")
+
+
+@contextlib.contextmanager
+def address_changed(place: Place, after: str) -> Iterator[None]:
+    """The machine has another address, as a container that was taken off its network and back."""
+    before, gateway = place.address, place.address.rpartition(".")[0] + ".1"
+
+    def change(old: str, new: str) -> None:
+        ip("-n", place.namespace, "addr", "del", f"{old}/24", "dev", "eth0")
+        ip("-n", place.namespace, "addr", "add", f"{new}/24", "dev", "eth0")
+        ip("-n", place.namespace, "route", "replace", "default", "via", gateway)
+        place.addresses[0] = new
+
+    change(before, after)
+    try:
+        yield
+    finally:
+        change(after, before)
+
+
+@each_library
+def test_a_container_that_has_moved(
+    lab: Lab, library: str, measure: Measure, tmp_path: Path
+) -> None:
+    """Heard again on the same port, outside and inside; and it can register more."""
+    name, more, place = lab.unique("moved"), tmp_path / "more", lab.place("c3")
+    options = {"topic": f"/{name}/a", "then": f"/{name}/b", "when": more}
+    env = {"ROS_IP": place.address}
+    node = lab.node(library, "c3", "more", name=name, env=env, **options)
+    server = lab.node(library, "c3", "serve", name=f"{name}_s", service=f"/{name}/s", env=env)
+    receiver = lab.node(library, "c3", "sub", name=f"{name}_r", topic=f"/{name}/c", env=env)
+    for one in (node, server, receiver):
+        one.wait_for("^ready")
+    peers = [lab.node(p, r, "sub", topic=f"/{name}/a") for r in ("out", "c2") for p in LIBRARIES]
+    for peer in peers:
+        peer.wait_for_count("^got ", 3)
+    # The proxy ends connections that are idle for 75 s; one that is kept hangs with its address.
+    end_connections(place, lab.place("px").address)
+    before, old = lab.node_uri(name), place.address
+    with address_changed(place, old.rpartition(".")[0] + ".99"):
+        marks = [peer.mark() for peer in peers]
+        moved = time.time()
+        assert tell(lab, "/containers", moved={old: place.address})["moved"] == 3
+        for peer, mark in zip(peers, marks, strict=True):
+            peer.wait_for_count("^got ", 3, since=mark)
+        measure("moved: heard again", time.time() - moved)
+        after = lab.node_uri(name)
+        assert before is not None
+        assert after is not None
+        assert before.split("/")[2] == after.split("/")[2], "another port"
+        assert after.endswith(f"/{place.address}/")
+        more.touch()
+        for role in ("out", "c2"):
+            lab.node(library, role, "sub", topic=f"/{name}/b").wait_for_count("^got ", 3)
+            lab.node(library, role, "call", service=f"/{name}/s").wait_for("^reply ask 0 ")
+            word = lab.unique("word")
+            lab.node(library, role, "pub", topic=f"/{name}/c", word=word)
+            receiver.wait_for_count(f"^got {word} ", 3)
+        assert lab.node_uri(name) == after
+        assert tell(lab, "/containers", moved={old: place.address})["moved"] == 0
+        assert node.stop() == 0
+        lab.wait_unregistered(name, timeout=2)
+
+
+def test_a_retired_proxy_leaves_nothing_at_the_master(lab: Lab) -> None:
+    names = [lab.unique("last") for _ in LIBRARIES]
+    for library, name in zip(LIBRARIES, names, strict=True):
+        lab.node(library, "c1", "pub", name=name, topic=f"/{name}/t").wait_for("^ready")
+    assert tell(lab, "/retire")["unregistered"] >= 2
+    assert not any(lab.registered(name) for name in names)
+    late = ("registerPublisher", "/late", "std_msgs/String", "http://c1box:1/")
+    with pytest.raises(LookupError, match="retired"):
+        lab.ask_master(*late, role="c1")
+    assert not lab.users("/late")[0]
+    assert lab.proxy is not None
+    lab.proxy.stop()
+    lab.start_proxy()
