@@ -1,4 +1,5 @@
-# The proxy's image: docker build --target proxy -t rosproxy .
+# The proxy's image:       docker build --target proxy -t rosproxy .
+# The controllers' image:  docker build --target operator -t rosproxy-operator .
 # Any base with Debian's packages will do; where it has no Python, Debian's is installed.
 ARG BASE_IMAGE=python:3.12-slim-bookworm
 
@@ -20,20 +21,27 @@ RUN if ! python3 -c 'import ensurepip' 2>/dev/null; then \
 # Two environments: one with pip, that stays here, and the one that is shipped.
 RUN python3 -m venv /opt/build && python3 -m venv --without-pip /opt/rosproxy
 WORKDIR /src
-# Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
-ARG EXTRAS=""
+# PIP_CONSTRAINT and not --constraint: it pins the build backend too.
+ENV PIP_CONSTRAINT=/src/constraints.txt
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY proxy proxy
-# PIP_CONSTRAINT and not --constraint: it pins the build backend too.
-RUN PIP_CONSTRAINT=/src/constraints.txt /opt/build/bin/pip --python /opt/rosproxy/bin/python \
-      install --no-cache-dir --compile ".${EXTRAS:+[$EXTRAS]}"
+
+
+FROM builder AS proxy-builder
+# Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
+ARG EXTRAS=""
+# Without operator/: a change of the controllers makes no other proxy image, so it replaces no
+# proxy. What is left of them is the name of a program.
+RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
+      ".${EXTRAS:+[$EXTRAS]}" \
+    && rm /opt/rosproxy/bin/rosproxy-controller
 
 
 FROM base AS proxy
 LABEL org.opencontainers.image.title="rosproxy" \
       org.opencontainers.image.description="A transparent proxy between isolated networks for ROS 1" \
       org.opencontainers.image.licenses="Apache-2.0"
-COPY --from=builder /opt/rosproxy /opt/rosproxy
+COPY --from=proxy-builder /opt/rosproxy /opt/rosproxy
 ENV PATH=/opt/rosproxy/bin:$PATH
 # A number, so that Kubernetes can check runAsNonRoot. The proxy writes no file at all:
 # it runs with --read-only, --cap-drop ALL and --security-opt no-new-privileges.
@@ -46,3 +54,28 @@ HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["ros
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["rosproxy"]
 CMD ["run"]
+
+
+FROM builder AS operator-builder
+# Which controllers: docker, kubernetes, or operator for both.
+ARG OPERATOR_EXTRAS=docker
+COPY operator operator
+RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
+      ".[$OPERATOR_EXTRAS]"
+
+
+FROM base AS operator
+LABEL org.opencontainers.image.title="rosproxy-operator" \
+      org.opencontainers.image.description="Controllers that run rosproxy for labelled containers" \
+      org.opencontainers.image.licenses="Apache-2.0"
+COPY --from=operator-builder /opt/rosproxy /opt/rosproxy
+ENV PATH=/opt/rosproxy/bin:$PATH
+# A number, as above. It writes no file and opens no port but its own health check, on
+# loopback. The engine's socket belongs to root: who mounts it runs this as 0:0, still
+# without any capability (examples/docker), or puts a socket proxy between.
+USER 10001:10001
+WORKDIR /
+HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy-controller", "health"]
+STOPSIGNAL SIGTERM
+ENTRYPOINT ["rosproxy-controller"]
+CMD ["docker"]

@@ -7,16 +7,17 @@ MAKEFLAGS += --no-print-directory
 VENV ?= .venv
 BIN := $(VENV)/bin
 IMAGE ?= rosproxy:latest
+OPERATOR_IMAGE ?= rosproxy-operator:latest
 # Which layers `make test` runs, for example: make test LAYERS="unit ros"
 LAYERS ?=
-SOURCES := proxy tests scripts
+SOURCES := proxy operator tests scripts
 
 $(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
 	@scripts/venv.sh $(VENV)
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh
-	@scripts/venv.sh $(VENV) dev,uvloop
+	@scripts/venv.sh $(VENV) dev,uvloop,operator
 	@touch $(VENV)/.runtime $@
 
 .PHONY: help
@@ -57,8 +58,9 @@ lock: ## pin what is installed anew, into constraints.txt
 	@scripts/lock.sh constraints.txt
 
 .PHONY: image
-image: ## build the proxy's container image (IMAGE=rosproxy:latest)
+image: ## build the container images of the proxy and of the controllers (IMAGE, OPERATOR_IMAGE)
 	docker build --target proxy --tag $(IMAGE) .
+	docker build --target operator --tag $(OPERATOR_IMAGE) .
 
 .PHONY: clean
 clean: ## remove what the other targets made

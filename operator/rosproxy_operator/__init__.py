@@ -1,0 +1,1 @@
+"""Controllers that provide containers and pods with a proxy of their own."""

@@ -1,0 +1,81 @@
+"""From wishes to the proxies that there ought to be."""
+
+from collections.abc import Collection, Iterable
+
+from rosproxy_operator.core.membership import BUILT_IN
+from rosproxy_operator.core.memory import Memory
+from rosproxy_operator.core.model import Desired, Key, Network, Observed, Problem, Wish
+from rosproxy_operator.core.settings import PlanSettings
+
+
+def desire(
+    observed: Observed,
+    settings: PlanSettings,
+    wishes: Iterable[Wish],
+    memory: Memory,
+    now: float,
+) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
+    """One Desired for each key that is wished for or has a proxy, sorted by key.
+
+    A wish for networks that are not there (any more) is dropped. Containers that have exited
+    keep networks joined that a proxy is on, for the settings' grace, but join none.
+    """
+    every = tuple(wishes)
+    bad = _before_uplink(observed.networks, settings.uplink)
+    usable = {network.name for network in observed.networks} - BUILT_IN - bad
+    keys = {wish.key for wish in every} | observed.keys
+    recent = [
+        wish
+        for wish in every
+        if not wish.alive and now - memory.exited.get(wish.id, now) < settings.grace
+    ]
+    live = [wish for wish in every if wish.alive and wish.networks & usable]
+    desired = tuple(
+        _one(key, settings.ports, live, _kept(key, recent, observed), usable)
+        for key in sorted(keys)
+    )
+    wanted = {name for wish in every if wish.alive for name in wish.networks}
+    return desired, tuple(_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
+
+
+def _one(
+    key: Key, ports: int, live: Iterable[Wish], kept: frozenset[str], usable: Collection[str]
+) -> Desired:
+    own = tuple(wish for wish in live if wish.key == key)
+    joined = {name for wish in own for name in wish.networks} | kept
+    return Desired(
+        key=key,
+        live=bool(own),
+        ports=max([ports, *(wish.ports for wish in own)]),
+        networks=frozenset(joined.intersection(usable)),
+        wishes=own,
+    )
+
+
+def _kept(key: Key, recent: Iterable[Wish], observed: Observed) -> frozenset[str]:
+    """The networks that a key's sandboxes are on and that its exited containers are, too."""
+    there = {n for s in observed.sandboxes if s.key == key for n in s.container.networks}
+    left = {name for wish in recent if wish.key == key for name in wish.networks}
+    return frozenset(there & left)
+
+
+def _before_uplink(networks: Iterable[Network], uplink: str) -> set[str]:
+    """Networks that would take the published ports and the default route over from the uplink.
+
+    The engine gives both to the network whose name sorts first, internal ones aside, and moving
+    them cuts all connections.
+    """
+    return {
+        network.name
+        for network in networks
+        if not network.internal and network.name.encode() < uplink.encode()
+    }
+
+
+def _bad_network(name: str, uplink: str) -> Problem:
+    return Problem(
+        f"network {name}",
+        f"can't be joined: its name sorts before that of the uplink network {uplink}, so the "
+        "engine would move the proxy's published ports to it: give it another name, or start the "
+        "controller with an --uplink that sorts first",
+    )

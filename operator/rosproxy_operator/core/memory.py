@@ -1,0 +1,99 @@
+"""What a controller remembers from look to look. Losing it costs time, never correctness."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.model import Key, Observed, Wish
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The engine didn't start a sandbox because of its ports.
+
+    ``since`` is when it first said so. ``ports`` are those that it named; None if it named none.
+    """
+
+    since: float
+    ports: frozenset[int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A proxy had to leave the range on which it had served."""
+
+    ports: PortRange
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Times are in seconds of the controller's monotonic clock.
+
+    ``exited`` are containers, by id, since when they are seen not to run; ``absent`` proxies since
+    when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
+    ``planned`` the one with which one is being created. ``refusals`` are by the name of the
+    sandbox. ``taken`` are ports that the engine has refused, and when.
+    """
+
+    exited: Mapping[str, float] = field(default_factory=dict)
+    absent: Mapping[Key, float] = field(default_factory=dict)
+    served: Mapping[Key, PortRange] = field(default_factory=dict)
+    planned: Mapping[Key, PortRange] = field(default_factory=dict)
+    refusals: Mapping[str, Refusal] = field(default_factory=dict)
+    taken: Mapping[int, float] = field(default_factory=dict)
+    moved: Mapping[Key, Move] = field(default_factory=dict)
+
+    def port_taken(self, name: str, ports: Iterable[int] | None, now: float) -> "Memory":
+        """Note that the engine could not start the sandbox ``name``: ports are taken.
+
+        ``ports`` are those that it named; None or nothing if it is not known which.
+        """
+        known = self.refusals.get(name)
+        refusal = Refusal(known.since if known else now, frozenset(ports or ()) or None)
+        return replace(self, refusals={**self.refusals, name: refusal})
+
+
+TAKEN_FOR = 300.0
+"""Seconds for which a port is avoided that the engine has refused."""
+MOVED_FOR = 600.0
+"""Seconds for which it is told that a proxy had to leave its range."""
+SERVING = frozenset({"running", "paused", "restarting"})
+"""States of a container that runs, or does again in a moment."""
+_HAS_SERVED = SERVING | {"exited", "dead", "removing"}
+
+
+def looked(
+    memory: Memory, observed: Observed, wishes: Iterable[Wish], grace: float, now: float
+) -> Memory:
+    """What is remembered after a look at the host, before anything is decided."""
+    every = tuple(wishes)
+    live = {wish.key for wish in every if wish.alive}
+    idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
+    known = (observed.keys | set(memory.served)) - live
+    absent = {key: memory.absent.get(key, now) for key in sorted(known)}
+    kept = live | observed.keys | {key for key, since in absent.items() if now - since < grace}
+    return Memory(
+        exited={w.id: memory.exited.get(w.id, now) for w in every if not w.alive},
+        absent={key: since for key, since in absent.items() if key in kept},
+        served={key: ports for key, ports in _served(memory, observed).items() if key in kept},
+        planned={key: ports for key, ports in memory.planned.items() if key in live},
+        refusals={name: said for name, said in memory.refusals.items() if name in idle},
+        taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
+        moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
+    )
+
+
+def _served(memory: Memory, observed: Observed) -> dict[Key, PortRange]:
+    """Where each proxy has served: what is running knows best, what has stopped least."""
+    found = {
+        sandbox.key: sandbox.range
+        for sandbox in reversed(observed.sandboxes)
+        if sandbox.container.state in _HAS_SERVED
+    }
+    serving = {
+        sandbox.key: sandbox.range
+        for sandbox in reversed(observed.sandboxes)
+        if sandbox.container.state in SERVING
+    }
+    return {**found, **memory.served, **serving}

@@ -1,0 +1,147 @@
+"""Carrying out what was planned.
+
+Every action may be carried out twice, or after somebody else did it, or on something that has
+vanished meanwhile: that is no error, the next look sees what is left to do.
+"""
+
+import contextlib
+import logging
+import secrets
+from collections.abc import Iterator
+
+from rosproxy.core.uris import HostPort
+from rosproxy_operator.core.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    ProxySpec,
+    Remove,
+    Rename,
+    Restart,
+    Start,
+    Unpause,
+)
+from rosproxy_operator.core.fingerprint import (
+    MANAGED,
+    container_config,
+    master,
+    read_own,
+    sandbox_config,
+)
+from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.docker.engine import Engine, Json
+from rosproxy_operator.docker.errors import Conflict, EngineError, Gone
+from rosproxy_operator.docker.observe import Look, Way
+from rosproxy_operator.masters import Masters
+from rosproxy_operator.proxies import Proxies, ProxyError
+from rosproxy_operator.threads import in_thread
+
+log = logging.getLogger(__name__)
+
+
+class Applier:
+    """Carries out actions, each in a thread."""
+
+    def __init__(
+        self, engine: Engine, settings: PlanSettings, proxies: Proxies, masters: Masters
+    ) -> None:
+        self._engine, self._settings = engine, settings
+        self._proxies, self._masters = proxies, masters
+        self._former: dict[str, str] = {}
+
+    async def carry_out(self, action: Action, look: Look) -> None:
+        """Carry out an action that was planned from a look. Raises EngineError."""
+        if isinstance(action, Remove) and action.retire:
+            await self._retire(action.name, look.ways.get(self._seen_as(action.name, look)))
+        await in_thread(self._do, action, look)
+
+    def _seen_as(self, name: str, look: Look) -> str:
+        """The name that a container had when the look was made, of one renamed since then."""
+        return name if name in look.tokens else self._former.get(name, name)
+
+    async def _retire(self, name: str, way: Way | None) -> None:
+        if way is None:
+            return
+        try:
+            told = await self._proxies.retire(HostPort(way.host, way.port), way.token)
+            log.info("%s has unregistered %s nodes at its master", name, told.get("unregistered"))
+        except ProxyError as error:
+            log.warning("%s could not unregister its nodes at the master: %s", name, error)
+
+    def _do(self, action: Action, look: Look) -> None:  # noqa: C901 - one case per action
+        engine = self._engine
+        match action:
+            case CreateNetwork(name):
+                with _fine("already exists"):
+                    engine.create_network(name, {MANAGED: "true"})
+            case CreateSandbox(spec):
+                self._create(spec.name, sandbox_config(spec, self._settings))
+            case Create(spec):
+                self._create(spec.name, self._config(spec, look))
+            case Start(name):
+                with _fine("is not running"):
+                    engine.start(name)
+            case Restart(name):
+                with _fine():
+                    engine.restart(name)
+            case Unpause(name):
+                with _fine("is not paused"):
+                    engine.unpause(name)
+            case Rename(name, to):
+                with _fine("same name as its current name"):
+                    engine.rename(name, to)
+                self._former[to] = name
+            case Connect(name, network, aliases):
+                with _fine("already exists in network", "already attached"):
+                    engine.connect(name, network, aliases)
+            case Disconnect(name, network):
+                with _fine("is not connected"):
+                    engine.disconnect(name, network)
+            case Remove(name):
+                with _fine("is already in progress"):
+                    self._leave_all(name)
+                    engine.remove(name)
+
+    def _leave_all(self, name: str) -> None:
+        """Take a container off all networks but the uplink.
+
+        The engine lays the published ports anew over each one that it still has when it ends,
+        which takes 2 s per network.
+        """
+        networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
+        for network in networks:
+            if network != self._settings.uplink:
+                with _fine("is not connected"):
+                    self._engine.disconnect(name, network)
+
+    def _config(self, spec: ProxySpec, look: Look) -> Json:
+        token = look.tokens.get(self._seen_as(spec.replaces, look)) or secrets.token_hex(16)
+        address = self._masters.address(master(spec.key).host)
+        return container_config(spec, self._settings, token, address)
+
+    def _create(self, name: str, config: Json) -> None:
+        try:
+            self._engine.create_container(name, config)
+        except Conflict:
+            labels = self._engine.container(name)["Config"].get("Labels") or {}
+            if read_own(labels) is None:
+                raise EngineError(
+                    f"a container that is not this controller's is called {name}; "
+                    f"rename it (docker rename {name} …) or remove it"
+                ) from None
+
+
+@contextlib.contextmanager
+def _fine(*said: str) -> Iterator[None]:
+    """Let pass what the engine says when there is nothing left to do, and that things are gone."""
+    try:
+        yield
+    except Gone as error:
+        log.debug("gone meanwhile: %s", error)
+    except EngineError as error:
+        if not any(words in str(error) for words in said):
+            raise
+        log.debug("nothing to do: %s", error)

@@ -1,0 +1,92 @@
+"""Running the Docker controller's commands."""
+
+import asyncio
+import json
+import logging
+import signal
+import time
+
+from rosproxy import __version__
+from rosproxy.console import WATCH_INTERVAL, draw, size, write
+from rosproxy_operator.core.model import Problem
+from rosproxy_operator.core.report import plan_text, render
+from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.docker.controller import Controller
+from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.status import Survey, describe, survey
+from rosproxy_operator.health import Health
+from rosproxy_operator.metrics import Metrics
+from rosproxy_operator.settings import DockerSettings
+
+log = logging.getLogger(__name__)
+
+ONCE = 60.0
+"""Seconds within which ``--once`` has to reach what is wanted."""
+
+
+def run(settings: DockerSettings) -> None:
+    """Run the controller until a signal ends it; its proxies go on. Raises SettingError."""
+    asyncio.run(_run(settings))
+
+
+def run_once(settings: DockerSettings) -> list[Problem]:
+    """Look and act until nothing is left to do; what is not as wanted. Raises EngineError."""
+    return asyncio.run(_run_once(settings))
+
+
+def show_plan(settings: PlanSettings) -> None:
+    """Print what would be done now, and what is wrong. Raises EngineError."""
+    found = asyncio.run(survey(settings))
+    write(plan_text(found.plan.actions))
+    for problem in found.problems:
+        write(f"{problem.subject}: {problem.text}")
+
+
+def show_status(settings: PlanSettings, as_json: bool) -> None:
+    """Print what there is on the host. Raises EngineError."""
+    found = asyncio.run(survey(settings))
+    write(_text(found, settings, as_json, size()[0], None))
+
+
+def watch_status(settings: PlanSettings) -> None:
+    """Draw the status again and again until interrupted, also while no engine answers."""
+    try:
+        while True:
+            columns, lines = size()
+            try:
+                text = _text(asyncio.run(survey(settings)), settings, False, columns, lines)
+            except EngineError as error:
+                text = f"{time.strftime('%H:%M:%S')} {error}"
+            draw(text)
+            time.sleep(WATCH_INTERVAL)
+    except KeyboardInterrupt:
+        write("")
+
+
+def _text(
+    found: Survey, settings: PlanSettings, as_json: bool, columns: int, lines: int | None
+) -> str:
+    status = describe(found, settings)
+    return json.dumps(status, indent=2) if as_json else render(status, columns, lines)
+
+
+async def _run(settings: DockerSettings) -> None:
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    metrics = Metrics()
+    controller = Controller(settings, metrics)
+    health = Health(metrics.registry, controller.dead, controller.unready)
+    await health.start(settings.admin)
+    log.info("rosproxy-controller %s: health and metrics at http://%s", __version__, settings.admin)
+    running = asyncio.create_task(controller.run())
+    stopping = asyncio.create_task(stopped.wait())
+    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+    if running.done():
+        running.result()  # raises what it died of
+    running.cancel()
+    await asyncio.gather(running, stopping, health.stop(), return_exceptions=True)
+
+
+async def _run_once(settings: DockerSettings) -> list[Problem]:
+    return await Controller(settings, Metrics()).run_once(ONCE)

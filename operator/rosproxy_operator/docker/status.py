@@ -1,0 +1,166 @@
+"""What there is on a host, for ``status`` and ``plan``: found out without a running controller."""
+
+import asyncio
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from rosproxy import __version__
+from rosproxy.core.uris import HostPort, parse_host_port
+from rosproxy_operator.core.fingerprint import proxy_name, sandbox_name
+from rosproxy_operator.core.memory import Memory
+from rosproxy_operator.core.model import Container, Key, Problem, Proxy, Sandbox
+from rosproxy_operator.core.plan import Plan, plan
+from rosproxy_operator.core.report import line
+from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.docker.details import Inspector
+from rosproxy_operator.docker.engine import Engine
+from rosproxy_operator.docker.observe import Look, Observer
+from rosproxy_operator.docker.sense import sense, unresolved
+from rosproxy_operator.docker.teller import silence
+from rosproxy_operator.masters import Masters
+from rosproxy_operator.proxies import Json, Proxies, ProxyError
+
+Own = TypeVar("Own", Proxy, Sandbox)
+PATIENCE = 3.0
+"""Seconds that are waited for inspections: nobody looks a second time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """One look at a host, what would be done there, and what its proxies say, by name."""
+
+    look: Look
+    plan: Plan
+    said: Mapping[str, Json | ProxyError]
+    problems: tuple[Problem, ...]
+
+
+async def survey(settings: PlanSettings) -> Survey:
+    """Look at the engine and ask all proxies. Raises EngineError."""
+    engine, masters, proxies = Engine(), Masters(_nothing), Proxies()
+    observer = Observer(engine, settings, Inspector(engine, _nothing))
+    try:
+        look = await sense(observer, masters, settings, PATIENCE)
+        planned = plan(look.observed, settings, Memory(), time.monotonic())
+        answers = await asyncio.gather(
+            *(_ask(proxies, HostPort(way.host, way.port)) for way in look.ways.values())
+        )
+    finally:
+        await proxies.close()
+    said = dict(zip(look.ways, answers, strict=True))
+    silent = [
+        silence(name, answer, look, settings.uplink)
+        for name, answer in said.items()
+        if isinstance(answer, ProxyError)
+    ]
+    problems = (*planned.problems, *unresolved(look, masters, settings), *silent)
+    return Survey(look, planned, said, problems)
+
+
+def describe(found: Survey, settings: PlanSettings) -> Json:
+    """A survey as JSON: what `rosproxy_operator.core.report.render` shows."""
+    observed = found.look.observed
+    keys = {wish.id: wish.key for wish in found.plan.wishes if wish.key in observed.keys}
+    listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
+    return {
+        "version": __version__,
+        "uplink": settings.uplink,
+        "proxies": [_proxy(key, found, settings) for key in sorted(observed.keys)],
+        "containers": [_container(c, _name(keys.get(c.id)), found) for c in listed],
+        "problems": [
+            {"subject": problem.subject, "text": problem.text, "fatal": problem.fatal}
+            for problem in found.problems
+        ],
+        "actions": [line(action) for action in found.plan.actions],
+    }
+
+
+def _name(key: Key | None) -> str | None:
+    return proxy_name(key) if key else None
+
+
+def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
+    """One row per proxy; its sandbox is only told of where it is what is wrong."""
+    observed, name = found.look.observed, proxy_name(key)
+    process = _best([p for p in observed.proxies if p.key == key], name)
+    box = _best([box for box in observed.sandboxes if box.key == key], sandbox_name(key))
+    answer = found.said.get(process.container.name) if process else None
+    said = answer if isinstance(answer, dict) else {}
+    its_master, ports = said.get("master") or {}, said.get("ports") or {}
+    own = box or process
+    networks = box.container.networks if box else frozenset()
+    return {
+        "name": name,
+        "master_uri": key.master_uri,
+        "master_address": its_master.get("address") or "",
+        "master_up": its_master.get("up"),
+        "advertise_host": key.advertise_host,
+        "range": str(own.range) if own else "",
+        "state": process.container.state if process else "absent",
+        "reachable": bool(said),
+        "networks": sorted(networks - {settings.uplink}),
+        "used": ports.get("used"),
+        "free": ports.get("free"),
+        "problems": [
+            *_amiss(box, sandbox_name(key)),
+            *(f"{p['subject']}: {p['text']}" for p in said.get("problems") or ()),
+        ],
+    }
+
+
+def _best(found: Sequence[Own], name: str) -> Own | None:
+    """The one that is called so, if it runs; else any that runs; else any."""
+    ranked = sorted(found, key=lambda o: (o.container.state != "running", o.container.name != name))
+    return ranked[0] if ranked else None
+
+
+def _amiss(box: Sandbox | None, name: str) -> Iterator[str]:
+    state = box.container.state if box else "absent"
+    if state != "running":
+        yield f"the container {name}, which holds its ports and networks, is {state}"
+
+
+def _container(container: Container, proxy: str | None, found: Survey) -> Json:
+    addresses = {a.network: a.address for a in container.attachments if a.address}
+    answer = found.said.get(proxy or "")
+    nodes = answer.get("nodes", ()) if isinstance(answer, dict) else ()
+    return {
+        "name": container.name,
+        "state": container.state,
+        "proxy": proxy,
+        "networks": sorted(container.networks),
+        "addresses": addresses,
+        "nodes": [_node(node) for node in nodes if _host(node) in addresses.values()],
+    }
+
+
+def _node(node: Mapping[str, Any]) -> Json:
+    return {
+        "names": node.get("nodes", []),
+        "address": node.get("address", ""),
+        "advertised_uri": node.get("advertised_uri", ""),
+        "state": node.get("state", ""),
+    }
+
+
+def _host(node: Mapping[str, Any]) -> str:
+    where = parse_host_port(str(node.get("address", "")))
+    return where.host if where else ""
+
+
+def _meant(container: Container, found: Survey) -> bool:
+    """Whether something is wrong with a container's labels."""
+    return any(problem.subject == f"container {container.name}" for problem in found.problems)
+
+
+async def _ask(proxies: Proxies, where: HostPort) -> Json | ProxyError:
+    try:
+        return await proxies.status(where)
+    except ProxyError as error:
+        return error
+
+
+def _nothing() -> None:
+    """Nobody has to be woken."""

@@ -1,0 +1,112 @@
+"""The settings of the controllers, validated."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Any
+
+from rosproxy.core.settings import SettingError, parse_range
+from rosproxy.core.uris import HostPort, is_loopback, parse_host_port, parse_slave_uri
+from rosproxy_operator.core.settings import MOST_PORTS, PlanSettings
+
+DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
+_NAME = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-"
+
+
+@dataclass(frozen=True, slots=True)
+class DockerSettings:
+    """Everything that ``rosproxy-controller docker`` can be told.
+
+    ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
+    serves its own health.
+    """
+
+    plan: PlanSettings
+    resync: float = 30.0
+    admin: HostPort = DEFAULT_ADMIN
+
+
+def parse_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
+    """Settings from the values of the command line's options.
+
+    Raises SettingError for the first value that can't be used.
+    """
+    plan = PlanSettings(
+        master_uri=_master(options.get("master_uri") or ""),
+        advertise_host=_host(options.get("advertise_host") or ""),
+        ports=_ports(options["ports"]),
+        window=parse_range("--port-window", options["port_window"]),
+        publish=tuple(map(_publish, options["publish_address"] or ("0.0.0.0",))),
+        image=_image(options["proxy_image"]),
+        expose_by_default=options["expose_by_default"],
+        grace=_seconds("--grace", options["grace"], 0.0),
+        uplink=_uplink(options["uplink"]),
+    )
+    if len(plan.window) < plan.ports:
+        raise SettingError(
+            "--port-window", f"{plan.window} has {len(plan.window)} ports, --ports is {plan.ports}"
+        )
+    return DockerSettings(
+        plan=plan,
+        resync=_seconds("--resync", options["resync"], 1.0),
+        admin=_admin(options["admin_bind"]),
+    )
+
+
+def _master(uri: str) -> str:
+    where = parse_slave_uri(uri)
+    if uri and where is None:
+        raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
+    if where and is_loopback(where.host):
+        raise SettingError(
+            "--master-uri",
+            f"{uri!r} means another machine to each container; give the address or name of the "
+            "master's host, or http://host.docker.internal:PORT for this one",
+        )
+    return uri
+
+
+def _host(text: str) -> str:
+    bare = text.strip("[]")
+    whole = f"[{bare}]:1" if ":" in bare else f"{bare}:1"
+    if text and parse_host_port(whole) != HostPort(bare, 1):
+        raise SettingError("--advertise-host", f"{text!r} is neither a host name nor an address")
+    return bare
+
+
+def _ports(count: int) -> int:
+    if not 1 <= count <= MOST_PORTS:
+        raise SettingError("--ports", f"{count} is not between 1 and {MOST_PORTS}")
+    return count
+
+
+def _publish(text: str) -> str:
+    try:
+        return str(ip_address(text))
+    except ValueError:
+        raise SettingError("--publish-address", f"{text!r} is not an IP address") from None
+
+
+def _image(text: str) -> str:
+    if not text or any(c.isspace() for c in text):
+        raise SettingError("--proxy-image", f"{text!r} is not the name of an image")
+    return text
+
+
+def _uplink(text: str) -> str:
+    if not text or not text[0].isalnum() or any(c not in _NAME for c in text):
+        raise SettingError("--uplink", f"{text!r} is not a network's name")
+    return text
+
+
+def _admin(text: str) -> HostPort:
+    where = parse_host_port(text)
+    if where is None:
+        raise SettingError("--admin-bind", f"{text!r} is not of the form 127.0.0.1:11313")
+    return where
+
+
+def _seconds(option: str, value: float, low: float) -> float:
+    if not low <= value <= 86400:
+        raise SettingError(option, f"{value:g} s is not between {low:g} and 86400 s")
+    return float(value)

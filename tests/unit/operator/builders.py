@@ -1,0 +1,137 @@
+"""Containers, networks and hosts for tests."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.core.fingerprint import (
+    fingerprint,
+    master,
+    own_labels,
+    proxy_name,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from rosproxy_operator.core.model import (
+    Attachment,
+    Container,
+    Host,
+    Key,
+    Network,
+    Observed,
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.core.settings import PlanSettings
+
+ROBOT = "http://robot:11311"
+HERE = "192.0.2.10"
+KEY = Key(ROBOT, HERE)
+RANGE = PortRange(11400, 11431)
+SETTINGS = PlanSettings(advertise_host=HERE)
+IMAGE = "sha256:1"
+EPHEMERAL = PortRange(32768, 60999)
+UPLINK = Network("n0", "0-rosproxy", gateway="172.30.0.1")
+APP = Network("n1", "app", gateway="172.18.0.1")
+ENABLED = {"rosproxy.enable": "true", "rosproxy.master-uri": ROBOT}
+
+
+def place(network: str = "app", *names: str, network_id: str = "") -> Attachment:
+    return Attachment(network, "", frozenset(names), network_id)
+
+
+def container(
+    name: str = "talker",
+    labels: Mapping[str, str] | None = None,
+    networks: Iterable[str | Attachment] = ("app",),
+    state: str = "running",
+    env: str = "",
+    mode: str = "",
+    ports: Iterable[int] = (),
+) -> Container:
+    """A container, by default one that runs, is labelled and is on the network ``app``."""
+    places = tuple(place(n, name) if isinstance(n, str) else n for n in networks)
+    return Container(
+        id=f"id-{name}",
+        name=name,
+        state=state,
+        labels=ENABLED if labels is None else labels,
+        network_mode=mode or (places[0].network if places else ""),
+        attachments=places,
+        master_uri=env,
+        host_ports=frozenset(ports),
+    )
+
+
+def sandbox(
+    key: Key = KEY,
+    ports: PortRange = RANGE,
+    networks: Iterable[str | Attachment] = ("app",),
+    state: str = "running",
+    name: str = "",
+    settings: PlanSettings = SETTINGS,
+    made: str = "",
+    started_at: str = "2026-01-01T10:00:00.5Z",
+) -> Sandbox:
+    """A sandbox as the controller makes it, by default one that runs on its uplink and ``app``."""
+    name = name or sandbox_name(key)
+    made = made or sandbox_fingerprint(key, ports, settings)
+    aliases = ("rosproxy", master(key).host, proxy_name(key), name)
+    places = [place(n, *aliases) if isinstance(n, str) else n for n in networks]
+    own = container(
+        name,
+        own_labels(SandboxSpec(name, key, ports, made, settings.uplink)),
+        [place(settings.uplink, name), *places],
+        state,
+        ports=ports.ports(),
+    )
+    return Sandbox(key, replace(own, started_at=started_at), ports, made)
+
+
+def proxy(
+    key: Key = KEY,
+    ports: PortRange = RANGE,
+    state: str = "running",
+    name: str = "",
+    settings: PlanSettings = SETTINGS,
+    image: str = IMAGE,
+    made: str = "",
+    sandbox_id: str = "",
+    started_at: str = "2026-01-01T10:00:00.75Z",
+) -> Proxy:
+    """A proxy as the controller makes it, by default one that runs in the `sandbox` of its key."""
+    name = name or proxy_name(key)
+    made = made or fingerprint(key, ports, settings, image)
+    mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
+    labels = own_labels(ProxySpec(name, key, ports, made, sandbox_name(key)))
+    own = container(name, labels, [], state, mode=mode)
+    return Proxy(key, replace(own, started_at=started_at), ports, made)
+
+
+def both(**more: Any) -> dict[str, Any]:
+    """A sandbox and the proxy in it, for `observed`. Words: key, ports, settings."""
+    return {"sandboxes": [sandbox(**more)], "proxies": [proxy(**more)]}
+
+
+def observed(
+    *containers: Container,
+    proxies: Iterable[Proxy] = (),
+    sandboxes: Iterable[Sandbox] = (),
+    networks: Iterable[Network] = (UPLINK, APP),
+    listening: Iterable[int] = (),
+    ephemeral: PortRange = EPHEMERAL,
+    image: str = IMAGE,
+    advertise: Mapping[str, str] | None = None,
+) -> Observed:
+    """A host with these containers."""
+    return Observed(
+        containers=containers,
+        networks=tuple(networks),
+        proxies=tuple(proxies),
+        host=Host(ephemeral, frozenset(listening)),
+        image_id=image,
+        advertise=advertise or {},
+        sandboxes=tuple(sandboxes),
+    )

@@ -1,0 +1,309 @@
+"""A pure engine: what actions do to a host, and what must never be done to it."""
+
+import itertools
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    Remove,
+    Rename,
+    Restart,
+    Start,
+    Unpause,
+)
+from rosproxy_operator.core.fingerprint import ROLE_PROXY, ROLE_SANDBOX, Own, own_labels, read_own
+from rosproxy_operator.core.memory import Memory
+from rosproxy_operator.core.model import (
+    STARTED,
+    Attachment,
+    Container,
+    Host,
+    Network,
+    Observed,
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.core.plan import Plan, plan
+from rosproxy_operator.core.settings import PlanSettings
+
+SERVING = {"running", "paused", "restarting"}
+
+
+class Failed(Exception):
+    """The engine can't do it."""
+
+
+class Refused(Failed):
+    """A container can't be started because of its ports."""
+
+    def __init__(self, ports: Collection[int]) -> None:
+        super().__init__(f"ports are taken: {sorted(ports)}")
+        self.ports = ports
+
+
+@dataclass
+class Box:
+    """A container of the engine. ``networks`` holds ids and names by network.
+
+    ``namespace`` is when its network namespace came to be: for a proxy, its sandbox's start.
+    """
+
+    id: str
+    name: str
+    state: str = "created"
+    labels: dict[str, str] = field(default_factory=dict)
+    networks: dict[str, tuple[str, frozenset[str]]] = field(default_factory=dict)
+    env: str = ""
+    ports: frozenset[int] = frozenset()
+    mode: str = ""
+    started: int = 0
+    namespace: int = 0
+
+    @property
+    def own(self) -> Own | None:
+        return read_own(self.labels)
+
+    @property
+    def role(self) -> str:
+        return self.own.role if self.own else ""
+
+    @property
+    def started_at(self) -> str:
+        return f"2026-01-01T00:00:00.{self.started:06d}".rstrip("0") + "Z"
+
+
+class Engine:
+    """A Docker host. ``open`` and ``hidden`` are ports that other programs hold; the controller
+    can't see the hidden ones. ``names_ports``: refusals name the port.
+    """
+
+    def __init__(self, settings: PlanSettings, ephemeral: PortRange) -> None:
+        self.settings = settings
+        self.ephemeral = ephemeral
+        self.boxes: list[Box] = []
+        self.networks: dict[str, Network] = {}
+        self.open: set[int] = set()
+        self.hidden: set[int] = set()
+        self.image = "image-1"
+        self.names_ports = True
+        self.ids = itertools.count()
+
+    # what users do
+
+    def add_network(self, name: str, internal: bool = False) -> None:
+        self.networks[name] = Network(f"net-{next(self.ids)}", name, internal=internal)
+
+    def add(self, name: str, **more: object) -> Box:
+        box = Box(f"box-{next(self.ids)}", name)
+        for word, value in more.items():
+            setattr(box, word, value)
+        self.boxes.append(box)
+        return box
+
+    def join(self, box: Box, network: str, *names: str) -> None:
+        known = self.networks[network].id if box.state in SERVING | {"exited"} else ""
+        box.networks[network] = known, frozenset({box.name, *names})
+
+    def active(self, network: str) -> bool:
+        """Whether a network can't be removed: something that runs is on it."""
+        return any(network in box.networks and box.state in SERVING for box in self.boxes)
+
+    def conflicts(self, box: Box) -> set[int]:
+        """The ports of a container that something else holds."""
+        others = {
+            port
+            for one in self.boxes
+            if one is not box and one.state in SERVING
+            for port in one.ports
+        }
+        return set(box.ports) & (others | self.open | self.hidden)
+
+    # what a controller sees
+
+    def observe(self) -> Observed:
+        held = {port for box in self.boxes if box.state in STARTED for port in box.ports}
+        own = [(box, box.own) for box in self.boxes]
+        return Observed(
+            containers=tuple(self._container(box) for box, role in own if role is None),
+            networks=tuple(self.networks.values()),
+            proxies=tuple(
+                Proxy(is_.key, self._container(box), is_.range, is_.fingerprint)
+                for box, is_ in own
+                if is_ and is_.role == ROLE_PROXY
+            ),
+            host=Host(self.ephemeral, frozenset(self.open | held)),
+            image_id=self.image,
+            sandboxes=tuple(
+                Sandbox(is_.key, self._container(box), is_.range, is_.fingerprint)
+                for box, is_ in own
+                if is_ and is_.role == ROLE_SANDBOX
+            ),
+        )
+
+    def _container(self, box: Box) -> Container:
+        places = tuple(
+            Attachment(name, "", names | {box.name}, known)
+            for name, (known, names) in box.networks.items()
+        )
+        return Container(
+            id=box.id,
+            name=box.name,
+            state=box.state,
+            labels=dict(box.labels),
+            network_mode=box.mode,
+            attachments=places,
+            master_uri=box.env,
+            host_ports=box.ports,
+            started_at=box.started_at,
+        )
+
+    # what a controller does
+
+    def apply(self, action: Action) -> None:  # noqa: C901, PLR0912 - one case per action
+        """Raises Failed. An AssertionError means that the plan is wrong in itself."""
+        match action:
+            case CreateNetwork(name):
+                if name in self.networks:
+                    raise Failed(f"network {name} exists")
+                self.add_network(name)
+            case CreateSandbox() | Create():
+                self._create(action)
+            case Start(name):
+                self.start(self.own(name))
+            case Restart(name):
+                box = self.own(name)
+                assert box.role == ROLE_PROXY
+                box.state = "exited"
+                self.start(box)
+            case Unpause(name):
+                box = self.own(name)
+                if box.state != "paused":
+                    raise Failed("not paused")
+                box.state = "running"
+            case Rename(name, to):
+                box = self.own(name)
+                if self._named(to):
+                    raise Failed(f"{to} exists")
+                box.name = to
+            case Connect(name, network, aliases):
+                self._connect(self.own(name), network, aliases)
+            case Disconnect(name, network):
+                box = self.own(name)
+                if network not in box.networks or network not in self.networks:
+                    raise Failed("not connected")
+                del box.networks[network]
+            case Remove(name):
+                self.boxes.remove(self.own(name))
+
+    def own(self, name: str) -> Box:
+        """A container to do something to, which must be the controller's own."""
+        found = self._named(name)
+        if not found:
+            raise Failed(f"no container {name}")
+        assert found[0].own is not None, f"{name} is not the controller's"
+        assert found[0].state != "removing"
+        return found[0]
+
+    def _named(self, name: str) -> list[Box]:
+        return [box for box in self.boxes if box.name == name]
+
+    def _create(self, action: CreateSandbox | Create) -> None:
+        spec = action.sandbox if isinstance(action, CreateSandbox) else action.proxy
+        if self._named(spec.name) or not self.image:
+            raise Failed(f"can't create {spec.name}")
+        if isinstance(action, CreateSandbox):
+            if action.sandbox.uplink not in self.networks:
+                raise Failed("no uplink")
+            box = self.add(spec.name, labels=own_labels(spec), ports=frozenset(spec.range.ports()))
+            self.join(box, action.sandbox.uplink)
+        else:
+            home = self.own(action.proxy.sandbox)
+            assert home.role == ROLE_SANDBOX
+            self.add(spec.name, labels=own_labels(spec), mode=f"container:{home.id}")
+
+    def start(self, box: Box) -> None:
+        if box.state not in {"created", "exited"}:
+            raise Failed(f"{box.name} is {box.state}")
+        for name, (known, _) in box.networks.items():
+            if name not in self.networks or known not in ("", self.networks[name].id):
+                raise Failed(f"network {name} not found")
+        if taken := self.conflicts(box):
+            raise Refused({min(taken)} if self.names_ports else ())
+        home = self.home(box)
+        if box.mode and (home is None or home.state not in STARTED):
+            raise Failed("cannot join network of a non running container")
+        box.state = "running"
+        box.started = next(self.ids)
+        box.namespace = home.namespace if home else box.started
+        box.networks = {n: (self.networks[n].id, names) for n, (_, names) in box.networks.items()}
+
+    def home(self, box: Box) -> Box | None:
+        """The container whose network namespace another one shares."""
+        return next((one for one in self.boxes if box.mode == f"container:{one.id}"), None)
+
+    def _connect(self, box: Box, network: str, aliases: tuple[str, ...]) -> None:
+        if network not in self.networks:
+            raise Failed(f"no network {network}")
+        if network in box.networks and box.state != "created":
+            raise Failed("already connected")
+        uplink = self.settings.uplink
+        assert box.role == ROLE_SANDBOX
+        assert self.networks[network].internal or network >= uplink, "moves the published ports"
+        for alias in aliases:
+            others = [
+                one.name
+                for one in self.boxes
+                if one.own is None
+                and network in one.networks
+                and alias in one.networks[network][1]
+                and one.state not in ("dead", "removing")
+            ]
+            assert not others, f"{alias} on {network} is that of {others}"
+        self.join(box, network, *aliases)
+
+
+class Controller:
+    """A controller that plans, carries out and may be killed anywhere."""
+
+    def __init__(self, engine: Engine, settings: PlanSettings) -> None:
+        self.engine, self.settings = engine, settings
+        self.memory = Memory()
+        self.now = 1000.0
+
+    def look(self) -> Plan:
+        found = plan(self.engine.observe(), self.settings, self.memory, self.now)
+        self.memory = found.memory
+        return found
+
+    def carry_out(self, found: Plan, most: int | None = None) -> list[tuple[Action, Failed]]:
+        """Carry out a plan's actions, or the first few. What fails is returned."""
+        failed: list[tuple[Action, Failed]] = []
+        left = len(found.actions) if most is None else most
+        for group in found.groups:
+            for action in group.actions:
+                if left <= 0:
+                    return failed
+                left -= 1
+                if error := self._try(action):
+                    failed.append((action, error))
+                    if not isinstance(action, Connect | Disconnect):
+                        break
+        return failed
+
+    def _try(self, action: Action) -> Failed | None:
+        try:
+            self.engine.apply(action)
+        except Refused as error:
+            assert isinstance(action, Start)
+            self.memory = self.memory.port_taken(action.name, error.ports, self.now)
+            return error
+        except Failed as error:
+            return error
+        return None

@@ -1,0 +1,237 @@
+"""Which proxies there ought to be, on which networks, under which names, with how many ports."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy_operator.core.aliases import assign
+from rosproxy_operator.core.desired import desire
+from rosproxy_operator.core.fingerprint import proxy_name
+from rosproxy_operator.core.labels import read_wishes
+from rosproxy_operator.core.memory import Memory, looked
+from rosproxy_operator.core.model import Container, Desired, Key, Network, Observed, Problem
+from rosproxy_operator.core.settings import PlanSettings
+from tests.unit.operator.builders import (
+    APP,
+    ENABLED,
+    HERE,
+    KEY,
+    SETTINGS,
+    UPLINK,
+    both,
+    container,
+    observed,
+    place,
+    sandbox,
+)
+
+ARM = Key("http://arm:11311", HERE)
+ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}
+LAB = Network("n2", "lab")
+NAME = proxy_name(KEY)
+
+
+def want(
+    seen: Observed,
+    memory: Memory | None = None,
+    now: float = 0.0,
+    settings: PlanSettings = SETTINGS,
+) -> tuple[dict[Key, Desired], tuple[Problem, ...]]:
+    wishes, _ = read_wishes(seen, settings)
+    memory = looked(memory or Memory(), seen, wishes, settings.grace, now)
+    desired, problems = desire(seen, settings, wishes, memory, now)
+    assert list(desired) == sorted(desired, key=lambda one: one.key)
+    return {one.key: one for one in desired}, problems
+
+
+def names(*containers: Container, **more: Any) -> tuple[dict[tuple[Key, str], set[str]], list[str]]:
+    """The names that proxies get on networks, and who is told that it won't find its own."""
+    seen = observed(*containers, **more)
+    given, problems = assign(want(seen)[0].values(), seen)
+    told = [problem.subject.removeprefix("container ") for problem in problems]
+    return {place: set(found) for place, found in given.items()}, told
+
+
+# groups
+
+
+def test_one_proxy_for_all_who_mean_the_same() -> None:
+    labels = {**ENABLED, "rosproxy.ports": "40"}
+    seen = observed(
+        container("a"),
+        container("b", labels, ("lab",)),
+        container("c", ON_ARM),
+        networks=(UPLINK, APP, LAB),
+    )
+    desired, problems = want(seen)
+    assert problems == ()
+    assert [wish.container for wish in desired[KEY].wishes] == ["a", "b"]
+    assert (desired[KEY].networks, desired[KEY].ports) == (frozenset({"app", "lab"}), 40)
+    assert (desired[ARM].networks, desired[ARM].ports) == (frozenset({"app"}), 32)
+
+
+def test_the_option_is_the_least_number_of_ports() -> None:
+    seen = observed(container(labels={**ENABLED, "rosproxy.ports": "8"}))
+    assert want(seen)[0][KEY].ports == 32
+    assert want(seen, settings=replace(SETTINGS, ports=4))[0][KEY].ports == 8
+
+
+def test_a_proxy_that_nobody_wants_is_listed_too() -> None:
+    desired, _ = want(observed(**both()))
+    assert desired[KEY] == Desired(KEY, False, 32)
+
+
+def test_a_network_that_is_gone_is_dropped() -> None:
+    desired, problems = want(observed(container(networks=("app", "gone"))))
+    assert (desired[KEY].networks, problems) == (frozenset({"app"}), ())
+    desired, problems = want(observed(container(networks=("gone",))))
+    assert (desired[KEY].live, problems) == (False, ())
+
+
+@pytest.mark.parametrize("name", ["0-app", "0-app_default", "0"])
+def test_a_network_that_would_take_the_published_ports_is_not_joined(name: str) -> None:
+    networks = (UPLINK, APP, Network("n3", name))
+    desired, problems = want(observed(container(networks=("app", name)), networks=networks))
+    assert desired[KEY].networks == {"app"}
+    assert [problem.subject for problem in problems] == [f"network {name}"]
+    assert "its name sorts before that of the uplink network 0-rosproxy" in problems[0].text
+
+
+@pytest.mark.parametrize("name", ["00", "0-zoo", "Lab", "_x", "1"])
+def test_a_network_that_sorts_later_is_joined(name: str) -> None:
+    networks = (UPLINK, Network("n3", name))
+    desired, problems = want(observed(container(networks=(name,)), networks=networks))
+    assert (desired[KEY].networks, problems) == (frozenset({name}), ())
+
+
+def test_an_internal_network_takes_nothing_and_is_joined() -> None:
+    networks = (UPLINK, Network("n3", "0-app", internal=True))
+    desired, problems = want(observed(container(networks=("0-app",)), networks=networks))
+    assert (desired[KEY].networks, problems) == (frozenset({"0-app"}), ())
+
+
+def test_an_early_network_that_nobody_asks_for_is_no_problem() -> None:
+    assert want(observed(container(), networks=(UPLINK, APP, Network("n3", "0-a"))))[1] == ()
+
+
+# who has exited
+
+
+def test_networks_of_who_has_exited_stay_joined_for_the_grace() -> None:
+    gone = container("b", networks=("lab",), state="exited")
+    there = [sandbox(networks=("app", "lab"))]
+    seen = observed(container("a"), gone, networks=(UPLINK, APP, LAB), sandboxes=there)
+    assert want(seen)[0][KEY].networks == {"app", "lab"}
+    since = Memory(exited={gone.id: 0.0})
+    assert want(seen, since, 59.0)[0][KEY].networks == {"app", "lab"}
+    assert want(seen, since, 60.0)[0][KEY].networks == {"app"}
+
+
+def test_who_has_exited_joins_nothing_and_keeps_no_proxy() -> None:
+    gone = container("b", networks=("lab",), state="exited")
+    networks = (UPLINK, APP, LAB)
+    desired, _ = want(observed(container("a"), gone, networks=networks, sandboxes=[sandbox()]))
+    assert desired[KEY].networks == {"app"}
+    desired, _ = want(observed(gone, networks=networks, sandboxes=[sandbox(networks=("lab",))]))
+    assert (desired[KEY].live, desired[KEY].networks) == (False, frozenset({"lab"}))
+
+
+# names
+
+
+def test_a_proxy_has_three_names() -> None:
+    assert names(container()) == ({(KEY, "app"): {"rosproxy", "robot", NAME}}, [])
+
+
+def test_a_master_that_is_an_address_gives_no_name() -> None:
+    labels = {**ENABLED, "rosproxy.master-uri": "http://192.0.2.7:11311"}
+    given, told = names(container(labels=labels))
+    assert told == []
+    assert [len(found) for found in given.values()] == [2]
+
+
+def test_a_masters_name_that_another_container_has_is_not_taken() -> None:
+    robot = container("robot", {}, [place("app", "Robot")])
+    given, told = names(container(), robot)
+    assert (given, told) == ({(KEY, "app"): {"rosproxy", NAME}}, [])
+
+
+def test_who_looks_for_the_masters_name_then_is_told() -> None:
+    robot = container("robot", {}, state="exited")
+    seen = observed(container(env=KEY.master_uri), robot)
+    problems = assign(want(seen)[0].values(), seen)[1]
+    assert problems == (
+        Problem(
+            "container talker",
+            "looks for its proxy by the name robot, but on network app container robot answers to "
+            "it, so its nodes go around their proxy: set ROS_MASTER_URI=http://rosproxy:11311",
+            fatal=False,
+        ),
+    )
+
+
+@pytest.mark.parametrize("state", ["dead", "removing"])
+def test_a_name_of_who_is_gone_is_free(state: str) -> None:
+    robot = container("robot", {}, state=state)
+    assert names(container(), robot)[0] == {(KEY, "app"): {"rosproxy", "robot", NAME}}
+
+
+def test_a_name_on_another_network_is_free() -> None:
+    robot = container("robot", {}, ("lab",))
+    assert names(container(), robot)[0] == {(KEY, "app"): {"rosproxy", "robot", NAME}}
+
+
+def test_a_proxy_made_by_hand_keeps_its_name() -> None:
+    by_hand = container("rosproxy", {})
+    given, told = names(container("a"), container("b", env=KEY.master_uri), by_hand)
+    assert (given, told) == ({(KEY, "app"): {"robot", NAME}}, ["a"])
+
+
+def test_of_two_proxies_on_a_network_one_is_called_rosproxy() -> None:
+    given, told = names(
+        container("a"), container("b", ON_ARM), container("c", ON_ARM, env=ARM.master_uri)
+    )
+    assert given == {
+        (ARM, "app"): {"arm", "rosproxy", proxy_name(ARM)},
+        (KEY, "app"): {"robot", NAME},
+    }
+    assert told == ["a"]
+
+
+def test_the_one_whose_containers_look_for_it() -> None:
+    given, told = names(container("a"), container("b", ON_ARM, env=ARM.master_uri))
+    assert (given[KEY, "app"], told) == ({"rosproxy", "robot", NAME}, [])
+    assert given[ARM, "app"] == {"arm", proxy_name(ARM)}
+
+
+def test_the_one_who_has_it_keeps_it() -> None:
+    seen: Any = {"sandboxes": [sandbox(), sandbox(ARM, networks=())]}
+    given, told = names(container("a"), container("b", ON_ARM), **seen)
+    assert given[KEY, "app"] == {"rosproxy", "robot", NAME}
+    assert told == ["b"]
+
+
+def test_the_one_who_lingers_keeps_it_as_long() -> None:
+    left = container("old", ON_ARM, state="exited")
+    given, told = names(container("a"), left, sandboxes=[sandbox(ARM)])
+    assert (given[KEY, "app"], told) == ({"robot", NAME}, ["a"])
+
+
+def test_the_one_who_leaves_gives_it_back() -> None:
+    given, told = names(container("a"), sandboxes=[sandbox(ARM)])
+    assert (given[KEY, "app"], told) == ({"rosproxy", "robot", NAME}, [])
+
+
+def test_two_masters_on_one_host() -> None:
+    """Both proxies can't be called robot; the second one's containers are told."""
+    second = Key("http://robot:11312", HERE)
+    labels = {**ENABLED, "rosproxy.master-uri": second.master_uri}
+    given, told = names(
+        container("a", env=KEY.master_uri),
+        container("b", labels, env=second.master_uri),
+        container("c", labels, env=f"http://{proxy_name(second)}:11312"),
+    )
+    assert given[KEY, "app"] == {"rosproxy", "robot", NAME}
+    assert given[second, "app"] == {proxy_name(second)}
+    assert told == ["b"]

@@ -1,0 +1,127 @@
+"""What the engine says when it refuses, and what the user is told."""
+
+import errno
+
+import pytest
+import requests
+import urllib3
+
+from rosproxy_operator.docker.errors import (
+    Conflict,
+    EngineError,
+    Gone,
+    PortTaken,
+    refusal,
+    unreachable,
+)
+
+ENDPOINT = "driver failed programming external connectivity on endpoint "
+NAME = f"x:1234 ({'7f' * 32}): "
+SOCKET = "unix:///var/run/docker.sock"
+
+
+@pytest.mark.parametrize(
+    ("text", "port"),
+    [
+        (f"{ENDPOINT}{NAME}Bind for 0.0.0.0:18080 failed: port is already allocated", 18080),
+        (
+            f"{ENDPOINT}{NAME}Error starting userland proxy: listen tcp4 0.0.0.0:18099: bind: "
+            "address already in use",
+            18099,
+        ),
+        (f"{ENDPOINT}{NAME}listen tcp4 0.0.0.0:18500: bind: address already in use", 18500),
+        (f"{ENDPOINT}{NAME}Bind for :::8080 failed: port is already allocated", 8080),
+        (
+            "failed to set up container networking: "
+            f"{ENDPOINT}b ({'0' * 64}): failed to bind host port for 0.0.0.0:11400:172.18.0.2:"
+            "11400/tcp: address already in use",
+            11400,
+        ),
+        (
+            "Ports are not available: exposing port TCP 127.0.0.1:5000 -> 0.0.0.0:0: listen tcp "
+            "127.0.0.1:5000: bind: address already in use",
+            5000,
+        ),
+        ("address already in use", None),
+    ],
+)
+def test_a_port_is_taken(text: str, port: int | None) -> None:
+    error = refusal(500, text, "POST /containers/x/start")
+    assert isinstance(error, PortTaken)
+    assert error.port == port
+
+
+def test_an_address_that_is_not_this_hosts() -> None:
+    text = (
+        f"{ENDPOINT}{NAME}Error starting userland proxy: listen tcp4 203.0.113.5:18520: bind: "
+        "cannot assign requested address"
+    )
+    error = refusal(500, text, "")
+    assert not isinstance(error, PortTaken)
+    assert str(error) == "--publish-address: 203.0.113.5 is not an address of this host"
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("No such container: nope", "container"),
+        ("network nope not found", "network"),
+        ("No such image: nope:latest", "image"),
+    ],
+)
+def test_gone(text: str, kind: str) -> None:
+    error = refusal(404, text, "")
+    assert isinstance(error, Gone)
+    assert error.kind == kind
+
+
+def test_a_conflict_without_the_long_ids() -> None:
+    error = refusal(409, f'The name "/x" is in use by container "{"ab" * 32}".\n Remove it', "")
+    assert isinstance(error, Conflict)
+    assert str(error) == 'The name "/x" is in use by container "abababababab". Remove it'
+
+
+@pytest.mark.parametrize(
+    ("status", "text"),
+    [(403, "<html>Forbidden</html>"), (405, "Method Not Allowed"), (404, "page not found")],
+)
+def test_a_proxy_before_the_engine_does_not_let_a_call_through(status: int, text: str) -> None:
+    told = str(refusal(status, text, "POST /v1.41/networks/create"))
+    assert told.startswith("POST /v1.41/networks/create is not allowed (HTTP ")
+    assert "let it through the proxy in front of the engine's socket" in told
+
+
+def test_what_the_engine_itself_forbids_is_told_as_it_is() -> None:
+    text = "endpoint with name x already exists in network app"
+    assert str(refusal(403, text, "POST /x")) == text
+
+
+def wrapped(error: OSError) -> Exception:
+    """As it comes out of requests over a UNIX socket."""
+    inner = urllib3.exceptions.ProtocolError("Connection aborted.", error)
+    return requests.ConnectionError(inner)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (errno.EACCES, "no permission to use the Docker engine's socket /var/run/docker.sock"),
+        (errno.ENOENT, "mount it (-v /var/run/docker.sock:/var/run/docker.sock)"),
+        (errno.ECONNREFUSED, f"no Docker engine answers at {SOCKET}"),
+    ],
+)
+def test_an_engine_that_cannot_be_reached(number: int, words: str) -> None:
+    told = str(unreachable(SOCKET, wrapped(OSError(number, "no"))))
+    assert words in told
+    assert "\n" not in told
+
+
+def test_a_cause_is_found_too() -> None:
+    outer = EngineError("Error while fetching server API version")
+    outer.__cause__ = wrapped(OSError(errno.ECONNREFUSED, "refused"))
+    assert "is it running?" in str(unreachable("tcp://10.0.0.1:2375", outer))
+
+
+def test_anything_else_is_told_in_one_line() -> None:
+    told = str(unreachable(SOCKET, requests.ReadTimeout("Read timed out.")))
+    assert told == f"the Docker engine at {SOCKET} can't be asked: Read timed out."

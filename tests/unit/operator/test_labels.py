@@ -1,0 +1,467 @@
+"""What containers ask for, and what they are told if they can't have it."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy_operator.core.labels import masters, read_wishes
+from rosproxy_operator.core.model import Container, Key, Problem, Wish
+from rosproxy_operator.core.settings import PlanSettings
+from tests.unit.operator.builders import (
+    ENABLED,
+    HERE,
+    KEY,
+    ROBOT,
+    SETTINGS,
+    both,
+    container,
+    observed,
+    place,
+    proxy,
+    sandbox,
+)
+
+ON = {"rosproxy.enable": "true"}
+EXPOSING = replace(SETTINGS, expose_by_default=True)
+
+
+def read(
+    one: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
+) -> tuple[Wish | None, list[Problem]]:
+    """The wish of one container, if any, and its problems."""
+    wishes, problems = read_wishes(observed(one, *others, **more), settings)
+    mine = [problem for problem in problems if problem.subject == f"container {one.name}"]
+    return next((wish for wish in wishes if wish.container == one.name), None), mine
+
+
+def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
+    """Why a container is left out."""
+    wish, problems = read(one, settings, **more)
+    assert wish is None
+    assert problems[-1].fatal
+    return problems[-1].text
+
+
+def warning(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
+    """What a container is told that has its wish nevertheless."""
+    wish, problems = read(one, settings, **more)
+    assert wish is not None
+    assert [problem.fatal for problem in problems] == [False]
+    return problems[0].text
+
+
+def test_a_labelled_container_wishes_for_a_proxy() -> None:
+    labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
+    wish, problems = read(container(labels=labels, networks=("app", "lab")))
+    assert problems == []
+    assert wish == Wish(
+        "talker",
+        "id-talker",
+        Key(ROBOT, "host.lab"),
+        40,
+        frozenset({"app", "lab"}),
+        "rosproxy",
+    )
+
+
+def test_the_label_alone_is_enough() -> None:
+    wish, problems = read(container(labels=ON, env=ROBOT))
+    assert problems == []
+    assert wish
+    assert (wish.key, wish.ports, wish.needs) == (KEY, 0, "robot")
+
+
+@pytest.mark.parametrize("value", ["true", "True", " TRUE "])
+def test_true_is_true(value: str) -> None:
+    assert read(container(labels={"rosproxy.enable": value}, env=ROBOT))[0]
+
+
+@pytest.mark.parametrize("value", ["yes", "1", "", "ture"])
+def test_neither_true_nor_false(value: str) -> None:
+    text = refusal(container(labels={**ENABLED, "rosproxy.enable": value}))
+    assert text == (
+        f"label rosproxy.enable={value!r} is neither true nor false: write rosproxy.enable=true"
+    )
+
+
+def test_nobody_else_is_asked() -> None:
+    assert read(container(labels={}, env=ROBOT)) == (None, [])
+    assert read(container(labels={"com.example": "x"}, env=ROBOT)) == (None, [])
+
+
+def test_false_is_said_once_and_nothing_is_answered() -> None:
+    labels = {**ENABLED, "rosproxy.enable": "false", "rosproxy.prots": "many"}
+    for settings in (SETTINGS, EXPOSING):
+        assert read(container(labels=labels, env=ROBOT), settings) == (None, [])
+
+
+def test_a_label_without_enable_is_ignored_and_told() -> None:
+    wish, problems = read(container(labels={"rosproxy.ports": "8"}, env=ROBOT))
+    assert wish is None
+    assert [problem.fatal for problem in problems] == [False]
+    assert problems[0].text == "label rosproxy.ports ignored: add the label rosproxy.enable=true"
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("rosproxy.enabled", "rosproxy.enable"),
+        ("rosproxy.master_uri", "rosproxy.master-uri"),
+        ("rosproxy.port", "rosproxy.ports"),
+        ("rosproxy.advertise", "rosproxy.advertise-host"),
+        ("rosproxy.networks", "rosproxy.network"),
+        ("Rosproxy.Ports", "rosproxy.ports"),
+        ("rosproxy_ports", "rosproxy.ports"),
+    ],
+)
+def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> None:
+    text = warning(container(labels={**ENABLED, name: "1"}))
+    assert text == f"label {name} is unknown and ignored; did you mean {near}?"
+
+
+def test_an_unknown_label_that_is_near_to_none() -> None:
+    text = warning(container(labels={**ENABLED, "rosproxy.colour-scheme": "1"}))
+    assert "there are rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
+
+
+@pytest.mark.parametrize("value", ["0", "1001", "-1", "many", "", "1.5", "٣", "9" * 5000])
+def test_bad_numbers_of_ports(value: str) -> None:
+    text = refusal(container(labels={**ENABLED, "rosproxy.ports": value}))
+    assert text.startswith("label rosproxy.ports=")
+    assert "not a number from 1 to 1000" in text
+    assert "e.g. rosproxy.ports=32" in text
+    assert len(text) < 300
+
+
+@pytest.mark.parametrize("value", ["1", "1000", " 32 "])
+def test_good_numbers_of_ports(value: str) -> None:
+    wish, problems = read(container(labels={**ENABLED, "rosproxy.ports": value}))
+    assert wish
+    assert (wish.ports, problems) == (int(value), [])
+
+
+# masters
+
+
+@pytest.mark.parametrize(
+    ("uri", "same"),
+    [
+        ("http://robot:11311", ROBOT),
+        ("http://robot:11311/", ROBOT),
+        (" http://Robot:11311 ", ROBOT),
+        ("http://robot:11311/bridge/", "http://robot:11311/bridge"),
+        ("http://192.0.2.7:11312", "http://192.0.2.7:11312"),
+        ("http://[2001:DB8::1]:11311", "http://[2001:db8::1]:11311"),
+        ("http://host.docker.internal:11311", "http://host.docker.internal:11311"),
+    ],
+)
+def test_a_master_has_one_uri(uri: str, same: str) -> None:
+    wish, _ = read(container(labels={**ON, "rosproxy.master-uri": uri}))
+    assert wish
+    assert wish.key.master_uri == same
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["robot", "robot:11311", "https://robot:11311", "http://robot", "http://robot:0", "http://:1",
+     "http://robot:11311/a b", "http://rö:11311", "", "http://u@robot:11311"],
+)  # fmt: skip
+def test_what_is_no_uri(uri: str) -> None:
+    text = refusal(container(labels={**ON, "rosproxy.master-uri": uri}))
+    assert text == f"label rosproxy.master-uri={uri!r} is not of the form http://HOST:11311"
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "0.0.0.0", "a.localhost"])
+def test_a_master_on_loopback_is_nobodys(host: str) -> None:
+    for labels, env in (
+        ({**ON, "rosproxy.master-uri": f"http://{host}:11311"}, ""),
+        (ON, f"http://{host}:11311"),
+    ):
+        text = refusal(container(labels=labels, env=env))
+        assert "is the container itself" in text
+        assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
+
+
+@pytest.mark.parametrize(
+    "host", ["rosproxy", "rosproxy-robot-0a1b2c", "rosproxy-robot-0a1b2c-ports"]
+)
+def test_a_proxy_is_no_master(host: str) -> None:
+    labels = {**ON, "rosproxy.master-uri": f"http://{host}:11311"}
+    assert "names a proxy: give the real master" in refusal(container(labels=labels))
+
+
+def test_the_controllers_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
+    settings = replace(SETTINGS, master_uri="http://arm:11311")
+    for env in ("", "http://rosproxy:11311", "http://rosproxy-arm-0a1b2c:11311"):
+        wish, _ = read(container(labels=ON, env=env), settings)
+        assert wish
+        assert wish.key.master_uri == "http://arm:11311"
+    wish, _ = read(container(labels=ON, env=ROBOT), settings)
+    assert wish
+    assert wish.key == KEY
+
+
+def test_no_master() -> None:
+    text = refusal(container(labels=ON))
+    assert text.startswith(
+        "no master is known: add the label rosproxy.master-uri=http://HOST:11311"
+    )
+    text = refusal(container(labels=ON), replace(SETTINGS, master_uri="robot"))
+    assert text.startswith("the controller's --master-uri 'robot' is not of the form")
+
+
+# by which name the proxy is found
+
+
+def test_an_address_goes_around_the_proxy() -> None:
+    text = warning(container(labels=ON, env="http://192.0.2.7:11311"))
+    assert text.startswith("its variable ROS_MASTER_URI='http://192.0.2.7:11311' is an address")
+    assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
+
+
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        (
+            "http://rosproxy:11312",
+            "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
+        ),
+        ("http://robot:11312", "the proxy stands at its master's port 11311"),
+        ("http://other:11311", "is not its master http://robot:11311, so its nodes go elsewhere"),
+        ("http://localhost:11311", "is the container itself: set ROS_MASTER_URI="),
+        (
+            "http://rosproxy-arm-0a1b2c:11311",
+            "names another master's proxy, its own is rosproxy-robot-",
+        ),
+        ("robot:11311", "is not of the form http://HOST:11311"),
+    ],
+)
+def test_a_variable_that_leads_astray(env: str, told: str) -> None:
+    assert told in warning(container(env=env))
+
+
+@pytest.mark.parametrize("env", ["", "http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
+def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
+    wish, problems = read(container(env=env))
+    assert wish
+    assert problems == []
+    assert wish.needs == ("rosproxy" if "rosproxy" in env or not env else "robot")
+
+
+# this host's address
+
+
+def test_who_says_what_this_host_is_called() -> None:
+    labelled = container(labels={**ENABLED, "rosproxy.advertise-host": "[2001:db8::5]"})
+    found = {"robot": "192.0.2.99"}
+    for one, settings, host in (
+        (labelled, SETTINGS, "2001:db8::5"),
+        (container(), SETTINGS, HERE),
+        (container(), PlanSettings(), "192.0.2.99"),
+    ):
+        wish, problems = read(one, settings, advertise=found)
+        assert wish
+        assert (wish.key.advertise_host, problems) == (host, [])
+
+
+@pytest.mark.parametrize("value", ["", "a b", "http://host", "host:1", "-x", "x" * 300])
+def test_what_is_no_host(value: str) -> None:
+    text = refusal(container(labels={**ENABLED, "rosproxy.advertise-host": value}))
+    assert "is neither a host name nor an address" in text
+
+
+def test_loopback_is_no_address_for_others() -> None:
+    labels = {**ENABLED, "rosproxy.advertise-host": "127.0.0.1"}
+    assert "means another host to everybody else" in refusal(container(labels=labels))
+
+
+def test_an_address_that_is_not_known() -> None:
+    text = refusal(container(), PlanSettings())
+    assert text.startswith("this host's address towards the master http://robot:11311 is not known")
+    assert "--advertise-host" in text
+
+
+def test_an_address_that_is_not_known_for_a_moment() -> None:
+    """The proxy that is there stays: of several, the one on the container's network."""
+    other = Key(ROBOT, "192.0.2.1")
+    seen = [sandbox(other, networks=()), sandbox(KEY)]
+    wish, problems = read(container(), PlanSettings(), sandboxes=seen)
+    assert wish
+    assert (wish.key, problems) == (KEY, [])
+
+
+# networks
+
+
+def test_only_user_defined_networks_but_the_uplink() -> None:
+    wish, _ = read(container(networks=("bridge", "app", "0-rosproxy")))
+    assert wish
+    assert wish.networks == {"app"}
+
+
+def test_one_network_of_several() -> None:
+    labels = {**ENABLED, "rosproxy.network": "lab"}
+    wish, _ = read(container(labels=labels, networks=("app", "lab")))
+    assert wish
+    assert wish.networks == {"lab"}
+
+
+def test_a_network_as_compose_files_call_it() -> None:
+    labels = {**ENABLED, "rosproxy.network": "lab", "com.docker.compose.project": "demo"}
+    wish, _ = read(container(labels=labels, networks=("demo_lab", "demo_default")))
+    assert wish
+    assert wish.networks == {"demo_lab"}
+
+
+def test_a_network_that_it_is_not_on() -> None:
+    one = container(labels={**ENABLED, "rosproxy.network": "app2"}, networks=("lab", "app"))
+    assert refusal(one) == (
+        "label rosproxy.network='app2' names no network of the container; it has: app, lab"
+    )
+
+
+@pytest.mark.parametrize(
+    ("networks", "mode", "told"),
+    [
+        (("bridge",), "bridge", "is only on the default bridge network, where no names resolve"),
+        ((), "default", "is only on the default bridge network"),
+        (("host",), "host", "is on the host's own network, where its nodes need no proxy"),
+        (("none",), "none", "is on no network"),
+        ((), "app", "is on no network"),
+    ],
+)
+def test_networks_where_no_proxy_is_found(networks: tuple[str, ...], mode: str, told: str) -> None:
+    text = refusal(container(networks=networks, mode=mode))
+    assert text.startswith(told)
+    assert "docker network create ros" in text
+
+
+def test_the_network_of_another_container() -> None:
+    pod = container("pod", {}, ("app", "lab"))
+    one = container("talker", networks=(), mode="container:id-pod")
+    two = container("two", networks=(), mode="container:id-talker")
+    for each, other in ((one, two), (two, one)):
+        wish, problems = read(each, SETTINGS, pod, other)
+        assert wish
+        assert problems == []
+        assert wish.networks == {"app", "lab"}
+
+
+def test_the_network_of_a_container_that_is_gone() -> None:
+    one = container(networks=(), mode="container:id-pod")
+    assert "shares the network of a container ('id-pod') that is not there" in refusal(one)
+    assert "not there" in refusal(replace(one, network_mode="container:id-talker"))
+
+
+# states
+
+
+@pytest.mark.parametrize("state", ["created", "running", "paused", "restarting"])
+def test_who_lives_counts(state: str) -> None:
+    wish, _ = read(container(state=state))
+    assert wish
+    assert wish.alive
+
+
+def test_who_has_exited_has_no_problems() -> None:
+    wish, problems = read(container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited"))
+    assert wish
+    assert (wish.alive, problems) == (False, [])
+    assert read(container(labels=ON, state="exited")) == (None, [])
+
+
+@pytest.mark.parametrize("state", ["dead", "removing", "whatever"])
+def test_who_is_dead_wants_nothing(state: str) -> None:
+    assert read(container(state=state)) == (None, [])
+
+
+# --expose-by-default
+
+
+def test_everybody_with_a_master_is_exposed() -> None:
+    wish, problems = read(container(labels={}, env=ROBOT), EXPOSING)
+    assert wish
+    assert (wish.key, problems) == (KEY, [])
+    wish, _ = read(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING)
+    assert wish
+    assert read(container(labels={}), EXPOSING) == (None, [])
+
+
+def test_who_has_not_asked_is_no_failure() -> None:
+    one = container(labels={}, env=ROBOT, networks=("host",))
+    wish, problems = read(one, EXPOSING)
+    assert wish is None
+    assert [problem.fatal for problem in problems] == [False]
+
+
+# all together
+
+
+def test_one_bad_container_does_not_touch_the_others() -> None:
+    good = [container("a"), container("b", state="exited"), container("c", ON, env=ROBOT)]
+    bad = [
+        container("bad1", {**ENABLED, "rosproxy.ports": "0"}),
+        container("bad2", ON),
+        container("bad3", networks=()),
+    ]
+    wishes, _ = read_wishes(observed(*good), SETTINGS)
+    with_bad, problems = read_wishes(observed(*bad, *good), SETTINGS)
+    assert with_bad == wishes
+    assert {problem.subject for problem in problems if problem.fatal} == {
+        "container bad1",
+        "container bad2",
+        "container bad3",
+    }
+
+
+def test_a_container_with_the_controllers_own_label() -> None:
+    _, problems = read(container(labels={"io.rosproxy.managed": "true"}))
+    assert problems[0].text.startswith("has the label io.rosproxy.managed, which is for proxies")
+
+
+def test_whose_address_is_needed() -> None:
+    there = Key("http://left:11311", HERE)
+    seen = observed(
+        container("a"),
+        container("b", ON, env="http://arm:11311"),
+        container("c", ON, env="http://gone:11311", state="exited"),
+        container("d", ON),
+        container("e", {**ON, "rosproxy.enable": "maybe"}, env="http://no:11311"),
+        **both(key=there),
+    )
+    assert masters(seen, SETTINGS) == ("http://arm:11311", "http://left:11311", ROBOT)
+
+
+def test_a_proxy_of_whatever_name_is_no_master() -> None:
+    odd = {"sandboxes": [sandbox(name="odd")], "proxies": [proxy(name="strange")]}
+    for host in ("odd", "strange"):
+        one = container(labels=ON, env=f"http://{host}:11311")
+        assert read(one, replace(SETTINGS, master_uri=ROBOT), **odd)[0]
+
+
+TEXT = st.text(max_size=30) | st.sampled_from(["true", ROBOT, "app", "8", HERE])
+LABELS = st.dictionaries(
+    st.sampled_from(
+        ["rosproxy.enable", "rosproxy.master-uri", "rosproxy.ports", "rosproxy.advertise-host",
+         "rosproxy.network", "rosproxy.x", "rosproxy", "com.docker.compose.project"]
+    ),
+    TEXT,
+)  # fmt: skip
+
+
+@given(LABELS, TEXT, TEXT, st.booleans())
+def test_labels_of_whatever_kind_are_read_or_told(
+    labels: dict[str, str], env: str, mode: str, expose: bool
+) -> None:
+    one = container("odd", labels, [place("app")], env=env, mode=mode)
+    settings = replace(SETTINGS, expose_by_default=expose)
+    wish, problems = read(one, settings)
+    asked = labels.get("rosproxy.enable", "").strip().lower()
+    if asked == "true":
+        assert wish or any(problem.fatal for problem in problems)
+    if wish:
+        assert wish.key.master_uri.startswith("http://")
+        assert wish.key.advertise_host
+        assert 0 <= wish.ports <= 1000

@@ -1,0 +1,585 @@
+"""What is done in which order, rule by rule. That it always ends well: test_plan_convergence."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    ProxySpec,
+    Remove,
+    Rename,
+    Restart,
+    SandboxSpec,
+    Start,
+    Unpause,
+)
+from rosproxy_operator.core.fingerprint import (
+    fingerprint,
+    proxy_name,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from rosproxy_operator.core.memory import Memory, Move
+from rosproxy_operator.core.model import Key, Network, Observed
+from rosproxy_operator.core.plan import Plan, plan
+from rosproxy_operator.core.settings import PlanSettings
+from tests.unit.operator.builders import (
+    APP,
+    ENABLED,
+    HERE,
+    IMAGE,
+    KEY,
+    RANGE,
+    SETTINGS,
+    UPLINK,
+    both,
+    container,
+    observed,
+    place,
+    proxy,
+    sandbox,
+)
+
+NAME, PORTS = proxy_name(KEY), sandbox_name(KEY)
+ALIASES = ("robot", "rosproxy", NAME)
+ARM = Key("http://arm:11311", HERE)
+ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}
+LAB = Network("n2", "lab")
+NEXT = PortRange(11432, 11463)
+
+
+def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
+    made = sandbox_fingerprint(KEY, ports, SETTINGS)
+    return CreateSandbox(SandboxSpec(name, KEY, ports, made, "0-rosproxy"))
+
+
+def new_proxy(
+    ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
+) -> Create:
+    made = fingerprint(KEY, ports, SETTINGS, image)
+    return Create(ProxySpec(NAME, KEY, ports, made, home, replaces))
+
+
+def look(
+    seen: Observed,
+    memory: Memory | None = None,
+    now: float = 0.0,
+    settings: PlanSettings = SETTINGS,
+) -> Plan:
+    return plan(seen, settings, memory or Memory(), now)
+
+
+def actions(seen: Observed, **more: Any) -> list[Action]:
+    return list(look(seen, **more).actions)
+
+
+def texts(found: Plan) -> list[str]:
+    return [problem.text for problem in found.problems]
+
+
+FIRST = [
+    new_sandbox(),
+    Start(PORTS),
+    Connect(PORTS, "app", ALIASES),
+    new_proxy(),
+    Start(NAME),
+]
+
+
+def test_the_first_container_on_a_host() -> None:
+    found = look(observed(container(), networks=[APP]))
+    assert list(found.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
+    assert [group.key for group in found.groups] == [None, KEY]
+    assert (found.problems, found.again_in) == ((), None)
+
+
+def test_all_is_as_it_ought_to_be() -> None:
+    found = look(observed(container(), **both()))
+    assert (found.actions, found.problems, found.again_in) == ((), (), None)
+
+
+def test_nobody_wants_anything() -> None:
+    found = look(observed(container(labels={}), networks=[APP]))
+    assert (found.actions, found.problems, found.again_in) == ((), (), None)
+
+
+def test_a_controller_killed_after_any_step_goes_on() -> None:
+    """What is there already is not done again."""
+    created = sandbox(networks=(), state="created", started_at="")
+    started = sandbox(networks=())
+    made = proxy(state="created", started_at="")
+    for there, left in (
+        ({}, FIRST),
+        ({"sandboxes": [created]}, FIRST[1:]),
+        ({"sandboxes": [started]}, FIRST[2:]),
+        ({"sandboxes": [sandbox()]}, FIRST[3:]),
+        ({"sandboxes": [sandbox()], "proxies": [made]}, FIRST[4:]),
+    ):
+        assert actions(observed(container(), **there)) == left
+
+
+# networks
+
+
+def test_networks_are_joined_and_left() -> None:
+    seen = observed(container(networks=("lab",)), networks=[UPLINK, APP, LAB], **both())
+    found = look(seen)
+    assert list(found.actions) == [Disconnect(PORTS, "app"), Connect(PORTS, "lab", ALIASES)]
+    assert len(found.groups) == 2
+
+
+def test_the_last_one_leaves() -> None:
+    """`docker compose down` can then remove the network; the proxy itself has its grace."""
+    found = look(observed(**both()))
+    assert list(found.actions) == [Disconnect(PORTS, "app")]
+    assert found.again_in == 60.0
+
+
+def test_the_uplink_is_joined_again() -> None:
+    bare = sandbox()
+    bare = replace(bare, container=replace(bare.container, attachments=(place("app", *ALIASES),)))
+    seen = observed(container(), networks=[APP], sandboxes=[bare], proxies=[proxy()])
+    assert actions(seen) == [CreateNetwork("0-rosproxy"), Connect(PORTS, "0-rosproxy", ())]
+
+
+def test_a_missing_name_that_somebody_looks_for() -> None:
+    there: Any = {"sandboxes": [sandbox(networks=[place("app", "robot")])], "proxies": [proxy()]}
+    again = [Disconnect(PORTS, "app"), Connect(PORTS, "app", ALIASES)]
+    assert actions(observed(container(), **there)) == again
+    assert actions(observed(container(env=KEY.master_uri), **there)) == []
+
+
+def test_a_name_that_another_one_has_now_is_not_taken_again() -> None:
+    robot = container("robot", {})
+    stopped = sandbox(state="exited")
+    seen = observed(container(), robot, sandboxes=[stopped], proxies=[proxy()])
+    assert Connect(PORTS, "app", ("rosproxy", NAME)) in actions(seen)
+
+
+# sandboxes that do not run
+
+
+def test_a_sandbox_that_has_stopped_is_started_without_networks() -> None:
+    """The engine joins them in any order, and may lay the ports over the wrong one first."""
+    seen = observed(container(), sandboxes=[sandbox(state="exited")], proxies=[proxy()])
+    assert actions(seen) == [
+        Disconnect(PORTS, "app"),
+        Start(PORTS),
+        Connect(PORTS, "app", ALIASES),
+        Restart(NAME),
+    ]
+
+
+@pytest.mark.parametrize("network_id", ["other", "n1"])
+def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str) -> None:
+    stopped = sandbox(networks=[place("app", network_id=network_id)], state="exited")
+    seen = observed(container(), sandboxes=[stopped])
+    anew = [
+        Rename(PORTS, f"{PORTS}-old"),
+        new_sandbox(),
+        Remove(f"{PORTS}-old", "made anew"),
+        *FIRST[1:],
+    ]
+    usual = [Disconnect(PORTS, "app"), *FIRST[1:]]
+    assert actions(seen) == (usual if network_id == "n1" else anew)
+
+
+def test_a_sandbox_that_is_paused() -> None:
+    seen = observed(container(), sandboxes=[sandbox(state="paused")], proxies=[proxy()])
+    assert actions(seen) == [Unpause(PORTS)]
+
+
+def test_a_sandbox_that_the_engine_restarts_is_left_alone() -> None:
+    found = look(observed(container(), sandboxes=[sandbox(state="restarting", networks=())]))
+    assert found.actions == ()
+    assert texts(found) == [f"ends and is restarted: see docker logs {PORTS}"]
+
+
+def test_a_sandbox_that_is_dead() -> None:
+    seen = observed(container(), sandboxes=[sandbox(state="dead")])
+    assert actions(seen) == [Remove(PORTS, "left over"), *FIRST]
+
+
+def test_a_sandbox_that_is_being_removed_is_waited_for() -> None:
+    found = look(observed(container(), sandboxes=[sandbox(state="removing")], proxies=[proxy()]))
+    assert (found.actions, found.again_in) == ((), 1.0)
+
+
+# proxies that do not run
+
+
+@pytest.mark.parametrize(
+    ("state", "done"),
+    [
+        ("exited", [Start(NAME)]),
+        ("created", [Start(NAME)]),
+        ("paused", [Unpause(NAME)]),
+        ("restarting", []),
+        ("dead", [Remove(NAME, "left over"), new_proxy(), Start(NAME)]),
+        ("removing", []),
+    ],
+)
+def test_a_proxy_that_does_not_run(state: str, done: list[Action]) -> None:
+    found = look(observed(container(), sandboxes=[sandbox()], proxies=[proxy(state=state)]))
+    assert list(found.actions) == done
+    assert found.again_in == (1.0 if state == "removing" else None)
+
+
+@pytest.mark.parametrize(
+    ("proxys", "sandboxs", "lost"),
+    [
+        ("10:00:01Z", "10:00:00Z", False),
+        ("10:00:00Z", "10:00:01Z", True),
+        ("10:00:00.12Z", "10:00:00.115Z", False),
+        ("10:00:00.12Z", "10:00:00.1234Z", True),
+        ("10:00:00Z", "10:00:00.1Z", True),
+        ("", "10:00:00.1Z", False),
+        ("10:00:00Z", "", False),
+    ],
+)
+def test_a_proxy_in_a_namespace_that_is_gone(proxys: str, sandboxs: str, lost: bool) -> None:
+    day = "2026-01-01T"
+    seen = observed(
+        container(),
+        sandboxes=[sandbox(started_at=sandboxs and day + sandboxs)],
+        proxies=[proxy(started_at=proxys and day + proxys)],
+    )
+    assert actions(seen) == ([Restart(NAME)] if lost else [])
+
+
+def test_a_proxy_in_another_sandbox_is_replaced() -> None:
+    seen = observed(container(), sandboxes=[sandbox()], proxies=[proxy(sandbox_id="gone")])
+    assert actions(seen) == replacement()
+
+
+# replacement
+
+
+def replacement(image: str = IMAGE) -> list[Action]:
+    old = f"{NAME}-old"
+    return [
+        Rename(NAME, old),
+        new_proxy(replaces=old, image=image),
+        Remove(old, "made anew"),
+        Start(NAME),
+    ]
+
+
+def test_a_new_image_replaces_the_proxy_and_not_the_sandbox() -> None:
+    assert actions(observed(container(), image="new", **both())) == replacement("new")
+
+
+def test_a_controller_killed_while_replacing_goes_on() -> None:
+    old = proxy(name=f"{NAME}-old")
+    new = proxy(image="new", state="created", started_at="")
+    for there, left in (
+        ([old], [new_proxy(replaces=f"{NAME}-old", image="new"), *replacement()[2:]]),
+        ([old, new], [Remove(f"{NAME}-old", "another one takes over"), Start(NAME)]),
+        ([new], [Start(NAME)]),
+    ):
+        seen = observed(container(), image="new", sandboxes=[sandbox()], proxies=there)
+        assert actions(seen) == left
+
+
+def test_an_old_one_that_is_right_after_all_gets_its_name_back() -> None:
+    old = proxy(name=f"{NAME}-old")
+    seen = observed(container(), sandboxes=[sandbox()], proxies=[old])
+    assert actions(seen) == [Rename(f"{NAME}-old", NAME)]
+
+
+def test_two_that_run() -> None:
+    other = proxy(name="other")
+    seen = observed(container(), sandboxes=[sandbox()], proxies=[other, proxy()])
+    assert actions(seen) == [Remove("other", "left over")]
+
+
+def test_other_ports_replace_both() -> None:
+    labels = {**ENABLED, "rosproxy.ports": "40"}
+    longer = PortRange(11400, 11439)
+    assert actions(observed(container(labels=labels), **both())) == [
+        Rename(PORTS, f"{PORTS}-old"),
+        new_sandbox(longer),
+        Remove(NAME, "its sandbox is made anew"),
+        Remove(f"{PORTS}-old", "made anew"),
+        Start(PORTS),
+        Connect(PORTS, "app", ALIASES),
+        new_proxy(longer, replaces=NAME),
+        Start(NAME),
+    ]
+
+
+def test_another_publish_address_replaces_both() -> None:
+    settings = replace(SETTINGS, publish=("192.0.2.10",))
+    found = actions(observed(container(), **both()), settings=settings)
+    assert found[0] == Rename(PORTS, f"{PORTS}-old")
+    assert found[2] == Remove(NAME, "its sandbox is made anew")
+
+
+def test_names_of_strangers_are_left_to_them() -> None:
+    strangers = [container(PORTS, {}), container(NAME, {})]
+    found = actions(observed(container(), *strangers))
+    assert found[0] == new_sandbox(name=f"{PORTS}-2")
+    assert found[1] == Start(f"{PORTS}-2")
+    assert Start(f"{NAME}-2") in found
+
+
+# image and uplink
+
+
+def test_without_an_image_nothing_is_created() -> None:
+    found = look(observed(container(), image=""))
+    assert found.actions == ()
+    assert [(problem.subject, problem.fatal) for problem in found.problems] == [
+        ("proxy image rosproxy:latest", True)
+    ]
+    assert "not on this host: docker pull rosproxy:latest" in texts(found)[0]
+    assert "docker build --target proxy" in texts(found)[0]
+
+
+def test_without_an_image_everything_is_kept() -> None:
+    settings = replace(SETTINGS, publish=("::",), ports=40)
+    found = look(observed(container(), image="", **both()), settings=settings)
+    assert found.actions == ()
+    assert [problem.fatal for problem in found.problems] == [False]
+    stopped: Any = {"sandboxes": [sandbox(state="exited")], "proxies": [proxy(state="exited")]}
+    assert actions(observed(container(), image="", **stopped)) == [
+        Disconnect(PORTS, "app"),
+        Start(PORTS),
+        Connect(PORTS, "app", ALIASES),
+        Start(NAME),
+    ]
+
+
+@pytest.mark.parametrize(
+    "uplink", [replace(UPLINK, internal=True), replace(UPLINK, driver="ipvlan")]
+)
+def test_an_uplink_that_is_none(uplink: Network) -> None:
+    found = look(observed(container(), networks=[uplink, APP]))
+    assert found.actions == ()
+    assert "can't be the proxies' uplink" in texts(found)[0]
+
+
+# the end
+
+
+def test_the_grace() -> None:
+    alone: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
+    first = look(observed(**alone))
+    assert (first.actions, first.again_in) == ((), 60.0)
+    second = look(observed(**alone), memory=first.memory, now=59.5)
+    assert (second.actions, second.again_in) == ((), 0.5)
+    third = look(observed(**alone), memory=second.memory, now=60.0)
+    why = "no running container wants it any more"
+    assert list(third.actions) == [Remove(NAME, why, retire=True), Remove(PORTS, why)]
+    assert third.again_in is None
+    assert look(observed(), memory=third.memory, now=61.0).memory == Memory()
+
+
+def test_the_grace_begins_anew_with_each_container() -> None:
+    alone: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
+    memory = look(observed(**alone)).memory
+    memory = look(observed(container(), **both()), memory=memory, now=50.0).memory
+    assert look(observed(**alone), memory=memory, now=70.0).again_in == 60.0
+
+
+@pytest.mark.parametrize("state", ["exited", "paused", "created", "restarting"])
+def test_what_does_not_run_goes_too(state: str) -> None:
+    settings = replace(SETTINGS, grace=0.0)
+    seen = observed(sandboxes=[sandbox(networks=(), state=state)], proxies=[proxy(state=state)])
+    found = actions(seen, settings=settings)
+    why = "no running container wants it any more"
+    removals = [Remove(NAME, why, retire=state == "paused"), Remove(PORTS, why)]
+    assert found == ([Unpause(NAME), *removals] if state == "paused" else removals)
+
+
+def test_a_container_that_has_exited_keeps_its_network_for_the_grace() -> None:
+    seen = observed(container(state="exited"), **both())
+    first = look(seen)
+    assert (first.actions, first.again_in) == ((), 60.0)
+    after = look(seen, memory=first.memory, now=60.0)
+    assert [type(action) for action in after.actions] == [Remove, Remove]
+
+
+# ports
+
+
+def port_problem(found: Plan) -> str:
+    return next(problem.text for problem in found.problems if problem.subject == f"proxy {NAME}")
+
+
+def created(found: Plan) -> PortRange:
+    return next(a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox))
+
+
+@pytest.mark.parametrize(
+    ("seen", "first"),
+    [
+        (observed(container()), 11400),
+        (observed(container(ports=[11405])), 11406),
+        (observed(container(), container("web", {}, state="created", ports=[11405])), 11406),
+        (observed(container(), container("web", {}, state="exited", ports=[11431])), 11432),
+        (observed(container(), listening=[11400, 11410]), 11411),
+        (observed(container(), ephemeral=PortRange(10000, 20000)), 20001),
+        (observed(container(), **both(key=ARM)), 11432),
+        (observed(container(), sandboxes=[sandbox(ARM, state="created")]), 11432),
+    ],
+)
+def test_new_ports_are_nobodys(seen: Observed, first: int) -> None:
+    assert created(look(seen)) == PortRange(first, first + 31)
+
+
+def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
+    labels = {**ENABLED, "rosproxy.master-uri": "http://robot:11405"}
+    assert created(look(observed(container(labels=labels)))).first == 11406
+
+
+def test_two_new_proxies_do_not_get_the_same() -> None:
+    found = look(observed(container(), container("b", ON_ARM)))
+    ranges = [a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox)]
+    assert ranges == [RANGE, NEXT]
+
+
+def test_ports_are_kept_while_a_container_is_being_created() -> None:
+    memory = look(observed(container())).memory
+    found = look(observed(container(), container("a", ON_ARM)), memory=memory)
+    assert [
+        (a.sandbox.key, a.sandbox.range) for a in found.actions if isinstance(a, CreateSandbox)
+    ] == [
+        (ARM, NEXT),
+        (KEY, RANGE),
+    ]
+
+
+def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:
+    """What listens there may be what is left of it."""
+    there = PortRange(11500, 11531)
+    memory = look(observed(container(), **both(ports=there))).memory
+    found = look(observed(container(), listening=there.ports()), memory=memory)
+    assert created(found) == there
+
+
+def test_ports_are_kept_when_the_proxy_was_removed_and_nothing_is_remembered() -> None:
+    there = PortRange(11500, 11531)
+    seen = observed(container(), sandboxes=[sandbox(ports=there)])
+    assert actions(seen) == [new_proxy(there), Start(NAME)]
+
+
+def test_never_fewer_ports() -> None:
+    assert actions(observed(container(), **both()), settings=replace(SETTINGS, ports=8)) == []
+
+
+def test_more_ports_that_can_not_be_had() -> None:
+    labels = {**ENABLED, "rosproxy.ports": "40"}
+    found = look(observed(container(labels=labels), listening=[11435], **both()))
+    assert found.actions == ()
+    assert "40 ports are wanted" in port_problem(found)
+    assert "it keeps its 32 at 11400-11431, since 11432-11439 are not free" in port_problem(found)
+
+
+def test_exhausted() -> None:
+    settings = replace(SETTINGS, window=PortRange(11400, 11430))
+    found = look(observed(container()), settings=settings)
+    assert found.actions == ()
+    assert port_problem(found) == (
+        "no 32 free ports in a row between 11400 and 11430: 31 of 31 are free, 31 at most in a "
+        "row: lower --ports or the label rosproxy.ports (32), widen --port-window (11400-11430), "
+        "or stop what holds ports there"
+    )
+
+
+def refused(seen: Observed, ports: Iterable[int] | None, memory: Memory, now: float) -> Plan:
+    return look(seen, memory=memory.port_taken(PORTS, ports, now), now=now)
+
+
+@pytest.mark.parametrize(
+    ("ports", "then"), [([11410], PortRange(11411, 11442)), (None, NEXT), ([99], NEXT)]
+)
+def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
+    ports: list[int] | None, then: PortRange
+) -> None:
+    seen = observed(container(), sandboxes=[sandbox(state="created", networks=())])
+    found = refused(seen, ports, Memory(), 0.0)
+    assert found.actions[:4] == (
+        Rename(PORTS, f"{PORTS}-old"),
+        new_sandbox(then),
+        Remove(f"{PORTS}-old", "made anew"),
+        Start(PORTS),
+    )
+    assert look(seen, memory=found.memory, now=299.0).actions == found.actions
+
+
+@pytest.mark.parametrize("ports", [[11410], None])
+def test_ports_that_have_served_are_tried_for_a_while(ports: list[int] | None) -> None:
+    seen = observed(
+        container(), sandboxes=[sandbox(state="exited", networks=())], proxies=[proxy()]
+    )
+    first = refused(seen, ports, Memory(), 100.0)
+    assert first.actions[0] == Start(PORTS)
+    assert first.again_in == 1.0
+    then = refused(seen, ports, first.memory, 119.9)
+    assert then.actions[0] == Start(PORTS)
+    last = refused(seen, ports, then.memory, 120.0)
+    assert created(last) == (PortRange(11411, 11442) if ports else NEXT)
+    assert f"HAS LEFT ITS PORTS 11400-11431 for {created(last)}" in port_problem(last)
+    assert last.memory.moved == {KEY: Move(RANGE, 120.0)}
+
+
+def test_added_ports_that_are_refused_are_given_up() -> None:
+    labels = {**ENABLED, "rosproxy.ports": "40"}
+    memory = look(observed(container(labels=labels), **both())).memory
+    longer = sandbox(ports=PortRange(11400, 11439), state="created", networks=())
+    for ports in ([11435], None):
+        found = refused(observed(container(labels=labels), sandboxes=[longer]), ports, memory, 1.0)
+        assert created(found) == RANGE
+        assert "it keeps its 32" in port_problem(found)
+
+
+def test_ports_that_a_stranger_publishes_now_are_left() -> None:
+    web = container("web", {}, ports=[11400])
+    found = look(observed(container(), web, sandboxes=[sandbox(state="exited")]))
+    assert created(found) == PortRange(11401, 11432)
+    assert "HAS LEFT ITS PORTS" in port_problem(found)
+
+
+def test_a_start_that_went_well_is_the_end_of_it() -> None:
+    memory = Memory().port_taken(PORTS, None, 0.0)
+    found = look(observed(container(), **both()), memory=memory, now=30.0)
+    assert (found.actions, found.memory.refusals, found.again_in) == ((), {}, None)
+
+
+# all together
+
+
+def test_problems_of_one_key_do_not_touch_another() -> None:
+    arm: Any = both(key=ARM, ports=NEXT)
+    alone = look(observed(container("b", ON_ARM), **arm), settings=SETTINGS)
+    for bad in (
+        container("a", networks=("bridge",)),
+        container("a", {**ENABLED, "rosproxy.ports": "1000"}),
+        container("a", {**ENABLED, "rosproxy.ports": "none"}),
+        container("a", networks=("gone",)),
+    ):
+        settings = replace(SETTINGS, window=PortRange(11400, 11463))
+        found = look(observed(bad, container("b", ON_ARM), **arm), settings=settings)
+        assert [group for group in found.groups if group.key == ARM] == list(alone.groups)
+
+
+def test_what_lets_names_go_comes_first() -> None:
+    """A key's name may be another one's next."""
+    seen = observed(
+        container(),
+        networks=[UPLINK, APP],
+        sandboxes=[sandbox(Key("http://zoo:11311", HERE), ports=NEXT)],
+    )
+    found = look(seen)
+    assert isinstance(found.actions[0], Disconnect)
+    assert Connect(PORTS, "app", ALIASES) in found.actions

@@ -1,0 +1,174 @@
+"""What people read."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.core.text import width
+from rosproxy_operator.core.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    ProxySpec,
+    Remove,
+    Rename,
+    Restart,
+    SandboxSpec,
+    Start,
+    Unpause,
+)
+from rosproxy_operator.core.report import line, plan_text, render
+from tests.unit.operator.builders import KEY, RANGE
+
+PROXY = {
+    "name": "rosproxy-robot-eefee4",
+    "master_uri": "http://robot:11311",
+    "master_address": "192.0.2.7",
+    "advertise_host": "192.0.2.10",
+    "range": "11400-11431",
+    "state": "running",
+    "reachable": True,
+    "master_up": True,
+    "networks": ["app"],
+    "used": 2,
+    "free": 30,
+    "problems": [],
+}
+NODES = [
+    {
+        "names": ["/talker", "/rosout"],
+        "address": "172.18.0.2:40001",
+        "advertised_uri": "http://192.0.2.10:11400/",
+        "state": "alive",
+    },
+]
+TALKER = {
+    "name": "talker",
+    "state": "running",
+    "proxy": "rosproxy-robot-eefee4",
+    "networks": ["app"],
+    "addresses": {"app": "172.18.0.2"},
+    "nodes": NODES,
+}
+LISTENER = {**TALKER, "name": "listener", "proxy": None, "nodes": []}
+STATUS = {
+    "version": "1.0",
+    "uplink": "0-rosproxy",
+    "proxies": [PROXY],
+    "containers": [TALKER, LISTENER],
+    "problems": [],
+    "actions": [],
+}
+
+ACTIONS: list[tuple[Action, str]] = [
+    (CreateNetwork("0-rosproxy"), "create network 0-rosproxy, a bridge: the uplink of all proxies"),
+    (
+        CreateSandbox(SandboxSpec("p-ports", KEY, RANGE, "f", "0-rosproxy")),
+        "create container p-ports: it holds ports 11400-11431 for the proxy of the master "
+        "http://robot:11311",
+    ),
+    (
+        Create(ProxySpec("p", KEY, RANGE, "f", "p-ports", "p-old")),
+        "create container p: proxy of the master http://robot:11311 at 192.0.2.10, ports "
+        "11400-11431 of p-ports, instead of p-old",
+    ),
+    (Start("p"), "start container p"),
+    (Restart("p"), "restart container p"),
+    (Unpause("p"), "resume container p"),
+    (Rename("p", "p-old"), "rename container p to p-old"),
+    (Connect("p", "app", ("a", "b")), "connect container p to network app as a, b"),
+    (Connect("p", "0-rosproxy", ()), "connect container p to network 0-rosproxy"),
+    (Disconnect("p", "app"), "disconnect container p from network app"),
+    (Remove("p", "made anew"), "remove container p (made anew)"),
+    (
+        Remove("p", "done", retire=True),
+        "remove container p (done), after unregistering its nodes at the master",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("action", "text"), ACTIONS)
+def test_each_action_is_one_line(action: Action, text: str) -> None:
+    assert line(action) == text
+
+
+def test_a_plan_is_its_lines() -> None:
+    assert plan_text([Start("a"), Start("b")]) == "start container a\nstart container b"
+    assert plan_text([]) == "Nothing to do."
+
+
+def test_the_whole_status() -> None:
+    assert render(STATUS, 100).splitlines() == [
+        "rosproxy-controller 1.0: 2 containers, 1 proxy, uplink network 0-rosproxy",
+        "",
+        "PROXY                  STATE    MASTER              OUTSIDE     PORTS",
+        "rosproxy-robot-eefee4  running  http://robot:11311  192.0.2.10  11400-11431 2 used",
+        "",
+        "CONTAINER  STATE    PROXY                  PORTS        NODES",
+        "talker     running  rosproxy-robot-eefee4  11400-11431  1",
+        "    /talker  /rosout",
+        "listener   running  -                      -            0",
+    ]
+
+
+def test_what_is_wrong_stands_where_it_belongs() -> None:
+    proxy = {**PROXY, "reachable": False, "master_up": False, "used": None, "problems": ["ill"]}
+    status = {
+        **STATUS,
+        "proxies": [proxy],
+        "problems": [
+            {"subject": "container listener", "text": "no master is known", "fatal": True},
+            {"subject": "network 0-a", "text": "can't be joined", "fatal": True},
+        ],
+        "actions": ["start container x"],
+    }
+    text = render(status, 120)
+    assert "running, no answer  http://robot:11311 DOWN" in text
+    assert "\n    ! ill\n" in text
+    assert (
+        text.endswith(
+            "listener   running             -                      -            0\n"
+            "    ! no master is known\n"
+            "\nproblems:\n  network 0-a: can't be joined\n"
+            "\nyet to be done: 1 step\n  start container x"
+        )
+        or "    ! no master is known\n\nproblems:\n  network 0-a: can't be joined\n" in text
+    )
+
+
+def test_nothing_there() -> None:
+    text = render({**STATUS, "proxies": [], "containers": []}, 80)
+    assert "No proxy." in text
+    assert "No container is labelled: docker run --label rosproxy.enable=true" in text
+
+
+@pytest.mark.parametrize("lines", [1, 4, 8, 20, 100])
+def test_a_bound_on_lines(lines: int) -> None:
+    status = {**STATUS, "containers": [TALKER] * 30}
+    text = render(status, 100, lines).splitlines()
+    assert len(text) <= lines
+    if lines < 100:
+        assert "more: rosproxy-controller docker status" in text[-1]
+
+
+NASTY = st.text(st.sampled_from("ab\x1b[2J\u202e\n\r\t漢 "), max_size=40)
+
+
+@given(NASTY, st.integers(30, 200), st.none() | st.integers(2, 30))
+def test_hostile_names_do_no_harm(name: str, columns: int, lines: int | None) -> None:
+    status = {
+        **STATUS,
+        "uplink": name,
+        "proxies": [{**PROXY, "name": name, "master_uri": name, "problems": [name]}],
+        "containers": [{**TALKER, "name": name, "proxy": name, "nodes": [{"names": [name]}]}],
+        "problems": [{"subject": name, "text": name, "fatal": True}],
+        "actions": [name],
+    }
+    for text in render(status, columns, lines).splitlines():
+        assert text.isprintable()
+        assert width(text) >= 0
+    action = Connect(name, name, (name,))
+    assert line(action).isprintable()

@@ -1,0 +1,126 @@
+"""What a proxy is told of the containers on its networks."""
+
+from dataclasses import replace
+from ipaddress import IPv4Network
+from typing import Any
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.model import (
+    Attachment,
+    Container,
+    Host,
+    Key,
+    Network,
+    Observed,
+    Proxy,
+    Sandbox,
+    Wish,
+)
+from rosproxy_operator.docker.observe import Look
+from rosproxy_operator.docker.tell import Facts, facts, gone, moved
+
+KEY = Key("http://robot:11311", "192.0.2.10")
+PORTS = PortRange(11400, 11431)
+SUBNET = IPv4Network("172.18.0.0/16")
+
+
+def at(address: str, network: str = "app", *names: str) -> Attachment:
+    return Attachment(network, address, frozenset(names))
+
+
+def talker(address: str = "172.18.0.5", state: str = "running") -> Container:
+    return Container("t" * 20, "talker", state, attachments=(at(address),), hostname="bhost")
+
+
+def look(*containers: Container) -> Look:
+    home = Container(
+        "box", "box", "running", attachments=(at("172.30.0.2", "up"), at("172.18.0.2"))
+    )
+    process = Container("p", "p", "running", network_mode="container:box")
+    networks = (
+        Network("1", "app", gateway="172.18.0.1"),
+        Network("2", "up", gateway="172.30.0.1"),
+        Network("3", "other", gateway="172.19.0.1"),
+    )
+    return Look(
+        Observed(
+            containers,
+            networks,
+            (Proxy(KEY, process, PORTS, ""),),
+            Host(PORTS),
+            sandboxes=(Sandbox(KEY, home, PORTS, ""),),
+        ),
+        endpoints={("t" * 20, "app"): "e1"},
+        subnets={"app": (SUBNET,), "other": (IPv4Network("172.19.0.0/16"),)},
+        addresses=frozenset({"172.18.0.5", "172.18.0.2", "172.30.0.2"}),
+    )
+
+
+def told(seen: Look, *wishes: Wish, master: str = "198.51.100.7") -> Facts:
+    return facts(seen, seen.observed.proxies[0], wishes, master)
+
+
+def wish(container: Container) -> Wish:
+    return Wish(container.name, container.id, KEY)
+
+
+def nodes(*addresses: str) -> dict[str, Any]:
+    return {"nodes": [{"address": f"{address}:40001"} for address in addresses]}
+
+
+def test_a_running_container_has_arrived_under_all_its_names() -> None:
+    seen = look(replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),)))
+    (arrival,) = told(seen, wish(talker())).arrivals
+    assert (arrival.address, arrival.network, arrival.endpoint) == ("172.18.0.5", "app", "e1")
+    assert arrival.names == {"talker", "t" * 12, "web", "bhost"}
+
+
+def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
+    other = Wish("talker", "t" * 20, Key("http://other:11311", "192.0.2.10"))
+    assert not told(look(talker()), other).arrivals
+    assert not told(look(talker(state="exited")), wish(talker())).arrivals
+    assert not told(look(talker())).arrivals
+
+
+def test_networks_that_the_proxy_is_not_on_do_not_count() -> None:
+    away = replace(talker(), attachments=(at("172.19.0.5", "other"),))
+    known = told(look(away), wish(away))
+    assert not known.arrivals
+    assert not known.addresses
+    assert known.subnets == (SUBNET,)
+
+
+def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
+    guest = Container("g" * 20, "guest", "running", network_mode=f"container:{'t' * 20}")
+    (arrival,) = told(look(talker(), guest), wish(guest)).arrivals
+    assert (arrival.container, arrival.address, arrival.endpoint) == ("g" * 20, "172.18.0.5", "e1")
+    assert {"guest", "bhost"} <= arrival.names
+
+
+def test_the_masters_address_is_only_told_for_a_name() -> None:
+    assert told(look()).master_address == "198.51.100.7"
+    seen = look()
+    key = Key("http://198.51.100.8:11311", "192.0.2.10")
+    process = replace(seen.observed.proxies[0], key=key)
+    assert facts(seen, process, (), "198.51.100.8").master_address == ""
+
+
+def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
+    known = told(look(talker()))
+    status = nodes("172.18.0.5", "172.18.0.6", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker")
+    assert gone(status, known.taken, known.subnets) == ["172.18.0.6"]
+    assert gone({}, known.taken, known.subnets) == []
+
+
+def test_moved_is_who_has_another_address_on_the_same_network() -> None:
+    before = told(look(talker())).addresses
+    assert moved(before, told(look(talker("172.18.0.9")))) == {"172.18.0.5": "172.18.0.9"}
+    assert moved(before, told(look(talker()))) == {}
+    assert moved(before, told(look())) == {}
+    assert moved({}, told(look(talker()))) == {}
+
+
+def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
+    before = told(look(talker())).addresses
+    other = Container("o", "other", "running", attachments=(at("172.18.0.5"),))
+    assert moved(before, told(look(talker("172.18.0.9"), other))) == {}
