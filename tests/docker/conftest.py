@@ -1,13 +1,31 @@
-"""The engine, the images and a robot on another network, made once for all tests."""
+"""The engine, the images and machines outside, made once for all tests."""
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack
 
 import pytest
 
+from tests.docker.controller import Controller, proxies, remove_proxies, running_controller
 from tests.docker.engine import ROOT, build, docker, run, running_engine
-from tests.docker.robot import Robot, robot_outside
+from tests.docker.inside import Inside, inside
+from tests.docker.machines import Machine
+from tests.docker.robot import Robot, laptop, named_robot, robot_outside
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show with a failure what the proxies have logged and what they know."""
+    report = yield
+    if report.failed and report.when == "call":
+        for proxy in proxies():
+            report.sections.append((proxy.name, docker("logs", proxy.name, check=False)))
+            status = docker("exec", proxy.name, "rosproxy", "status", check=False)
+            report.sections.append((proxy.name, status))
+    return report
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,13 +55,24 @@ def proxy_image(base_image: str) -> str:
 
 
 @pytest.fixture(scope="session")
+def controller_image(base_image: str) -> str:
+    arguments = ("--build-arg", f"BASE_IMAGE={base_image}", "--target", "operator")
+    return build("rosproxy-operator:test", *arguments, ROOT)
+
+
+@pytest.fixture(scope="session")
 def ros_image(base_image: str) -> str:
     """A machine with ROS 1 on it."""
+    arguments = ("--build-arg", f"BASE_IMAGE={base_image}")
+    dockerfile = ("--file", ROOT / "tests/docker/ros.Dockerfile")
+    return build("rosproxy-test-ros:latest", *arguments, *dockerfile, ROOT / "tests/ros/nodes")
+
+
+@pytest.fixture(scope="session")
+def haproxy_image(base_image: str) -> str:
     here = ROOT / "tests/docker"
-    dockerfile = ("--file", here / "ros.Dockerfile")
-    return build(
-        "rosproxy-test-ros:latest", "--build-arg", f"BASE_IMAGE={base_image}", *dockerfile, here
-    )
+    arguments = ("--build-arg", f"BASE_IMAGE={base_image}", "--file", here / "haproxy.Dockerfile")
+    return build("rosproxy-test-haproxy:latest", *arguments, here)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +81,68 @@ def robot(ros_image: str) -> Iterator[Robot]:
     with robot_outside(ros_image) as robot:
         robot.start_master()
         yield robot
+
+
+@pytest.fixture(scope="session")
+def named(ros_image: str) -> Iterator[Robot]:
+    """The same, but it calls itself ``robot``: nobody inside can resolve that by himself."""
+    with named_robot(ros_image) as robot:
+        robot.start_master()
+        yield robot
+
+
+@pytest.fixture(scope="session")
+def other_machine(ros_image: str, named: Robot) -> Iterator[Machine]:
+    with laptop(ros_image, named) as machine:
+        yield machine
+
+
+@pytest.fixture(scope="session")
+def _no_other_controller(_engine: None) -> None:
+    found = [proxy.name for proxy in proxies()]
+    assert not found, f"a controller is at work on this engine, or has left its proxies: {found}"
+
+
+@pytest.fixture
+def start_controller(
+    controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None
+) -> Iterator[Callable[..., Controller]]:
+    """Starts a controller with options of its own; it and its proxies are removed afterwards."""
+    with ExitStack() as stack:
+        stack.callback(remove_proxies)
+        names = {named.name: named.address}
+
+        def start(*options: str, **more: dict[str, str]) -> Controller:
+            every = {**names, **more.get("names", {})}
+            return stack.enter_context(
+                running_controller(
+                    controller_image, "--proxy-image", proxy_image, *options, names=every
+                )
+            )
+
+        yield start
+
+
+@pytest.fixture(scope="module")
+def controller(
+    controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None
+) -> Iterator[Controller]:
+    """A controller with the usual options, for all tests of a module."""
+    names = {named.name: named.address}
+    try:
+        with running_controller(
+            controller_image, "--proxy-image", proxy_image, names=names
+        ) as found:
+            yield found
+    finally:
+        remove_proxies()
+
+
+@pytest.fixture
+def net(ros_image: str, named: Robot) -> Iterator[Inside]:
+    """Where the nodes inside live; all that a test makes there is removed after it."""
+    with inside(ros_image, named.master_uri) as made:
+        yield made
 
 
 @pytest.fixture

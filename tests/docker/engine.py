@@ -34,10 +34,13 @@ def docker(*arguments: str | Path, check: bool = True, seconds: float = 60) -> s
     return run("docker", *arguments, check=check, seconds=seconds)
 
 
-def inspect(name: str) -> dict[str, Any]:
-    """Everything that the engine knows about a container or an image."""
-    found: list[dict[str, Any]] = json.loads(docker("inspect", name))
-    return found[0]
+def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
+    """Everything that the engine knows about a container or an image; empty if it knows none."""
+    found = docker("inspect", name, check=check)
+    if not found.startswith("[\n"):
+        return {}
+    objects: list[dict[str, Any]] = json.loads(found)
+    return objects[0]
 
 
 def wait_until(true: Callable[[], bool], seconds: float, what: str | Callable[[], str]) -> float:

@@ -1,61 +1,83 @@
-"""A machine outside: ROS in a network namespace of its own, one cable away from this host.
+"""Robots: machines outside that run a roscore."""
 
-It is a container without any network, which then gets one end of a veth pair. Its only
-route is the cable: this host's published ports are in reach, container networks are not.
-"""
-
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any, cast
+from xmlrpc.client import ServerProxy
 
-from tests.docker.engine import docker, inspect, run, wait_until
+from tests.docker.engine import wait_until
+from tests.docker.machines import Machine, addresses, join, machine, reach
 
-HOST_ADDRESS = "198.18.77.1"
-ROBOT_ADDRESS = "198.18.77.2"
+ADDRESSED, NAMED, LAPTOP = 77, 78, 79
+HOST_ADDRESS, ROBOT_ADDRESS = addresses(ADDRESSED)
 MASTER_URI = f"http://{ROBOT_ADDRESS}:11311"
 
 
 @dataclass(frozen=True)
-class Robot:
-    container: str
+class Robot(Machine):
+    """A machine with a master, which ``name`` stands for in URIs."""
 
-    def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
-        """Run a ROS program on the robot; one that hangs is stopped and fails the test."""
-        return docker(
-            "exec", self.container, "timeout", str(seconds), *command,
-            check=check, seconds=seconds + 10,
-        )  # fmt: skip
+    name: str
 
-    def start(self, *command: str) -> None:
-        docker("exec", "--detach", self.container, *command)
+    @property
+    def master_uri(self) -> str:
+        return f"http://{self.name}:11311"
 
-    def start_master(self) -> None:
-        self.start("roscore")
-        wait_until(
-            lambda: "/rosout" in self.run("rosnode", "list", check=False), 30, "roscore is up"
-        )
+    def start_master(self, port: int = 11311) -> None:
+        self.start("sh", "-c", f"ROS_MASTER_URI=http://{self.name}:{port} exec roscore -p {port}")
+        wait_until(lambda: "/rosout" in self.nodes(port), 30, "roscore is up")
+
+    def nodes(self, port: int = 11311) -> dict[str, str]:
+        """Every node that the master knows, with its URI."""
+        try:
+            with ServerProxy(f"http://{self.address}:{port}") as master:
+                _, _, state = cast(Any, master.getSystemState("/test"))
+                names = {name for kind in state for _, nodes in kind for name in nodes}
+                return {name: cast(Any, master.lookupNode("/test", name))[2] for name in names}
+        except OSError:
+            return {}
+
+    def uri(self, node: str, port: int = 11311) -> str:
+        """The URI that the master has of a node; empty if none."""
+        return self.nodes(port).get(f"/{node}", "")
+
+    def knows_proxied(self, node: str, port: int = 11311) -> bool:
+        """Whether the master knows a node by an address of this host."""
+        return self.uri(node, port).startswith(f"http://{self.host_address}:")
 
 
 @contextmanager
 def robot_outside(image: str) -> Iterator[Robot]:
-    name = f"rosproxy-test-robot-{os.getpid()}"
+    """A robot that calls itself by its address."""
     settings = ("--env", f"ROS_MASTER_URI={MASTER_URI}", "--env", f"ROS_IP={ROBOT_ADDRESS}")
-    docker("run", "--detach", "--init", "--network", "none", "--name", name, *settings,
-           image, "sleep", "infinity")  # fmt: skip
-    try:
-        connect(str(inspect(name)["State"]["Pid"]))
-        yield Robot(name)
-    finally:
-        docker("rm", "--force", name, check=False)
+    with machine(image, "addressed", ADDRESSED, *settings) as found:
+        yield _robot(found, found.address)
 
 
-def connect(process: str) -> None:
-    """Lay the cable between this host and the network namespace of a process."""
-    here, there = f"rpxh{os.getpid()}"[:15], "eth0"
-    inside = ("nsenter", "--target", process, "--net")
-    run("ip", "link", "add", here, "type", "veth", "peer", "name", there, "netns", process)
-    run("ip", "address", "add", f"{HOST_ADDRESS}/30", "dev", here)
-    run("ip", "link", "set", here, "up")
-    run(*inside, "ip", "address", "add", f"{ROBOT_ADDRESS}/30", "dev", there)
-    run(*inside, "ip", "link", "set", there, "up")
+@contextmanager
+def named_robot(image: str, name: str = "robot", number: int = NAMED) -> Iterator[Robot]:
+    """A robot as most are: it calls itself by its name, in URIs too."""
+    with machine(image, name, number, *_names(name, number)) as found:
+        yield _robot(found, name)
+
+
+@contextmanager
+def laptop(image: str, robot: Robot) -> Iterator[Machine]:
+    """A second machine outside, beside the robot. Inside, nobody can resolve its name."""
+    own = addresses(LAPTOP)[1]
+    settings = ("--env", f"ROS_MASTER_URI={robot.master_uri}", "--env", f"ROS_IP={own}",
+                "--add-host", f"{robot.name}:{robot.address}")  # fmt: skip
+    with machine(image, "laptop", LAPTOP, *settings) as found:
+        join(robot, found)
+        reach(found, robot.host_address)
+        yield found
+
+
+def _names(name: str, number: int) -> tuple[str, ...]:
+    return ("--hostname", name, "--add-host", f"{name}:{addresses(number)[1]}",
+            "--env", f"ROS_MASTER_URI=http://{name}:11311")  # fmt: skip
+
+
+def _robot(found: Machine, name: str) -> Robot:
+    return Robot(found.container, found.address, found.host_address, name)

@@ -1,0 +1,191 @@
+"""The controller: as a container, as users run it, or as a process that can be killed at will."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.docker.engine import docker, inspect, run, wait_until
+
+PROGRAM = Path(sys.executable).with_name("rosproxy-controller")
+MANAGED = "label=io.rosproxy.managed=true"
+UPLINK = "0-rosproxy"
+WINDOW = range(12000, 13000)
+OPTIONS = ("--port-window", f"{WINDOW[0]}-{WINDOW[-1]}", "--ports", "6", "--grace", "3",
+           "--resync", "5", "--admin-bind", "127.0.0.1:21313")  # fmt: skip
+HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges:true",
+            "--user", "0:0")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Proxy:
+    """A proxy that a controller has made: a container, and another that holds its network."""
+
+    name: str
+
+    @property
+    def sandbox(self) -> str:
+        return f"{self.name}-ports"
+
+    @property
+    def id(self) -> str:
+        return str(inspect(self.name)["Id"])
+
+    @property
+    def ports(self) -> range:
+        first, last = inspect(self.sandbox)["Config"]["Labels"]["io.rosproxy.range"].split("-")
+        return range(int(first), int(last) + 1)
+
+    @property
+    def running(self) -> bool:
+        """Whether both run, the one in the network of the other."""
+        found = [inspect(name, check=False) for name in (self.name, self.sandbox)]
+        if not all(one and one["State"]["Running"] and not one["State"]["Paused"] for one in found):
+            return False
+        return bool(found[0]["HostConfig"]["NetworkMode"] == f"container:{found[1]['Id']}")
+
+    @property
+    def networks(self) -> set[str]:
+        return set(inspect(self.sandbox)["NetworkSettings"]["Networks"]) - {UPLINK}
+
+    def aliases(self, network: str) -> set[str]:
+        found = inspect(self.sandbox)
+        return set(found["NetworkSettings"]["Networks"][network]["Aliases"]) - {found["Id"][:12]}
+
+    def address(self, network: str) -> str:
+        return str(inspect(self.sandbox)["NetworkSettings"]["Networks"][network]["IPAddress"])
+
+
+def managed(role: str) -> list[str]:
+    """The names of the containers that a controller has made, in whatever state."""
+    names = docker("ps", "--all", "--filter", MANAGED, "--filter", f"label=io.rosproxy.role={role}",
+                   "--format", "{{.Names}}").splitlines()  # fmt: skip
+    return sorted(names)
+
+
+def proxies() -> list[Proxy]:
+    """All proxies on this engine, also those of which only one container is there."""
+    names = {*managed("proxy"), *(name.removesuffix("-ports") for name in managed("ports"))}
+    return [Proxy(name) for name in sorted(names)]
+
+
+def the_proxy(seconds: float = 30) -> Proxy:
+    """Wait for a single proxy that runs, and return it."""
+    wait_until(
+        lambda: [proxy.running for proxy in proxies()] == [True],
+        seconds, lambda: docker("ps", "--all"),
+    )  # fmt: skip
+    return proxies()[0]
+
+
+def remove_proxies() -> None:
+    """Remove all proxies and the uplink."""
+    names = [*managed("proxy"), *managed("ports")]
+    if names:
+        docker("rm", "--force", *names, check=False, seconds=120)
+    docker("network", "rm", UPLINK, check=False)
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A controller in a container."""
+
+    container: str
+    options: tuple[str, ...]
+
+    def logs(self) -> str:
+        return docker("logs", self.container, check=False)
+
+    def command(self, *words: str, check: bool = True) -> str:
+        """Run another command of the controller's program with the same settings."""
+        return docker("exec", self.container, "rosproxy-controller", "docker", *self.options,
+                      *words, check=check)  # fmt: skip
+
+    def status(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.command("status", "--json"))
+        return found
+
+    def problems(self) -> str:
+        return "\n".join(f"{one['subject']}: {one['text']}" for one in self.status()["problems"])
+
+    def kill(self) -> None:
+        docker("kill", self.container)
+
+    def start(self) -> None:
+        docker("start", self.container)
+
+
+@contextmanager
+def running_controller(
+    image: str, *options: str, names: Mapping[str, str], container: str = ""
+) -> Iterator[Controller]:
+    """A controller as examples/docker/compose.yaml has it; later options win.
+
+    ``names`` are entries of its hosts file.
+    """
+    container = container or f"rosproxy-test-controller-{os.getpid()}"
+    every = (*OPTIONS, *options)
+    hosts = [word for name, at in names.items() for word in ("--add-host", f"{name}:{at}")]
+    docker("run", "--detach", "--name", container, "--network", "host", *HARDENED, *hosts,
+           "--volume", "/var/run/docker.sock:/var/run/docker.sock", image, "docker",
+           *every)  # fmt: skip
+    try:
+        yield Controller(container, every)
+    finally:
+        print(docker("logs", container, check=False))
+        docker("rm", "--force", container, check=False)
+
+
+class Process:
+    """A controller that runs outside any container, with names of its own."""
+
+    def __init__(
+        self, directory: Path, *options: str, names: Mapping[str, str] | None = None,
+        namespace: str = "", environment: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        self._directory = directory
+        self.options = (*OPTIONS, *options)
+        self._hosts = directory / "hosts"
+        self._hosts.write_text("".join(f"{at} {name}\n" for name, at in (names or {}).items()))
+        self._namespace = namespace
+        self.environment = dict(environment or {})
+        self._log = directory / "controller.log"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                self._command(), stdout=log, stderr=log, env={**os.environ, **self.environment}
+            )
+
+    def once(self, *words: str, check: bool = True, seconds: float = 120) -> str:
+        """Run it to its end: --once, plan or status."""
+        command = self._command(*words)
+        environment = {**os.environ, **self.environment}
+        return run(*command, check=check, seconds=seconds, env=environment)
+
+    def kill(self, number: int = signal.SIGKILL) -> int:
+        """Send it a signal and wait for its end; return its exit status."""
+        assert self.process is not None
+        self.process.send_signal(number)
+        return self.process.wait(30)
+
+    def stop(self) -> None:
+        if self.process is not None and self.process.poll() is None:
+            self.kill()
+
+    def logs(self) -> str:
+        return self._log.read_text()
+
+    def _command(self, *words: str) -> tuple[str, ...]:
+        """In a mount namespace with our hosts file over the machine's."""
+        mount = f'mount --bind {self._hosts} /etc/hosts && exec "$@"'
+        enter = ("nsenter", f"--net={self._namespace}") if self._namespace else ()
+        return (*enter, "unshare", "--mount", "sh", "-c", mount, "sh",
+                str(PROGRAM), "docker", *self.options, *words)  # fmt: skip

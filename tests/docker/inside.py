@@ -1,0 +1,124 @@
+"""Labelled containers: ROS nodes in ordinary bridged networks."""
+
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from tests.docker.engine import docker, inspect
+from tests.docker.nodes import Log, node_command
+
+MARK = f"test.of.rosproxy={os.getpid()}"
+ENABLE = "rosproxy.enable=true"
+_numbers = itertools.count(1)
+
+
+def unique(what: str) -> str:
+    return f"rpx-{what}-{os.getpid()}-{next(_numbers)}"
+
+
+@dataclass
+class Inside:
+    """Makes networks and containers, and removes them in the end."""
+
+    image: str
+    master_uri: str
+    networks: list[str] = field(default_factory=list)
+
+    def network(self, *options: str) -> str:
+        name = unique("net")
+        docker("network", "create", "--label", MARK, *options, name)
+        self.networks.append(name)
+        return name
+
+    def run(
+        self, network: str, *command: str, name: str = "", image: str = "", uri: str | None = None,
+        labels: tuple[str, ...] = (ENABLE,), options: tuple[str, ...] = (), verb: str = "run",
+    ) -> "Container":  # fmt: skip
+        """Start a container as a user would: a network, ROS_MASTER_URI and a label."""
+        name = name or unique("node")
+        uri = self.master_uri if uri is None else uri
+        words = [verb, *(["--detach"] if verb == "run" else []), "--name", name]
+        words += ["--network", network, "--label", MARK, "--init", *options]
+        words += ["--env", f"ROS_MASTER_URI={uri}"] if uri else []
+        words += [word for label in labels for word in ("--label", label)]
+        docker(*words, image or self.image, *command)
+        return Container(name)
+
+    def node(self, network: str, library: str, role: str, *words: str, **more: Any) -> "Container":
+        """Start one of the test nodes in a container; both have the same name."""
+        name = more.setdefault("name", unique(role))
+        return self.run(
+            network, *node_command(library, role, *words, f"__name:={Container(name).node}"), **more
+        )
+
+    def idle(self, network: str, **more: Any) -> "Container":
+        """Start a container that runs no node: the controller can't tell."""
+        return self.run(network, "sleep", "infinity", **more)
+
+
+@dataclass(frozen=True)
+class Container:
+    name: str
+
+    @property
+    def node(self) -> str:
+        """The ROS name of the test node in it."""
+        return self.name.replace("-", "_")
+
+    @property
+    def log(self) -> Log:
+        return Log(lambda: docker("logs", self.name, check=False))
+
+    @property
+    def state(self) -> str:
+        return str(inspect(self.name)["State"]["Status"])
+
+    def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
+        return docker(
+            "exec", self.name, "timeout", str(seconds), *command, check=check, seconds=seconds + 10
+        )
+
+    def start(self, *command: str) -> None:
+        docker("exec", "--detach", self.name, *command)
+
+    def address(self, network: str) -> str:
+        return str(inspect(self.name)["NetworkSettings"]["Networks"][network]["IPAddress"])
+
+    def resolve(self, name: str) -> set[str]:
+        """What a name leads to in there."""
+        lines = self.run("getent", "ahostsv4", name, check=False).splitlines()
+        return {line.split()[0] for line in lines}
+
+    def remove(self) -> None:
+        docker("rm", "--force", self.name, check=False)
+
+
+@contextmanager
+def inside(image: str, master_uri: str) -> Iterator[Inside]:
+    """What is made in it is gone afterwards."""
+    made = Inside(image, master_uri)
+    try:
+        yield made
+    finally:
+        remove_marked()
+
+
+def remove_marked() -> None:
+    """Remove all containers and networks that the tests have made."""
+    containers = docker("ps", "--all", "--quiet", "--filter", f"label={MARK}").split()
+    if containers:
+        docker("rm", "--force", *containers, check=False, seconds=120)
+    for network in docker("network", "ls", "--quiet", "--filter", f"label={MARK}").split():
+        for container in attached(network):
+            docker("network", "disconnect", "--force", network, container, check=False)
+        docker("network", "rm", network, check=False)
+
+
+def attached(network: str) -> list[str]:
+    """The names of the running containers on a network."""
+    found = json.loads(docker("network", "inspect", network, check=False) or "[]")
+    return [one["Name"] for net in found for one in net["Containers"].values()]

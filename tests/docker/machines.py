@@ -1,0 +1,94 @@
+"""Machines outside: each in a network namespace of its own, one cable away from this host.
+
+Each is a container without any network, which then gets one end of a veth pair. Its only
+route is the cable: this host's published ports are in reach, container networks are not.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from tests.docker.engine import docker, inspect, run
+from tests.docker.nodes import Log, node_command
+
+
+@dataclass(frozen=True)
+class Machine:
+    """``address`` is its own, ``host_address`` this host's at the other end of the cable."""
+
+    container: str
+    address: str
+    host_address: str
+
+    def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
+        """Run a program; one that hangs is stopped and fails the test."""
+        return docker(
+            "exec", self.container, "timeout", str(seconds), *command,
+            check=check, seconds=seconds + 10,
+        )  # fmt: skip
+
+    def start(self, *command: str) -> None:
+        docker("exec", "--detach", self.container, *command)
+
+    def node(self, name: str, library: str, role: str, *options: str) -> Log:
+        """Start a test node; what it prints goes to a file."""
+        file = f"/tmp/{name}.log"
+        command = node_command(library, role, *options, f"__name:={name}")
+        self.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {' '.join(command)} >{file} 2>&1")
+        return Log(lambda: self.run("sh", "-c", f"cat {file} 2>/dev/null || true"))
+
+    def end(self, name: str, signal: str = "INT") -> None:
+        """End the test node of that name."""
+        self.run("sh", "-c", f"kill -{signal} $(cat /tmp/{name}.pid)", check=False)
+
+
+@contextmanager
+def machine(image: str, name: str, number: int, *options: str) -> Iterator[Machine]:
+    """A machine whose addresses are made of a number."""
+    container = f"rosproxy-test-{name}-{os.getpid()}"
+    host_address, address = addresses(number)
+    docker("run", "--detach", "--init", "--network", "none", "--name", container, *options,
+           image, "sleep", "infinity")  # fmt: skip
+    try:
+        plug(container, number)
+        yield Machine(container, address, host_address)
+    finally:
+        docker("rm", "--force", container, check=False)
+
+
+def addresses(number: int) -> tuple[str, str]:
+    """This host's address on a machine's cable, and the machine's."""
+    return f"198.18.{number}.1", f"198.18.{number}.2"
+
+
+def plug(container: str, number: int, *, namespace: str = "", interface: str = "eth0") -> None:
+    """Lay a cable between a container and this host, or another network namespace."""
+    here, process = f"rpx{number}h{os.getpid()}"[:15], str(inspect(container)["State"]["Pid"])
+    host_address, address = addresses(number)
+    near = ("nsenter", f"--net={namespace}") if namespace else ()
+    far = ("nsenter", "--target", process, "--net")
+    run("ip", "link", "add", here, "type", "veth", "peer", "name", interface, "netns", process)
+    if namespace:
+        run("ip", "link", "set", here, "netns", namespace)
+    run(*near, "ip", "address", "add", f"{host_address}/30", "dev", here)
+    run(*near, "ip", "link", "set", here, "up")
+    run(*far, "ip", "address", "add", f"{address}/30", "dev", interface)
+    run(*far, "ip", "link", "set", interface, "up")
+
+
+def join(one: Machine, other: Machine) -> None:
+    """Lay a cable between two machines, so that they reach each other by their addresses."""
+    pids = [str(inspect(machine.container)["State"]["Pid"]) for machine in (one, other)]
+    ends = [("nsenter", "--target", pid, "--net") for pid in pids]
+    run(*ends[0], "ip", "link", "add", "eth1", "type", "veth", "peer", "name", "eth1",
+        "netns", pids[1])  # fmt: skip
+    for end, there in ((ends[0], other), (ends[1], one)):
+        run(*end, "ip", "link", "set", "eth1", "up")
+        run(*end, "ip", "route", "add", there.address, "dev", "eth1")
+
+
+def reach(one: Machine, address: str) -> None:
+    """Let a machine reach another of this host's addresses by its cable."""
+    pid = str(inspect(one.container)["State"]["Pid"])
+    run("nsenter", "--target", pid, "--net", "ip", "route", "add", address, "via", one.host_address)

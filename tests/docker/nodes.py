@@ -1,0 +1,58 @@
+"""The test nodes of tests/ros, in containers and on machines, and what they print."""
+
+import itertools
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tests.docker.engine import wait_until
+
+LIBRARIES = ("rospy", "roscpp")
+_PROGRAMS = {"rospy": ("python3", "/nodes/node.py"), "roscpp": ("/nodes/node",)}
+_GOT = re.compile(r"^(got|reply|sent) (\S+) (\d+) size \d+ crc \w+ at ([\d.]+)", re.MULTILINE)
+
+
+def node_command(library: str, role: str, *options: str) -> tuple[str, ...]:
+    return (*_PROGRAMS[library], role, *options)
+
+
+@dataclass(frozen=True)
+class Got:
+    """A message or reply that a node has received; ``at`` is the clock's time in seconds."""
+
+    word: str
+    number: int
+    at: float
+
+
+@dataclass(frozen=True)
+class Log:
+    """What a node prints, read anew each time."""
+
+    read: Callable[[], str]
+
+    def got(self, word: str = "", verb: str = "got") -> list[Got]:
+        """The messages with that word that it has received, or sent."""
+        found = (Got(m[2], int(m[3]), float(m[4])) for m in _GOT.finditer(self.read())
+                 if m[1] == verb)  # fmt: skip
+        return [got for got in found if not word or got.word == word]
+
+    def wait_for(
+        self, word: str, count: int = 3, seconds: float = 30, since: float = 0, verb: str = "got"
+    ) -> float:
+        """Wait until it has received that many with a word; return when the first came."""
+
+        def fresh() -> list[Got]:
+            return [got for got in self.got(word, verb) if got.at >= since]
+
+        wait_until(
+            lambda: len(fresh()) >= count, seconds,
+            lambda: f"{count} messages {word!r} since {since} in:\n{self.read()[-3000:]}",
+        )  # fmt: skip
+        return fresh()[0].at
+
+    def longest_gap(self, word: str, since: float, until: float, verb: str = "got") -> float:
+        """The longest time in which no message came."""
+        times = [got.at for got in self.got(word, verb) if since <= got.at <= until]
+        edges = [since, *times, until]
+        return max(later - earlier for earlier, later in itertools.pairwise(edges))

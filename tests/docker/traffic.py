@@ -1,0 +1,85 @@
+"""Topics and services across the proxy while something happens to it."""
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from tests.docker.engine import docker
+from tests.docker.inside import Container, Inside, unique
+from tests.docker.nodes import Log
+from tests.docker.robot import Robot
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """One node inside that publishes, one that listens and one with a service; and theirs outside.
+
+    ``outward`` is what the robot hears, ``inward`` what is heard inside, ``replies`` what the
+    robot has from the service inside.
+    """
+
+    talker: Container
+    listener: Container
+    server: Container
+    outward: Log
+    inward: Log
+    service: Log
+    words: tuple[str, str]
+
+    def wait(self, since: float = 0, seconds: float = 30) -> None:
+        """Wait until all of it flows."""
+        self.outward.wait_for(self.words[0], since=since, seconds=seconds)
+        self.inward.wait_for(self.words[1], since=since, seconds=seconds)
+        self.service.wait_for("ask", since=since, seconds=seconds, verb="reply")
+
+    def gaps(self, since: float) -> "Gaps":
+        """The longest pauses since then."""
+        now = time.time()
+        return Gaps(
+            self.outward.longest_gap(self.words[0], since, now),
+            self.inward.longest_gap(self.words[1], since, now),
+            self.service.longest_gap("ask", since, now, verb="reply"),
+        )
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Seconds without anything heard outside, heard inside, answered from inside."""
+
+    outward: float
+    inward: float
+    service: float
+
+    def __str__(self) -> str:
+        return (f"seconds without messages outward {self.outward:.1f}, "
+                f"inward {self.inward:.1f}, without service {self.service:.1f}")  # fmt: skip
+
+
+@contextmanager
+def traffic(net: Inside, robot: Robot, network: str, library: str) -> Iterator[Traffic]:
+    """Twenty messages a second both ways, and as many calls."""
+    out, back, service = (f"/{unique(what).replace('-', '_')}" for what in ("out", "in", "serve"))
+    mark = out.rsplit("_", 1)[1]
+    talker = net.node(network, library, "pub", "--topic", out, "--word", "inside")
+    listener = net.node(network, library, "sub", "--topic", back)
+    server = net.node(network, library, "serve", "--service", service)
+    names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
+    outward = robot.node(names[0], library, "sub", "--topic", out)
+    robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
+    called = robot.node(names[2], library, "call", "--service", service, "--count", "100000")
+    found = Traffic(talker, listener, server, outward, listener.log, called, ("inside", "outside"))
+    try:
+        found.wait()
+        yield found
+    finally:
+        for name in names:
+            robot.end(name, "KILL")
+
+
+def crash(container: str) -> None:
+    """Kill the program of a container from behind, as the kernel would for want of memory."""
+    pid = docker("inspect", "--format", "{{.State.Pid}}", container)
+    os.kill(int(pid), signal.SIGKILL)
