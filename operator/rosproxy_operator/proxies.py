@@ -17,11 +17,15 @@ WITHIN_MASTER = 40.0
 
 
 class ProxyError(Exception):
-    """A proxy can't be asked. ``away`` if nothing at all is there: no route, or no answer."""
+    """A proxy did not do what it was asked.
 
-    def __init__(self, message: str, away: bool = False) -> None:
+    ``away`` if nothing at all is there: no route, or no answer. ``later`` if it is well, but needs
+    its master, which can't be asked now.
+    """
+
+    def __init__(self, message: str, away: bool = False, later: bool = False) -> None:
         super().__init__(message)
-        self.away = away
+        self.away, self.later = away, later
 
 
 class Proxies:
@@ -78,7 +82,8 @@ class Proxies:
 
 def _read(status: int, text: str, what: str) -> Json:
     if status != 200:
-        raise ProxyError(f"{what} answers HTTP {status}: {text.strip()[:200]}")
+        message = f"{what} answers HTTP {status}: {text.strip()[:200]}"
+        raise ProxyError(message, later=status == 503)
     try:
         found = json.loads(text)
     except ValueError:

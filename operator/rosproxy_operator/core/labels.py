@@ -105,7 +105,13 @@ def _counts(container: Container, settings: PlanSettings) -> bool:
 
 
 def _own(container: Container) -> list[str]:
-    return sorted(name for name in container.labels if name.lower().startswith(_PREFIX))
+    """The labels that are meant for this controller, misspelt ones too."""
+    return sorted(
+        name
+        for name in container.labels
+        if name.lower().startswith(f"{_PREFIX}.")
+        or (name.lower().startswith(_PREFIX) and _near(name, 0.9))
+    )
 
 
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
@@ -126,8 +132,12 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
 
 
 def _nearest(name: str) -> str:
-    near = difflib.get_close_matches(name.lower(), LABELS, n=1, cutoff=0.75)
+    near = _near(name, 0.75)
     return f"did you mean {near[0]}?" if near else f"there are {', '.join(LABELS)}"
+
+
+def _near(name: str, cutoff: float) -> list[str]:
+    return difflib.get_close_matches(name.lower(), LABELS, n=1, cutoff=cutoff)
 
 
 def _master(container: Container, seen: _Seen) -> str:

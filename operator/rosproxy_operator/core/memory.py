@@ -4,7 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.model import Key, Observed, Wish
+from rosproxy_operator.core.model import Desired, Key, Observed, Wish
+from rosproxy_operator.core.ports import within
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +64,25 @@ SERVING = frozenset({"running", "paused", "restarting"})
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 
 
+def noticed(memory: Memory, wishes: Iterable[Wish], now: float) -> Memory:
+    """The memory with who has exited, and since when."""
+    gone = (wish.id for wish in wishes if not wish.alive)
+    return replace(memory, exited={each: memory.exited.get(each, now) for each in gone})
+
+
 def looked(
-    memory: Memory, observed: Observed, wishes: Iterable[Wish], grace: float, now: float
+    memory: Memory, observed: Observed, desired: Iterable[Desired], grace: float, now: float
 ) -> Memory:
     """What is remembered after a look at the host, before anything is decided."""
-    every = tuple(wishes)
-    live = {wish.key for wish in every if wish.alive}
+    live = {one.key for one in desired if one.live}
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
     known = (observed.keys | set(memory.served)) - live
     absent = {key: memory.absent.get(key, now) for key in sorted(known)}
-    kept = live | observed.keys | {key for key, since in absent.items() if now - since < grace}
+    wanted = live | {key for key, since in absent.items() if now - since < grace}
     return Memory(
-        exited={w.id: memory.exited.get(w.id, now) for w in every if not w.alive},
-        absent={key: since for key, since in absent.items() if key in kept},
-        served={key: ports for key, ports in _served(memory, observed).items() if key in kept},
+        exited=memory.exited,
+        absent={k: since for k, since in absent.items() if k in wanted | observed.keys},
+        served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
         planned={key: ports for key, ports in memory.planned.items() if key in live},
         refusals={name: said for name, said in memory.refusals.items() if name in idle},
         taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
@@ -85,15 +91,16 @@ def looked(
 
 
 def _served(memory: Memory, observed: Observed) -> dict[Key, PortRange]:
-    """Where each proxy has served: what is running knows best, what has stopped least."""
-    found = {
-        sandbox.key: sandbox.range
-        for sandbox in reversed(observed.sandboxes)
-        if sandbox.container.state in _HAS_SERVED
-    }
-    serving = {
-        sandbox.key: sandbox.range
-        for sandbox in reversed(observed.sandboxes)
-        if sandbox.container.state in SERVING
-    }
-    return {**found, **memory.served, **serving}
+    """Where each proxy has served: a sandbox that runs knows best.
+
+    What has stopped may be older than what is remembered, unless it has more ports.
+    """
+    served = dict(memory.served)
+    for one in observed.own:
+        known = served.get(one.key)
+        if one.container.state in _HAS_SERVED and (not known or within(known, one.range)):
+            served[one.key] = one.range
+    for sandbox in reversed(observed.sandboxes):
+        if sandbox.container.state in SERVING:
+            served[sandbox.key] = sandbox.range
+    return served

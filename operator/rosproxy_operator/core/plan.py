@@ -8,7 +8,7 @@ from rosproxy_operator.core.aliases import Aliases, assign
 from rosproxy_operator.core.case import Case
 from rosproxy_operator.core.desired import desire
 from rosproxy_operator.core.labels import read_wishes
-from rosproxy_operator.core.memory import Memory, looked
+from rosproxy_operator.core.memory import Memory, looked, noticed
 from rosproxy_operator.core.model import (
     Desired,
     Key,
@@ -66,8 +66,9 @@ def plan(observed: Observed, settings: PlanSettings, memory: Memory, now: float)
     clock that goes on as long as the memory does.
     """
     wishes, wrong = read_wishes(observed, settings)
-    memory = looked(memory, observed, wishes, settings.grace, now)
+    memory = noticed(memory, wishes, now)
     desired, bad_networks = desire(observed, settings, wishes, memory, now)
+    memory = looked(memory, observed, desired, settings.grace, now)
     aliases, astray = assign(desired, observed)
     live = [one.key for one in desired if one.live]
     memory = refused(observed, live, memory, now)

@@ -88,6 +88,11 @@ def overlap(one: PortRange, other: PortRange) -> bool:
     return one.first <= other.last and other.first <= one.last
 
 
+def within(inner: PortRange, outer: PortRange) -> bool:
+    """Whether the outer range has all ports of the inner one."""
+    return outer.first <= inner.first and inner.last <= outer.last
+
+
 def _gaps(
     window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange]
 ) -> Iterator[PortRange]:

@@ -42,12 +42,13 @@ def process_steps(case: Case, home: Home, gone: Collection[str]) -> tuple[Action
         usable=lambda container: True,
         creatable=case.creatable,
     )
-    if found.stuck:
+    astray = found.kept and not lives_in(found.kept, home.id)
+    if found.waiting and (astray or not found.kept):
+        return ()
+    if found.stuck or astray:
         return None
     if found.kept:
         return tuple(_tended(case, found, found.kept, home))
-    if found.waiting:
-        return ()
     before = [one.container.name for one in case.proxies if one.container.name in gone]
     return tuple(_created(case, found, home, print_, before[0] if before else ""))
 

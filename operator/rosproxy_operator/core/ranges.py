@@ -7,7 +7,7 @@ from rosproxy.core.ports import PortRange
 from rosproxy_operator.core.fingerprint import proxy_name, reserved_ports
 from rosproxy_operator.core.memory import SERVING, Memory, Move, Refusal
 from rosproxy_operator.core.model import STARTED, Desired, Key, Observed, Problem, Sandbox
-from rosproxy_operator.core.ports import PortsExhausted, extended, is_free, negotiate
+from rosproxy_operator.core.ports import PortsExhausted, extended, is_free, negotiate, within
 from rosproxy_operator.core.settings import PlanSettings
 
 RETRY_FOR = 20.0
@@ -73,7 +73,8 @@ class _Allocation:
         self.given: dict[Key, PortRange] = {}
         self.problems: list[Problem] = []
         published = frozenset(port for one in observed.containers for port in one.host_ports)
-        self.blocked = published | observed.host.listening | memory.taken.keys()
+        self.claimed = published | memory.taken.keys()
+        self.blocked = self.claimed | observed.host.listening
 
     def order(self, key: Key) -> tuple[int, Key]:
         """Who has ports comes before who had some, and that one before who wants some."""
@@ -87,7 +88,11 @@ class _Allocation:
     def held(self, key: Key) -> list[PortRange]:
         """The ranges that a key can't have: other proxies', and the kernel's."""
         others = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
-        return [self.observed.host.ephemeral, *others, *self.given.values()]
+        return [self.observed.host.ephemeral, *others, *self.given_to_others(key)]
+
+    def given_to_others(self, key: Key) -> list[PortRange]:
+        """What other keys have got already."""
+        return [ports for other, ports in self.given.items() if other != key]
 
     def may_stay(self, key: Key, ports: PortRange) -> bool:
         """Whether nobody else is seen to have ports on which this key's proxy has served.
@@ -102,36 +107,35 @@ class _Allocation:
         started = [one for one in self.observed.containers if one.state in STARTED]
         published = {port for one in started for port in one.host_ports}
         taken = published | self.memory.taken.keys()
-        return is_free(ports, taken, [*others, *self.given.values()])
+        return is_free(ports, taken, [*others, *self.given_to_others(key)])
 
-    def kept(self, key: Key) -> PortRange | None:
-        """Where a key's proxy serves or has served, if it may stay there."""
+    def keep(self, key: Key) -> None:
+        """Give a key the range where its proxy serves, has served, or is being made."""
         ports = self.memory.served.get(key)
-        if ports is None or self.serving(key) or self.may_stay(key, ports):
-            return ports
-        return None
-
-    def preferred(self, key: Key) -> PortRange | None:
-        """Where a key's proxy is being made."""
+        if ports is not None and (self.serving(key) or self.may_stay(key, ports)):
+            self.given[key] = ports
+            return
         created = [one.range for one in self.observed.sandboxes if one.key == key]
-        return self.memory.planned.get(key) or (created[0] if created else None)
+        ports = self.memory.planned.get(key) or (created[0] if created else None)
+        # What listens on ports of a sandbox that is there may be the engine, which is starting it.
+        blocked = self.claimed if ports in created else self.blocked
+        if ports and is_free(ports, blocked | reserved_ports(key), self.held(key)):
+            self.given[key] = ports
 
-    def give(self, desired: Desired, frozen: bool) -> None:
-        """Give one proxy its range, or note why it can't have one."""
+    def fill(self, desired: Desired, frozen: bool) -> None:
+        """Give a key more ports if it has too few, or a range if it has none."""
         key, count, window = desired.key, desired.ports, self.settings.window
         blocked, held = self.blocked | reserved_ports(key), self.held(key)
-        kept = self.kept(key)
+        kept = self.given.get(key)
         if kept is None:
             try:
-                prefer = self.preferred(key)
-                self.given[key] = negotiate(count, window, blocked, held, prefer)
+                self.given[key] = negotiate(count, window, blocked, held)
             except PortsExhausted as error:
                 self.problems.append(_exhausted(key, error))
-            return
-        more = None if frozen else extended(kept, count, window, blocked, held)
-        self.given[key] = more or kept
-        if len(self.given[key]) < count and not frozen:
-            self.problems.append(_too_few(key, kept, count))
+        elif not frozen:
+            self.given[key] = extended(kept, count, window, blocked, held) or kept
+            if len(self.given[key]) < count:
+                self.problems.append(_too_few(key, kept, count))
 
 
 def allocate(
@@ -149,25 +153,23 @@ def allocate(
     """
     live = {one.key: one for one in desired if one.live}
     allocation = _Allocation(observed, settings, memory, set(live))
-    for key in sorted(live, key=allocation.order):
-        allocation.give(live[key], frozen)
+    order = sorted(live, key=allocation.order)
+    for key in order:
+        allocation.keep(key)
+    for key in order:
+        allocation.fill(live[key], frozen)
     given = allocation.given
-    moved = dict(memory.moved)
-    for key in given:
-        served = memory.served.get(key)
-        if served is not None and not _within(served, given[key]):
-            moved.setdefault(key, Move(served, now))
+    served = memory.served
+    left = {key for key in given if key in served and not within(served[key], given[key])}
+    moved = {key: Move(served[key], now) for key in left} | dict(memory.moved)
     told = [
         _moved(key, moved[key], ports)
         for key, ports in sorted(given.items(), key=lambda item: item[0])
-        if key in moved and not _within(moved[key].ports, ports)
+        if key in moved and not within(moved[key].ports, ports)
     ]
-    memory = replace(memory, planned=given, moved=moved)
+    served = {key: ports for key, ports in served.items() if key not in left}
+    memory = replace(memory, served=served, planned=given, moved=moved)
     return Ranges(given, memory, (*allocation.problems, *told))
-
-
-def _within(inner: PortRange, outer: PortRange) -> bool:
-    return outer.first <= inner.first and inner.last <= outer.last
 
 
 def _exhausted(key: Key, error: PortsExhausted) -> Problem:

@@ -31,6 +31,9 @@ log = logging.getLogger(__name__)
 
 DEBOUNCE = 0.05
 """Least seconds between two looks: one ``compose up`` makes dozens of events."""
+SETTLED = 0.25
+"""Seconds after an event at which there is one more look: an engine tells of some things before it
+lists them."""
 PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until an engine is asked again that did not answer; the last is repeated."""
 LONGEST_LOOK = 60.0
@@ -48,14 +51,17 @@ class Controller:
         engine = Engine()
         self._proxies = Proxies()
         self._masters = Masters(self._wake)
-        self._observer = Observer(engine, settings.plan, Inspector(engine, self._wake))
+        self._inspector = Inspector(engine, self._wake)
+        self._observer = Observer(engine, settings.plan, self._inspector)
         self._applier = Applier(engine, settings.plan, self._proxies, self._masters)
         self._work = Work(self._tasks, self._wake, self._port_taken, self._count)
         uplink = settings.plan.uplink
         self._teller = Teller(self._tasks, self._proxies, self._masters, uplink, self._wake)
-        self._events = Events(engine, self._wake)
+        self._events = Events(engine, self._happened)
+        self._timer: asyncio.TimerHandle | None = None
         self._memory = Memory()
-        self._problems = ProblemLog()
+        self._shown: list[Problem] = []
+        self._log = ProblemLog()
         self._failures = 0
         self._looking_since: float | None = None
         self._looked_at = 0.0
@@ -68,10 +74,19 @@ class Controller:
         self._tasks.repeat(self._masters.refresh, AGAIN_UNRESOLVED, "resolving masters")
         try:
             while True:
-                await self.look()
+                await self._look_safely()
                 await self._pause()
         finally:
             await self._close()
+
+    async def _look_safely(self) -> None:
+        """Look, and go on whatever becomes of it: a mistake of ours must not end the controller."""
+        try:
+            await self.look()
+        except Exception as error:
+            if not self._failures:
+                log.exception("a look failed; going on")
+            self._failed(EngineError(f"the controller failed: {error!r}"))
 
     async def run_once(self, seconds: float) -> list[Problem]:
         """Look and act until nothing is left to do, for so many seconds at most.
@@ -132,6 +147,8 @@ class Controller:
             sum(len(group.actions) for group in groups),
             planned.again_in,
         )
+        if look.unsure and not self._inspector.waiting:
+            self._look_in(SETTLED)  # nobody is going to tell when the list is right
         self._work.start(groups, lambda action: self._applier.carry_out(action, look), seen)
         self._teller.tell(look, planned.wishes)
 
@@ -151,10 +168,10 @@ class Controller:
 
     def _looked(self, look: Look, planned: Plan) -> None:
         if self._failures:
-            log.info("the Docker engine answers again")
+            log.info("looking works again")
         self._failures, self._error, self._last = 0, None, (look, planned)
         problems = self._current(look, planned)
-        self._problems.update(problems)
+        self._log.update(problems)
         metrics = self._metrics
         metrics.looks.labels("ok").inc()
         metrics.engine_up.set(1)
@@ -163,21 +180,31 @@ class Controller:
         metrics.show_proxies(proxy.container.state for proxy in look.observed.proxies)
 
     def _current(self, look: Look, planned: Plan) -> list[Problem]:
-        return [
+        """All problems; those of what is being worked on as they were before.
+
+        What a look finds and plans in the midst of it is outdated a moment later.
+        """
+        found = [
             *planned.problems,
             *unresolved(look, self._masters, self._settings.plan),
             *self._work.problems,
             *self._teller.problems(look),
         ]
+        busy = self._work.subjects
+        self._shown = [
+            *(problem for problem in found if problem.subject not in busy),
+            *(problem for problem in self._shown if problem.subject in busy),
+        ]
+        return self._shown
 
     def _failed(self, error: EngineError) -> None:
-        if not self._failures:
+        if str(error) != self._error:
             log.error("%s", error)
         self._failures += 1
         self._error = str(error)
-        outcome = "unavailable" if isinstance(error, Unavailable) else "failed"
-        self._metrics.looks.labels(outcome).inc()
-        self._metrics.engine_up.set(0)
+        away = isinstance(error, Unavailable)
+        self._metrics.looks.labels("unavailable" if away else "failed").inc()
+        self._metrics.engine_up.set(0 if away else 1)
 
     async def _pause(self, most: float | None = None) -> None:
         """Wait until it is time for another look."""
@@ -196,8 +223,10 @@ class Controller:
         if not looked or self._last is None or self._work.busy or self._again.is_set():
             return False
         look, planned = self._last
-        if self._work.problems:
+        if self._work.problems or self._teller.problems(look):
             return True
+        if look.unsure or self._inspector.waiting:
+            return False
         doing = any(self._possible(group, look) for group in planned.groups)
         return not doing and not self._silent(planned)
 
@@ -228,6 +257,15 @@ class Controller:
     def _count(self, action: Action, outcome: str) -> None:
         word = _WORD.sub("_", type(action).__name__).lower()
         self._metrics.actions.labels(word, outcome).inc()
+
+    def _happened(self) -> None:
+        self._look_in(SETTLED)
+        self._wake()
+
+    def _look_in(self, seconds: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = asyncio.get_running_loop().call_later(seconds, self._wake)
 
     def _wake(self) -> None:
         self._again.set()

@@ -29,7 +29,7 @@ _NEVER = "0001-"
 class Details:
     """Of a container: ``host_ports`` it asks for, ``aliases`` by network, ``token`` if ours.
 
-    ``started_at`` is empty if it was never started.
+    ``state`` is in the engine's words, ``started_at`` empty if it was never started.
     """
 
     master_uri: str = ""
@@ -37,6 +37,7 @@ class Details:
     host_ports: frozenset[int] = frozenset()
     aliases: Mapping[str, frozenset[str]] = field(default_factory=dict)
     token: str = ""
+    state: str = ""
     started_at: str = ""
 
 
@@ -45,13 +46,15 @@ def read_details(inspected: Json) -> Details:
     config = inspected.get("Config") or {}
     variables = dict(text.partition("=")[::2] for text in config.get("Env") or ())
     networks = (inspected.get("NetworkSettings") or {}).get("Networks") or {}
-    started = (inspected.get("State") or {}).get("StartedAt") or ""
+    state = inspected.get("State") or {}
+    started = state.get("StartedAt") or ""
     return Details(
         master_uri=variables.get("ROS_MASTER_URI", ""),
         hostname=config.get("Hostname") or "",
         host_ports=bound_ports((inspected.get("HostConfig") or {}).get("PortBindings")),
         aliases={name: _aliases(endpoint or {}) for name, endpoint in networks.items()},
         token=variables.get(TOKEN_VARIABLE, ""),
+        state=state.get("Status") or "",
         started_at="" if started.startswith(_NEVER) else started,
     )
 
@@ -84,6 +87,11 @@ class Inspector:
         self._asking: dict[str, asyncio.Task[None]] = {}
         self._marks: dict[str, object] = {}
         self._turns = asyncio.Semaphore(AT_ONCE)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether inspections are under way, which are going to be told."""
+        return bool(self._asking)
 
     def get(self, container: str) -> Details | None:
         """The last known details of a container, by id; None if there are none yet."""

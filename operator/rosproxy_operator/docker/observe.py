@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Network, ip_network
 
 from rosproxy_operator import host
-from rosproxy_operator.core.fingerprint import ROLE_PROXY, ROLE_SANDBOX, admin_port, read_own
+from rosproxy_operator.core.fingerprint import ROLE_SANDBOX, admin_port, read_own
 from rosproxy_operator.core.model import (
     Attachment,
     Container,
@@ -55,6 +55,16 @@ class Look:
     unsure: frozenset[str] = frozenset()
     at_host: bool = False
 
+    def strangers(self, listening: frozenset[int]) -> frozenset[int]:
+        """Which of the ports that something listens on may be somebody else's.
+
+        Not those of a sandbox that is just being started: the engine takes them one by one before
+        it says that it runs. And none are known but at the host.
+        """
+        starting = (b for b in self.observed.sandboxes if b.container.name in self.unsure)
+        taken = listening if self.at_host else frozenset()
+        return taken - {port for box in starting for port in box.range.ports()}
+
 
 def sandbox_of(proxy: Proxy, observed: Observed) -> Sandbox | None:
     """The sandbox in whose network namespace a proxy is; None if it is there no more."""
@@ -80,27 +90,38 @@ class Observer:
             in_thread(self._engine.networks),
             in_thread(self._engine.image_id, self._settings.image),
         )
-        # A proxy's container has no network of its own, by which to see that it was started.
-        proxies = [row["Id"] for row in rows if _role(row) == ROLE_PROXY]
-        await self._inspector.update(rows, proxies, patience)
+        # What is the controller's own is inspected at each look: a proxy's container has no network
+        # by which to see that it was started anew, and the list is late to tell that one has ended.
+        mine = [row["Id"] for row in rows if read_own(row.get("Labels") or {})]
+        await self._inspector.update(rows, mine, patience)
+        look = self._assemble(rows, networks, image)
+        here = Host(host.ephemeral_ports(), look.strangers(listening))
+        return replace(look, observed=replace(look.observed, host=here))
+
+    def _assemble(self, rows: list[Json], networks: list[Json], image: str) -> Look:
         found = tuple(read_network(each) for each in networks)
-        at_host = host.has_any(n.gateway for n in found if n.driver == "bridge")
-        here = Host(host.ephemeral_ports(), listening if at_host else frozenset())
-        observed = self._sort(rows, Observed((), found, (), here, image_id=image))
+        nothing = Host(host.USUAL_EPHEMERAL)
+        observed = self._sort(rows, Observed((), found, (), nothing, image_id=image))
         own: list[Sandbox | Proxy] = [*observed.sandboxes, *observed.proxies]
-        endpoints = {key: end for row in rows for key, end in _endpoints(row)}
         return Look(
             observed,
-            {p.container.name: way for p in observed.proxies if (way := self._way(p, observed))},
-            {proxy.container.name: self._token(proxy) for proxy in observed.proxies},
-            endpoints,
-            {each["Name"]: read_subnets(each) for each in networks},
-            frozenset(end["IPAddress"] for row in rows for end in _networks(row).values() if end),
-            frozenset(
-                each.container.name for each in own if not self._inspector.fresh(each.container.id)
+            ways={p.container.name: w for p in observed.proxies if (w := self._way(p, observed))},
+            tokens={proxy.container.name: self._token(proxy) for proxy in observed.proxies},
+            endpoints={key: end for row in rows for key, end in _endpoints(row)},
+            subnets={each["Name"]: read_subnets(each) for each in networks},
+            addresses=frozenset(
+                end["IPAddress"] for row in rows for end in _networks(row).values() if end
             ),
-            at_host,
+            unsure=frozenset(o.container.name for o in own if not self._sure(o.container)),
+            at_host=host.has_any(n.gateway for n in found if n.driver == "bridge"),
         )
+
+    def _sure(self, container: Container) -> bool:
+        """Whether the list and the inspection, which is newer, say the same."""
+        details = self._inspector.get(container.id)
+        if details is None or not self._inspector.fresh(container.id):
+            return False
+        return details.state == container.state
 
     def _sort(self, rows: Iterable[Json], empty: Observed) -> Observed:
         """The containers, into the controller's own and others."""
@@ -192,11 +213,6 @@ def _attachment(row: Json, network: str, end: Json, aliases: frozenset[str] | No
         names=frozenset(own | (aliases or frozenset())),
         network_id=end.get("NetworkID") or "",
     )
-
-
-def _role(row: Json) -> str:
-    own = read_own(row.get("Labels") or {})
-    return own.role if own else ""
 
 
 def _endpoints(row: Json) -> list[tuple[tuple[str, str], str]]:

@@ -37,7 +37,7 @@ def run_once(settings: DockerSettings) -> list[Problem]:
 def show_plan(settings: PlanSettings) -> None:
     """Print what would be done now, and what is wrong. Raises EngineError."""
     found = asyncio.run(survey(settings))
-    write(plan_text(found.plan.actions))
+    write(plan_text(found.actions))
     for problem in found.problems:
         write(f"{problem.subject}: {problem.text}")
 

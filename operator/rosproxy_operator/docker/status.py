@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from rosproxy import __version__
 from rosproxy.core.uris import HostPort, parse_host_port
+from rosproxy_operator.core.actions import Action
 from rosproxy_operator.core.fingerprint import proxy_name, sandbox_name
 from rosproxy_operator.core.memory import Memory
 from rosproxy_operator.core.model import Container, Key, Problem, Proxy, Sandbox
@@ -35,6 +36,13 @@ class Survey:
     plan: Plan
     said: Mapping[str, Json | ProxyError]
     problems: tuple[Problem, ...]
+
+    @property
+    def actions(self) -> list[Action]:
+        """What would be done, but for what the engine is busy with and tells nothing of."""
+        own: list[Proxy | Sandbox] = [*self.look.observed.proxies, *self.look.observed.sandboxes]
+        busy = {each.key for each in own if each.container.name in self.look.unsure}
+        return [a for group in self.plan.groups if group.key not in busy for a in group.actions]
 
 
 async def survey(settings: PlanSettings) -> Survey:
@@ -73,7 +81,7 @@ def describe(found: Survey, settings: PlanSettings) -> Json:
             {"subject": problem.subject, "text": problem.text, "fatal": problem.fatal}
             for problem in found.problems
         ],
-        "actions": [line(action) for action in found.plan.actions],
+        "actions": [line(action) for action in found.actions],
     }
 
 
@@ -132,7 +140,11 @@ def _container(container: Container, proxy: str | None, found: Survey) -> Json:
         "proxy": proxy,
         "networks": sorted(container.networks),
         "addresses": addresses,
-        "nodes": [_node(node) for node in nodes if _host(node) in addresses.values()],
+        "nodes": [
+            _node(node)
+            for node in nodes
+            if _host(node) in addresses.values() and node.get("state") != "cleaned"
+        ],
     }
 
 

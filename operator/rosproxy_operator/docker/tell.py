@@ -13,6 +13,12 @@ from rosproxy_operator.docker.observe import Look, sandbox_of
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
 """Seconds after a container's arrival at which its proxy is told: nodes take time to register."""
+AWAY = 2.0
+"""Seconds for which a running container may be off a network before its address counts as gone."""
+MOVING = 5.0
+"""Seconds for which a proxy is told of a move, until it has found the nodes at the new address."""
+Place = tuple[str, str]
+"""A container's id and a network."""
 _SHARED = "container:"
 _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
 """What a node can call its host in a URI; aliases may be anything."""
@@ -34,15 +40,65 @@ class Facts:
     """What one look says to one proxy.
 
     ``addresses`` are those of running containers on its networks, by container id and network;
-    ``taken`` those of all containers and gateways. ``subnets`` are those of its networks.
-    ``master_address`` is empty if there is nothing to be told.
+    ``taken`` those of all containers and gateways. ``subnets`` are those of its networks,
+    ``running`` the ids of all containers that run. ``master_address`` is empty if there is nothing
+    to be told.
     """
 
     master_address: str = ""
-    addresses: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    addresses: Mapping[Place, str] = field(default_factory=dict)
     taken: frozenset[str] = frozenset()
     subnets: tuple[IPv4Network, ...] = ()
     arrivals: frozenset[Arrival] = frozenset()
+    running: frozenset[str] = frozenset()
+
+
+class Places:
+    """Where containers are, as far as their proxy knows, and where they were just now.
+
+    A container that is disconnected and connected again under another address has moved, and its
+    nodes live on. Times are monotonic.
+    """
+
+    def __init__(self) -> None:
+        self._at: dict[Place, str] = {}
+        self._absent: dict[Place, float] = {}
+        self._moves: dict[str, tuple[str, float]] = {}
+
+    def look(self, known: Facts, now: float) -> None:
+        """Compare with what the last look has found."""
+        missing = [place for place in self._at if place not in known.addresses]
+        self._absent = {place: self._absent.get(place, now) for place in missing}
+        for place, since in list(self._absent.items()):
+            if place[0] not in known.running or now >= since + AWAY:
+                del self._at[place], self._absent[place]
+        taken = set(known.addresses.values())
+        for place, address in known.addresses.items():
+            before = self._at.get(place, address)
+            if before != address:
+                self._moves[before] = address, now
+        self._at |= known.addresses
+        self._moves = {
+            old: (new, since)
+            for old, (new, since) in self._moves.items()
+            if now < since + MOVING and old not in taken
+        }
+
+    @property
+    def held(self) -> frozenset[str]:
+        """The addresses that nobody has, but whose containers may come back or have moved."""
+        return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
+
+    @property
+    def until(self) -> float | None:
+        """When the first of them is given up; None if there is none."""
+        times = [since + AWAY for since in self._absent.values()]
+        times += [since + MOVING for _, since in self._moves.values()]
+        return min(times, default=None)
+
+    def moved(self, nodes: Collection[str]) -> dict[str, str]:
+        """Old address to new one, of those where the proxy still believes its ``nodes`` to be."""
+        return {old: new for old, (new, _) in self._moves.items() if old in nodes}
 
 
 def facts(look: Look, proxy: Proxy, wishes: Iterable[Wish], master_address: str) -> Facts:
@@ -66,36 +122,26 @@ def facts(look: Look, proxy: Proxy, wishes: Iterable[Wish], master_address: str)
         arrivals=frozenset(
             arrival for container in mine for arrival in _arrivals(look, container, by_id, joined)
         ),
+        running=frozenset(c.id for c in observed.containers if c.state in STARTED),
     )
 
 
+def node_addresses(status: Mapping[str, Any]) -> frozenset[str]:
+    """The addresses of a proxy's nodes, from its status; not of those it has given up already."""
+    nodes = (node for node in status.get("nodes", ()) if node.get("state") != "cleaned")
+    found = (parse_host_port(str(node.get("address", ""))) for node in nodes)
+    return frozenset(where.host for where in found if where)
+
+
 def gone(
-    status: Mapping[str, Any], taken: Collection[str], subnets: Collection[IPv4Network]
+    nodes: Collection[str], taken: Collection[str], subnets: Collection[IPv4Network]
 ) -> list[str]:
     """The addresses of a proxy's nodes that no container has any more.
 
     ``taken`` are those of all containers and gateways, ``subnets`` those of the networks that the
     proxy is on or was on: other addresses are none of the engine's.
     """
-    found = set()
-    for node in status.get("nodes", ()):
-        where = parse_host_port(str(node.get("address", "")))
-        if where and where.host not in taken and _inside(where.host, subnets):
-            found.add(where.host)
-    return sorted(found)
-
-
-def moved(before: Mapping[tuple[str, str], str], known: Facts) -> dict[str, str]:
-    """Old address to new one of the containers whose address on a network has changed.
-
-    An old address that another container has now is left out: what is there is the other's.
-    """
-    now = known.addresses
-    return {
-        before[place]: now[place]
-        for place in now
-        if place in before and before[place] != now[place] and before[place] not in now.values()
-    }
+    return sorted(address for address in set(nodes) - set(taken) if _inside(address, subnets))
 
 
 def _arrivals(

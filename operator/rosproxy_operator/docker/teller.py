@@ -12,7 +12,7 @@ from rosproxy.tasks import Tasks
 from rosproxy_operator.core.fingerprint import master
 from rosproxy_operator.core.model import Problem, Proxy, Wish
 from rosproxy_operator.docker.observe import Look, Way
-from rosproxy_operator.docker.tell import AGAIN, Arrival, Facts, facts, gone, moved
+from rosproxy_operator.docker.tell import AGAIN, Arrival, Facts, Places, facts, gone, node_addresses
 from rosproxy_operator.masters import Masters
 from rosproxy_operator.proxies import Json, Proxies, ProxyError
 
@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 
 PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until a proxy is asked again that did not answer; the last is repeated."""
+AGAIN_MOVED = 1.0
+"""Seconds until a move is told again: the new address may not be reachable at once."""
 STARTING = 8.0
 """Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
 
@@ -33,12 +35,12 @@ class Conversation:
 
     def __init__(self, name: str, way: Way, proxies: Proxies, answered: Callable[[], None]) -> None:
         self.name, self.way = name, way
-        self.status: Json | None = None
         self.error: ProxyError | None = None
         self._proxies, self._answered = proxies, answered
         self._facts = Facts()
         self._subnets: set[IPv4Network] = set()
-        self._told: dict[tuple[str, str], str] = {}
+        self._places = Places()
+        self._moving = False
         self._due: dict[Arrival, list[float]] = {}
         self._heard = False
         self._news = asyncio.Event()
@@ -71,9 +73,10 @@ class Conversation:
                 failures = 0
             except ProxyError as error:
                 failures += 1
-                if self.error is None and self._heard:
-                    self._since = time.monotonic()
-                self.error = error
+                if error.later:
+                    self._well()
+                else:
+                    self._unwell(error)
 
     async def _wait(self, seconds: float | None) -> None:
         try:
@@ -84,8 +87,9 @@ class Conversation:
 
     async def _tell(self) -> None:
         self._news.clear()
-        where, token, known = HostPort(self.way.host, self.way.port), self.way.token, self._facts
-        self.status = status = await self._proxies.status(where)
+        where, token = HostPort(self.way.host, self.way.port), self.way.token
+        status = await self._proxies.status(where)
+        known = self._facts  # not older than need be: its nodes may have come since the last look
         address = known.master_address
         if address and status.get("master", {}).get("address") != address:
             await self._proxies.master_address(where, token, address)
@@ -93,33 +97,46 @@ class Conversation:
         now = time.monotonic()
         body = self._body(status, known, now)
         if body:
+            log.debug("%s is told %s", self.name, body)
             self._log(await self._proxies.containers(where, token, body))
-        self._told = dict(known.addresses)
         self._due = {
             arrival: [when for when in times if when > now] for arrival, times in self._due.items()
         }
+        self._well()
+
+    def _well(self) -> None:
         if self.error is not None or not self._heard:
             self.error, self._heard = None, True
             self._answered()
 
+    def _unwell(self, error: ProxyError) -> None:
+        if self.error is None and self._heard:
+            self._since = time.monotonic()
+        self.error = error
+
     def _body(self, status: Mapping[str, Any], known: Facts, now: float) -> dict[str, Any]:
-        changed = moved(self._told, known)
+        self._places.look(known, now)
+        nodes = node_addresses(status)
         arrived = [
             {"address": arrival.address, "names": sorted(arrival.names)}
             for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
             if times and times[0] <= now
         ]
-        absent = [
-            address
-            for address in gone(status, known.taken, self._subnets)
-            if address not in changed
-        ]
-        body = {"gone": absent, "moved": changed, "arrived": arrived}
+        body = {
+            "gone": gone(nodes, known.taken | self._places.held, self._subnets),
+            "moved": self._places.moved(nodes),
+            "arrived": arrived,
+        }
+        self._moving = bool(body["moved"])
         return {key: value for key, value in body.items() if value}
 
     def _next_due(self) -> float | None:
+        """Seconds until there is something to be told again; None if there is nothing."""
+        now = time.monotonic()
         times = [when for due in self._due.values() for when in due[:1]]
-        return max(min(times) - time.monotonic(), 0.0) if times else None
+        times += [self._places.until] if self._places.until else []
+        times += [now + AGAIN_MOVED] if self._moving else []
+        return max(min(times) - now, 0.0) if times else None
 
     def _log(self, done: Json) -> None:
         counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}

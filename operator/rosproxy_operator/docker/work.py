@@ -27,6 +27,9 @@ log = logging.getLogger(__name__)
 BACK_OFF = (1.0, 2.0, 5.0, 15.0, 60.0)
 """Seconds until the same actions are tried again that have failed; the last is repeated."""
 
+QUIET = 120.0
+"""Seconds without a failure after which the same one is worth a line in the log again."""
+
 CarryOut = Callable[[Action], Awaitable[None]]
 
 
@@ -60,12 +63,17 @@ class Work:
         self._busy: dict[Key | None, asyncio.Task[None]] = {}
         self._failures: dict[Key | None, _Failure] = {}
         self._over: dict[Key | None, float] = {}
-        self._refused: dict[Action, str] = {}
+        self._refused: dict[Action, tuple[str, float]] = {}
 
     @property
     def busy(self) -> bool:
         """Whether anything is under way."""
         return bool(self._busy)
+
+    @property
+    def subjects(self) -> frozenset[str]:
+        """What is being worked on, as problems name it."""
+        return frozenset(map(_subject, self._busy))
 
     @property
     def problems(self) -> list[Problem]:
@@ -84,10 +92,8 @@ class Work:
         ``seen`` is when the look began (monotonic) that the groups were planned from: it may not
         have seen what work did that was over only after that.
         """
+        self._forget_refusals()
         groups = [group for group in groups if self._over.get(group.key, 0.0) < seen]
-        planned = {action for group in groups for action in group.actions}
-        if not self._busy:
-            self._refused = {a: text for a, text in self._refused.items() if a in planned}
         by_key: dict[Key | None, list[Group]] = {}
         for group in groups:
             by_key.setdefault(group.key, []).append(group)
@@ -196,9 +202,13 @@ class Work:
     def _refuse(self, action: Action, error: EngineError) -> None:
         """Log why an action failed, once while it is tried again and again."""
         reason = type(error).__name__ if isinstance(error, PortTaken) else str(error)
-        again = self._refused.get(action) == reason
+        again = self._refused.get(action, ("", 0.0))[0] == reason
         log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", line(action), error)
-        self._refused[action] = reason
+        self._refused[action] = reason, time.monotonic()
+
+    def _forget_refusals(self) -> None:
+        long_ago = time.monotonic() - QUIET
+        self._refused = {a: each for a, each in self._refused.items() if each[1] > long_ago}
 
 
 def _subject(key: Key | None) -> str:

@@ -189,7 +189,7 @@ class Engine:
                 box.state = "running"
             case Rename(name, to):
                 box = self.own(name)
-                if self._named(to):
+                if self.named(to):
                     raise Failed(f"{to} exists")
                 box.name = to
             case Connect(name, network, aliases):
@@ -204,19 +204,19 @@ class Engine:
 
     def own(self, name: str) -> Box:
         """A container to do something to, which must be the controller's own."""
-        found = self._named(name)
+        found = self.named(name)
         if not found:
             raise Failed(f"no container {name}")
         assert found[0].own is not None, f"{name} is not the controller's"
         assert found[0].state != "removing"
         return found[0]
 
-    def _named(self, name: str) -> list[Box]:
+    def named(self, name: str) -> list[Box]:
         return [box for box in self.boxes if box.name == name]
 
     def _create(self, action: CreateSandbox | Create) -> None:
         spec = action.sandbox if isinstance(action, CreateSandbox) else action.proxy
-        if self._named(spec.name) or not self.image:
+        if self.named(spec.name) or not self.image:
             raise Failed(f"can't create {spec.name}")
         if isinstance(action, CreateSandbox):
             if action.sandbox.uplink not in self.networks:

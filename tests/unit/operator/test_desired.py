@@ -9,7 +9,7 @@ from rosproxy_operator.core.aliases import assign
 from rosproxy_operator.core.desired import desire
 from rosproxy_operator.core.fingerprint import proxy_name
 from rosproxy_operator.core.labels import read_wishes
-from rosproxy_operator.core.memory import Memory, looked
+from rosproxy_operator.core.memory import Memory, noticed
 from rosproxy_operator.core.model import Container, Desired, Key, Network, Observed, Problem
 from rosproxy_operator.core.settings import PlanSettings
 from tests.unit.operator.builders import (
@@ -39,7 +39,7 @@ def want(
     settings: PlanSettings = SETTINGS,
 ) -> tuple[dict[Key, Desired], tuple[Problem, ...]]:
     wishes, _ = read_wishes(seen, settings)
-    memory = looked(memory or Memory(), seen, wishes, settings.grace, now)
+    memory = noticed(memory or Memory(), wishes, now)
     desired, problems = desire(seen, settings, wishes, memory, now)
     assert list(desired) == sorted(desired, key=lambda one: one.key)
     return {one.key: one for one in desired}, problems

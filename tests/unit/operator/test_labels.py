@@ -126,6 +126,12 @@ def test_an_unknown_label_that_is_near_to_none() -> None:
     assert "there are rosproxy.enable, rosproxy.master-uri, rosproxy.ports," in text
 
 
+@pytest.mark.parametrize("name", ["rosproxy-test", "rosproxy-version", "rosproxy", "com.rosproxy"])
+def test_other_peoples_labels_are_not_ours(name: str) -> None:
+    assert read(container(labels={**ENABLED, name: "1"}))[1] == []
+    assert read(container(labels={name: "1"})) == (None, [])
+
+
 @pytest.mark.parametrize("value", ["0", "1001", "-1", "many", "", "1.5", "٣", "9" * 5000])
 def test_bad_numbers_of_ports(value: str) -> None:
     text = refusal(container(labels={**ENABLED, "rosproxy.ports": value}))

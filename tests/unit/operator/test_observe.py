@@ -1,13 +1,15 @@
 """From the engine's JSON to what the core plans with."""
 
+from dataclasses import replace
 from ipaddress import ip_network
 from typing import Any
 
 import pytest
 
-from rosproxy_operator.core.model import Network
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.model import Container, Host, Key, Network, Observed, Sandbox
 from rosproxy_operator.docker.details import Details, bound_ports, read_details, signature
-from rosproxy_operator.docker.observe import read_container, read_network, read_subnets
+from rosproxy_operator.docker.observe import Look, read_container, read_network, read_subnets
 from tests.unit.operator import captured
 
 APP = Network(captured.APP_ID, "app")
@@ -109,3 +111,14 @@ def test_the_signature_changes_with_each_connection() -> None:
     assert signature(row) == before
     row["NetworkSettings"]["Networks"]["app"] = captured.end("another", "172.29.0.2")
     assert signature(row) != before
+
+
+def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
+    key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
+    box = Sandbox(key, Container("1", "box", "created"), ports, "")
+    observed = Observed((), (), (), Host(ports), sandboxes=(box,))
+    look = Look(observed, unsure=frozenset({"box"}), at_host=True)
+    listening = frozenset({22, 11400, 11401})
+    assert look.strangers(listening) == {22}
+    assert replace(look, unsure=frozenset()).strangers(listening) == listening
+    assert replace(look, at_host=False).strangers(listening) == frozenset()

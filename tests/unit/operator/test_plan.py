@@ -317,6 +317,24 @@ def test_other_ports_replace_both() -> None:
     ]
 
 
+def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
+    """The proxy goes first: without its network it could not close its connections."""
+    labels = {**ENABLED, "rosproxy.ports": "40"}
+    longer = PortRange(11400, 11439)
+    old = sandbox(name=f"{PORTS}-old")
+    new = sandbox(ports=longer, state="created", networks=())
+    lives = proxy(sandbox_id=old.container.id)
+    seen = observed(container(labels=labels), sandboxes=[old, new], proxies=[lives])
+    assert actions(seen) == [
+        Remove(NAME, "its sandbox is made anew"),
+        Remove(f"{PORTS}-old", "another one takes over"),
+        Start(PORTS),
+        Connect(PORTS, "app", ALIASES),
+        new_proxy(longer, replaces=NAME),
+        Start(NAME),
+    ]
+
+
 def test_another_publish_address_replaces_both() -> None:
     settings = replace(SETTINGS, publish=("192.0.2.10",))
     found = actions(observed(container(), **both()), settings=settings)
@@ -457,6 +475,17 @@ def test_ports_are_kept_while_a_container_is_being_created() -> None:
         (ARM, NEXT),
         (KEY, RANGE),
     ]
+
+
+def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
+    """It is not seen to run yet, but its ports are listened on already."""
+    there = sandbox(state="created", networks=())
+    for memory in (None, look(observed(container())).memory):
+        found = look(
+            observed(container(), sandboxes=[there], listening=RANGE.ports()), memory=memory
+        )
+        assert found.actions[0] == Start(PORTS)
+        assert found.problems == ()
 
 
 def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:

@@ -5,7 +5,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.ports import PortsExhausted, extended, is_free, negotiate, overlap
+from rosproxy_operator.core.ports import (
+    PortsExhausted,
+    extended,
+    is_free,
+    negotiate,
+    overlap,
+    within,
+)
 
 WINDOW = PortRange(100, 139)
 PORTS = st.integers(90, 150)
@@ -82,6 +89,7 @@ def test_free_means_that_no_port_is_held(
 @given(RANGE, RANGE)
 def test_overlap(one: PortRange, other: PortRange) -> None:
     assert overlap(one, other) == bool(set(one.ports()) & set(other.ports()))
+    assert within(one, other) == (set(one.ports()) <= set(other.ports()))
 
 
 def test_the_error_says_how_many_there_are() -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from ipaddress import IPv4Network
-from typing import Any
 
 from rosproxy.core.ports import PortRange
 from rosproxy_operator.core.model import (
@@ -17,7 +16,7 @@ from rosproxy_operator.core.model import (
     Wish,
 )
 from rosproxy_operator.docker.observe import Look
-from rosproxy_operator.docker.tell import Facts, facts, gone, moved
+from rosproxy_operator.docker.tell import Facts, Places, facts, gone, node_addresses
 
 KEY = Key("http://robot:11311", "192.0.2.10")
 PORTS = PortRange(11400, 11431)
@@ -64,10 +63,6 @@ def wish(container: Container) -> Wish:
     return Wish(container.name, container.id, KEY)
 
 
-def nodes(*addresses: str) -> dict[str, Any]:
-    return {"nodes": [{"address": f"{address}:40001"} for address in addresses]}
-
-
 def test_a_running_container_has_arrived_under_all_its_names() -> None:
     seen = look(replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),)))
     (arrival,) = told(seen, wish(talker())).arrivals
@@ -107,20 +102,72 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
 
 def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
     known = told(look(talker()))
-    status = nodes("172.18.0.5", "172.18.0.6", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker")
-    assert gone(status, known.taken, known.subnets) == ["172.18.0.6"]
-    assert gone({}, known.taken, known.subnets) == []
+    nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
+    assert gone(nodes, known.taken, known.subnets) == ["172.18.0.6"]
+    assert gone(nodes, known.taken, ()) == []
 
 
-def test_moved_is_who_has_another_address_on_the_same_network() -> None:
-    before = told(look(talker())).addresses
-    assert moved(before, told(look(talker("172.18.0.9")))) == {"172.18.0.5": "172.18.0.9"}
-    assert moved(before, told(look(talker()))) == {}
-    assert moved(before, told(look())) == {}
-    assert moved({}, told(look(talker()))) == {}
+def test_the_addresses_of_nodes() -> None:
+    ended = {"address": "172.18.0.7:4001", "state": "cleaned"}
+    status = {"nodes": [{"address": "172.18.0.6:4001"}, {"address": "[fd00::1]:1"}, {}, ended]}
+    assert node_addresses(status) == {"172.18.0.6", "fd00::1"}
+    assert node_addresses({}) == frozenset()
+
+
+OLD, NEW = "172.18.0.5", "172.18.0.9"
+HERE, AWAY, THERE, NOBODY = (
+    told(look(*containers))
+    for containers in (
+        [talker()],
+        [replace(talker(), attachments=())],
+        [talker(NEW)],
+        [],
+    )
+)
+
+
+def places(*looks: tuple[float, Facts]) -> Places:
+    found = Places()
+    for when, known in looks:
+        found.look(known, when)
+    return found
+
+
+def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> None:
+    found = places((0.0, HERE), (1.0, THERE))
+    assert found.moved({OLD}) == {OLD: NEW}
+    assert found.moved({NEW}) == {}
+    assert found.held == {OLD}
+    assert found.until == 6.0
+
+
+def test_a_move_is_given_up_in_the_end() -> None:
+    found = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
+    assert not found.moved({OLD})
+    assert not found.held
+    assert found.until is None
+
+
+def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> None:
+    found = places((0.0, HERE), (1.0, AWAY))
+    assert not found.moved({OLD})
+    assert found.held == {OLD}
+    assert found.until == 3.0
+    found.look(THERE, 2.0)
+    assert found.moved({OLD}) == {OLD: NEW}
+
+
+def test_a_container_that_stays_away_is_gone() -> None:
+    assert places((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).held == frozenset()
+
+
+def test_a_container_that_does_not_run_is_gone_at_once() -> None:
+    found = places((0.0, HERE), (1.0, NOBODY))
+    assert not found.held
+    assert found.until is None
 
 
 def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
-    before = told(look(talker())).addresses
-    other = Container("o", "other", "running", attachments=(at("172.18.0.5"),))
-    assert moved(before, told(look(talker("172.18.0.9"), other))) == {}
+    other = Container("o", "other", "running", attachments=(at(OLD),))
+    found = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
+    assert found.moved({OLD}) == {}

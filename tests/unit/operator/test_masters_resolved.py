@@ -1,0 +1,98 @@
+"""Where the masters are."""
+
+import pytest
+
+from rosproxy_operator import masters as module
+from rosproxy_operator.masters import Masters
+
+
+class Names:
+    """A name server: ``known`` are its names; ``asked`` those that it was asked for."""
+
+    def __init__(self) -> None:
+        self.known: dict[str, list[str]] = {}
+        self.asked: list[str] = []
+
+    async def resolve(self, host: str) -> list[str]:
+        self.asked.append(host)
+        return self.known.get(host, [])
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> Names:
+    names = Names()
+    monkeypatch.setattr(module, "resolve", names.resolve)
+    monkeypatch.setattr(module, "AGAIN", 0.0)
+    monkeypatch.setattr(module, "AGAIN_UNRESOLVED", 0.0)
+    return names
+
+
+@pytest.fixture
+def changes() -> list[int]:
+    return []
+
+
+@pytest.fixture
+def masters(changes: list[int]) -> Masters:
+    return Masters(lambda: changes.append(1))
+
+
+async def test_an_address_needs_no_name_server(masters: Masters, names: Names) -> None:
+    await masters.learn(["192.0.2.7"], {}, [])
+    assert masters.address("192.0.2.7") == "192.0.2.7"
+    assert names.asked == []
+
+
+async def test_a_name_is_asked_for_when_it_is_new(masters: Masters, names: Names) -> None:
+    names.known["robot"] = ["192.0.2.7"]
+    for _ in range(2):
+        await masters.learn(["robot"], {}, [])
+    assert masters.address("robot") == "192.0.2.7"
+    assert names.asked == ["robot"]
+
+
+async def test_the_last_good_address_is_kept(
+    masters: Masters, names: Names, changes: list[int]
+) -> None:
+    names.known["robot"] = ["192.0.2.7"]
+    await masters.learn(["robot"], {}, [])
+    names.known.clear()
+    await masters.refresh()
+    assert masters.address("robot") == "192.0.2.7"
+    assert changes == []
+
+
+async def test_a_change_is_told(masters: Masters, names: Names, changes: list[int]) -> None:
+    names.known["robot"] = ["192.0.2.7", "192.0.2.8"]
+    await masters.learn(["robot"], {}, [])
+    names.known["robot"].reverse()  # the one in use is still good
+    await masters.refresh()
+    assert (masters.address("robot"), changes) == ("192.0.2.7", [])
+    names.known["robot"] = ["192.0.2.9"]
+    await masters.refresh()
+    assert (masters.address("robot"), changes) == ("192.0.2.9", [1])
+
+
+async def test_neither_loopback_nor_a_proxy_is_a_master(masters: Masters, names: Names) -> None:
+    names.known["robot"] = ["127.0.1.1", "172.18.0.2", "192.0.2.7"]
+    await masters.learn(["robot"], {}, ["172.18.0.2"])
+    assert masters.address("robot") == "192.0.2.7"
+
+
+async def test_what_the_engine_knows_helps_where_no_name_server_does(
+    masters: Masters, names: Names
+) -> None:
+    await masters.learn(["roscore", "robot"], {"roscore": "172.18.0.5"}, [])
+    assert masters.address("roscore") == "172.18.0.5"
+    assert masters.address("robot") == ""
+
+
+async def test_names_that_nobody_uses_any_more_are_forgotten(
+    masters: Masters, names: Names
+) -> None:
+    names.known["robot"] = ["192.0.2.7"]
+    await masters.learn(["robot"], {}, [])
+    await masters.learn([], {}, [])
+    assert masters.address("robot") == ""
+    await masters.refresh()
+    assert names.asked == ["robot"]
