@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 GONE_TIMEOUT = 0.5
 """Seconds that a node has to answer at an address that is said to be gone."""
+YOUNG = 3.0
+"""Seconds since its last registration in which a silent node gets a second chance."""
 RETIRE_TIMEOUT = 3.0
 """Seconds that registrations under way get to end before a proxy retires."""
 
@@ -92,12 +94,21 @@ class Containers:
         probe = self._parts.nodes.probe
         answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in found))
         outcomes = {e: answer.probe for e, answer in zip(found, answers, strict=True)}
-        dead = containers.dead(outcomes)
+        dead = containers.dead(outcomes, self._context.now() - YOUNG)
         for endpoint in dead:
             self._close(endpoint)
         for endpoint in set(found) - set(dead):
             endpoint.health.checked = None  # another process may have the address by now
+        spared = {e.place.address for e in set(found) - set(dead) if outcomes[e] is Probe.SILENT}
+        if spared:
+            self._context.tasks.spawn(self._bury_later(list(spared)), f"nodes at {spared}")
         return await self._unregister(e for e in dead if not e.health.cleaned)
+
+    async def _bury_later(self, addresses: Sequence[str]) -> None:
+        """Look again at silent nodes that were spared; upkeep unregisters what can't be now."""
+        await asyncio.sleep(YOUNG)
+        async with self._one_at_a_time:
+            await _tried(self._bury(addresses), [])
 
     def _close(self, endpoint: Endpoint) -> None:
         """Let a port refuse whose node has ended, and end what is still connected to it."""

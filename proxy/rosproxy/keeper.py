@@ -128,6 +128,7 @@ class Keeper:
         if not self._leases.is_open(endpoint):
             log.info("%s answers again", endpoint.label)
             self._leases.open(endpoint)
+            await self._upkeep.remind(endpoint)
 
     def _report_down(self, endpoint: Endpoint, reason: str) -> None:
         if endpoint.registrations:

@@ -103,19 +103,19 @@ class Strays:
         except (TimeoutError, Unreachable):
             return False
         verdict = strays.judge(endpoint, uri, self._advertised(endpoint))
-        if verdict is not Verdict.GUILTY:
-            log.info("%s registered around the proxy; not shut down", name)
-            endpoint.former_uris.add(endpoint.uri)
-            endpoint.health.checked = None  # what it lacks is found by a probe
-        if verdict is Verdict.ASTRAY:
-            former = {name: (endpoint, uri or endpoint.uri)}
-            self._context.tasks.spawn(self._again(former), f"taking over {endpoint.uri}")
-        return verdict is not Verdict.GUILTY
+        if verdict is Verdict.GUILTY:
+            return False
+        log.info("%s registered around the proxy; not shut down", name)
+        former = {name: (endpoint, uri or endpoint.uri)} if verdict is Verdict.ASTRAY else {}
+        self._context.tasks.spawn(self._again(endpoint, former), f"taking over {endpoint.uri}")
+        return True
 
-    async def _again(self, former: Mapping[str, tuple[Endpoint, str]]) -> None:
+    async def _again(self, endpoint: Endpoint, former: Mapping[str, tuple[Endpoint, str]]) -> None:
+        """Take names over once more; and what is at the master neither way by now."""
         try:
             async with self._one_at_a_time:
                 await self._upkeep.reclaim(former)
+                await self._upkeep.reconcile(endpoint)
         except (Unreachable, MasterError) as error:
             log.warning("%s; what is lost is registered later", error)
 

@@ -99,6 +99,16 @@ class Upkeep:
         await self._withdraw(topics)
         await self.register([*topics.values(), *subscribers])
 
+    async def remind(self, endpoint: Endpoint) -> None:
+        """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
+
+        A subscriber whose requestTopic was refused does not ask again by itself: it is told of
+        its publishers once more when one registers. Connections that have lasted stay.
+        """
+        topics = (Kind.PUBLISHER, Kind.SUBSCRIBER)
+        held = [one for one in endpoint.registrations.values() if one.kind in topics]
+        await self.register([(endpoint, one) for one in held])
+
     async def adopt(self, endpoint: Endpoint, said: SelfDescription) -> None:
         """Register what a node has and the master does not know of. Raises Unreachable."""
         found = upkeep.unregistered(endpoint, said.published, said.subscribed)

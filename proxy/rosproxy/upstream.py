@@ -181,6 +181,8 @@ async def _post(
     session: aiohttp.ClientSession, url: str, body: bytes, within: float, host: str
 ) -> bytes:
     """A reply's body; ``host`` is what the peer is called by, whatever address ``url`` names."""
+    if session.closed:
+        raise ConnectionAbortedError("the proxy is stopping")
     timeout = aiohttp.ClientTimeout(total=within, sock_connect=min(CONNECT_TIMEOUT, within))
     # A peer that could redirect the proxy would make it fetch from any host that it reaches.
     async with session.post(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.docker.engine import docker, inspect, run, wait_until
+from tests.docker.engine import docker, inspect, wait_until
 
 PROGRAM = Path(sys.executable).with_name("rosproxy-controller")
 MANAGED = "label=io.rosproxy.managed=true"
@@ -62,16 +62,17 @@ class Proxy:
         return str(inspect(self.sandbox)["NetworkSettings"]["Networks"][network]["IPAddress"])
 
 
-def managed(role: str) -> list[str]:
+def managed(role: str, *, check: bool = True) -> list[str]:
     """The names of the containers that a controller has made, in whatever state."""
     names = docker("ps", "--all", "--filter", MANAGED, "--filter", f"label=io.rosproxy.role={role}",
-                   "--format", "{{.Names}}").splitlines()  # fmt: skip
-    return sorted(names)
+                   "--format", "{{.Names}}", check=check).splitlines()  # fmt: skip
+    return sorted(name for name in names if " " not in name)
 
 
-def proxies() -> list[Proxy]:
+def proxies(*, check: bool = True) -> list[Proxy]:
     """All proxies on this engine, also those of which only one container is there."""
-    names = {*managed("proxy"), *(name.removesuffix("-ports") for name in managed("ports"))}
+    boxes = (name.removesuffix("-ports") for name in managed("ports", check=check))
+    names = {*managed("proxy", check=check), *boxes}
     return [Proxy(name) for name in sorted(names)]
 
 
@@ -152,11 +153,19 @@ class Process:
         self._directory = directory
         self.options = (*OPTIONS, *options)
         self._hosts = directory / "hosts"
-        self._hosts.write_text("".join(f"{at} {name}\n" for name, at in (names or {}).items()))
+        self._names: dict[str, str] = {}
+        self._hosts.touch()
+        for name, address in (names or {}).items():
+            self.name(name, address)
         self._namespace = namespace
         self.environment = dict(environment or {})
         self._log = directory / "controller.log"
         self.process: subprocess.Popen[bytes] | None = None
+
+    def name(self, name: str, address: str) -> None:
+        """Let a name lead to an address, from now on."""
+        self._names[name] = address
+        self._hosts.write_text("".join(f"{at} {name}\n" for name, at in self._names.items()))
 
     def start(self) -> None:
         with self._log.open("ab") as log:
@@ -166,14 +175,25 @@ class Process:
 
     def once(self, *words: str, check: bool = True, seconds: float = 120) -> str:
         """Run it to its end: --once, plan or status."""
-        command = self._command(*words)
         environment = {**os.environ, **self.environment}
-        return run(*command, check=check, seconds=seconds, env=environment)
+        self.process = subprocess.Popen(
+            self._command(*words), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env=environment,
+        )  # fmt: skip
+        text = self.process.communicate(timeout=seconds)[0].decode().strip()
+        code = self.process.returncode
+        assert code == 0 or not check, f"rosproxy-controller {' '.join(words)}: exit {code}\n{text}"
+        return text
+
+    def send(self, number: int) -> None:
+        """Send it a signal."""
+        assert self.process is not None
+        self.process.send_signal(number)
 
     def kill(self, number: int = signal.SIGKILL) -> int:
         """Send it a signal and wait for its end; return its exit status."""
+        self.send(number)
         assert self.process is not None
-        self.process.send_signal(number)
         return self.process.wait(30)
 
     def stop(self) -> None:

@@ -30,8 +30,17 @@ def run(*command: str | Path, check: bool = True, seconds: float = 60, **options
     return str(done.stdout).strip()
 
 
-def docker(*arguments: str | Path, check: bool = True, seconds: float = 60) -> str:
-    return run("docker", *arguments, check=check, seconds=seconds)
+def docker(
+    *arguments: str | Path, check: bool = True, seconds: float = 60, engine: str = ""
+) -> str:
+    """Run Docker's command line, with the engine that DOCKER_HOST names unless another is."""
+    host = ("--host", engine) if engine else ()
+    return run("docker", *host, *arguments, check=check, seconds=seconds)
+
+
+def engine_url() -> str:
+    """The engine that is used now."""
+    return os.environ.get("DOCKER_HOST") or "unix:///var/run/docker.sock"
 
 
 def inspect(name: str, *, check: bool = True) -> dict[str, Any]:

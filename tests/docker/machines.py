@@ -9,27 +9,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from tests.docker.engine import docker, inspect, run
+from tests.docker.engine import docker, engine_url, inspect, run
 from tests.docker.nodes import Log, node_command
 
 
 @dataclass(frozen=True)
 class Machine:
-    """``address`` is its own, ``host_address`` this host's at the other end of the cable."""
+    """``address`` is its own, ``host_address`` this host's at the other end of the cable.
+
+    ``engine`` is where it runs, which need not be where the nodes inside do.
+    """
 
     container: str
     address: str
     host_address: str
+    engine: str
 
     def run(self, *command: str, seconds: float = 30, check: bool = True) -> str:
         """Run a program; one that hangs is stopped and fails the test."""
         return docker(
             "exec", self.container, "timeout", str(seconds), *command,
-            check=check, seconds=seconds + 10,
+            check=check, seconds=seconds + 10, engine=self.engine,
         )  # fmt: skip
 
     def start(self, *command: str) -> None:
-        docker("exec", "--detach", self.container, *command)
+        docker("exec", "--detach", self.container, *command, engine=self.engine)
 
     def node(self, name: str, library: str, role: str, *options: str) -> Log:
         """Start a test node; what it prints goes to a file."""
@@ -44,17 +48,27 @@ class Machine:
 
 
 @contextmanager
-def machine(image: str, name: str, number: int, *options: str) -> Iterator[Machine]:
-    """A machine whose addresses are made of a number."""
+def machine(
+    image: str, name: str, number: int, *options: str, namespace: str = ""
+) -> Iterator[Machine]:
+    """A machine whose addresses are made of a number, beside this host or a network namespace."""
     container = f"rosproxy-test-{name}-{os.getpid()}"
     host_address, address = addresses(number)
+    engine = engine_url()
     docker("run", "--detach", "--init", "--network", "none", "--name", container, *options,
            image, "sleep", "infinity")  # fmt: skip
     try:
-        plug(container, number)
-        yield Machine(container, address, host_address)
+        plug(container, number, namespace)
+        yield Machine(container, address, host_address, engine)
     finally:
-        docker("rm", "--force", container, check=False)
+        docker("rm", "--force", container, check=False, engine=engine)
+        # The engine keeps the namespace of a container for up to a minute.
+        run("ip", "link", "delete", cable(number), check=False)
+
+
+def cable(number: int) -> str:
+    """The name of this host's end of a machine's cable."""
+    return f"rpx{number}h{os.getpid()}"[:15]
 
 
 def addresses(number: int) -> tuple[str, str]:
@@ -62,9 +76,10 @@ def addresses(number: int) -> tuple[str, str]:
     return f"198.18.{number}.1", f"198.18.{number}.2"
 
 
-def plug(container: str, number: int, *, namespace: str = "", interface: str = "eth0") -> None:
+def plug(container: str, number: int, namespace: str = "") -> None:
     """Lay a cable between a container and this host, or another network namespace."""
-    here, process = f"rpx{number}h{os.getpid()}"[:15], str(inspect(container)["State"]["Pid"])
+    interface = "eth0"
+    here, process = cable(number), str(inspect(container)["State"]["Pid"])
     host_address, address = addresses(number)
     near = ("nsenter", f"--net={namespace}") if namespace else ()
     far = ("nsenter", "--target", process, "--net")

@@ -1,10 +1,9 @@
 """Robots: machines outside that run a roscore."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
-from xmlrpc.client import ServerProxy
 
 from tests.docker.engine import wait_until
 from tests.docker.machines import Machine, addresses, join, machine, reach
@@ -12,6 +11,14 @@ from tests.docker.machines import Machine, addresses, join, machine, reach
 ADDRESSED, NAMED, LAPTOP = 77, 78, 79
 HOST_ADDRESS, ROBOT_ADDRESS = addresses(ADDRESSED)
 MASTER_URI = f"http://{ROBOT_ADDRESS}:11311"
+
+_NODES = """
+import json, sys, xmlrpc.client
+master = xmlrpc.client.ServerProxy(sys.argv[1])
+state = master.getSystemState("/test")[2]
+names = {name for kind in state for _, nodes in kind for name in nodes}
+print(json.dumps({name: master.lookupNode("/test", name)[2] for name in names}))
+"""
 
 
 @dataclass(frozen=True)
@@ -30,13 +37,9 @@ class Robot(Machine):
 
     def nodes(self, port: int = 11311) -> dict[str, str]:
         """Every node that the master knows, with its URI."""
-        try:
-            with ServerProxy(f"http://{self.address}:{port}") as master:
-                _, _, state = cast(Any, master.getSystemState("/test"))
-                names = {name for kind in state for _, nodes in kind for name in nodes}
-                return {name: cast(Any, master.lookupNode("/test", name))[2] for name in names}
-        except OSError:
-            return {}
+        text = self.run("python3", "-c", _NODES, f"http://{self.address}:{port}", check=False)
+        found: dict[str, str] = json.loads(text) if text.startswith("{") else {}
+        return found
 
     def uri(self, node: str, port: int = 11311) -> str:
         """The URI that the master has of a node; empty if none."""
@@ -56,9 +59,11 @@ def robot_outside(image: str) -> Iterator[Robot]:
 
 
 @contextmanager
-def named_robot(image: str, name: str = "robot", number: int = NAMED) -> Iterator[Robot]:
+def named_robot(
+    image: str, name: str = "robot", number: int = NAMED, namespace: str = ""
+) -> Iterator[Robot]:
     """A robot as most are: it calls itself by its name, in URIs too."""
-    with machine(image, name, number, *_names(name, number)) as found:
+    with machine(image, name, number, *_names(name, number), namespace=namespace) as found:
         yield _robot(found, name)
 
 
@@ -80,4 +85,4 @@ def _names(name: str, number: int) -> tuple[str, ...]:
 
 
 def _robot(found: Machine, name: str) -> Robot:
-    return Robot(found.container, found.address, found.host_address, name)
+    return Robot(found.container, found.address, found.host_address, found.engine, name)

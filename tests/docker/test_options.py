@@ -1,11 +1,16 @@
 """Controllers with options of their own."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 
-from tests.docker.controller import Controller, the_proxy
-from tests.docker.engine import wait_until
+import pytest
+
+from tests.docker.controller import Controller, Proxy, managed, the_proxy
+from tests.docker.engine import docker, inspect, wait_until
 from tests.docker.inside import Inside
+from tests.docker.nodes import LIBRARIES
 from tests.docker.robot import Robot
+from tests.docker.traffic import traffic
 
 
 def test_expose_by_default(start_controller: Callable[..., Controller], net: Inside) -> None:
@@ -26,3 +31,58 @@ def test_master_of_the_controller_serves_those_who_name_none(
     node = net.node(net.network(), "rospy", "pub", "--topic", "/out", uri="http://rosproxy:11311")
 
     wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+
+
+@pytest.fixture
+def moving_image(proxy_image: str) -> Iterator[str]:
+    """A tag that tests give to other images."""
+    tag = "rosproxy-test-moving:latest"
+    docker("tag", proxy_image, tag)
+    yield tag
+    docker("rmi", "--force", tag, check=False)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_updated_image_replaces_the_proxy(
+    library: str, start_controller: Callable[..., Controller], moving_image: str, net: Inside,
+    named: Robot,
+) -> None:  # fmt: skip
+    start_controller("--proxy-image", moving_image)
+    with traffic(net, named, net.network(), library) as flow:
+        before = the_proxy()
+        name, number, ports, token = before.name, before.id, before.ports, secret(before)
+        changed = time.time()
+
+        update(moving_image)
+
+        wait_until(lambda: the_proxy().id != number, 30, "another container")
+        flow.wait(since=time.time())
+        print(f"image updated: {flow.gaps(changed)}")
+        after = the_proxy()
+        assert (after.name, after.ports, secret(after)) == (name, ports, token)
+
+
+def update(tag: str) -> None:
+    """Give the tag to another image that does the same."""
+    made = docker("create", tag)
+    try:
+        docker("commit", "--change", f"LABEL made={time.time()}", made, tag)
+    finally:
+        docker("rm", made)
+
+
+def secret(proxy: Proxy) -> str:
+    words = inspect(proxy.name)["Config"]["Env"]
+    return next(str(word) for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN="))
+
+
+def test_missing_image_is_told_with_what_to_do(
+    start_controller: Callable[..., Controller], net: Inside
+) -> None:
+    controller = start_controller("--proxy-image", "rosproxy:nosuch")
+    net.idle(net.network())
+
+    wait_until(lambda: "rosproxy:nosuch" in controller.problems(), 10, controller.logs)
+
+    assert "docker build" in controller.problems() or "docker pull" in controller.problems()
+    assert not managed("proxy")

@@ -61,8 +61,31 @@ async def master() -> AsyncIterator[Master]:
 
 
 @pytest.fixture
-async def make_proxy(master: Master, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[MakeProxy]:
-    """Starts proxies in this process, for the master unless told otherwise."""
+async def make_node() -> AsyncIterator[MakeNode]:
+    """Starts inside nodes."""
+    made: list[Node] = []
+
+    async def make(
+        name: str = "/talker", address: str = NODE, host: str = "", port: int = 0
+    ) -> Node:
+        node = Node(name, address, host)
+        node.slave.address = address, port
+        made.append(node)
+        await node.start()
+        return node
+
+    yield make
+    await asyncio.gather(*(node.stop() for node in made))
+
+
+@pytest.fixture
+async def make_proxy(
+    master: Master, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[MakeProxy]:
+    """Starts proxies in this process, for the master unless told otherwise.
+
+    They are stopped before the nodes: a node can't close connections that are just being made.
+    """
     monkeypatch.setattr("rosproxy.app.TICK", 0.03)
     made: list[Proxy] = []
 
@@ -80,21 +103,6 @@ async def make_proxy(master: Master, monkeypatch: pytest.MonkeyPatch) -> AsyncIt
 async def proxy(make_proxy: MakeProxy) -> Proxy:
     """A proxy in this process."""
     return await make_proxy()
-
-
-@pytest.fixture
-async def make_node() -> AsyncIterator[MakeNode]:
-    """Starts inside nodes."""
-    made: list[Node] = []
-
-    async def make(name: str = "/talker", address: str = NODE, host: str = "") -> Node:
-        node = Node(name, address, host)
-        made.append(node)
-        await node.start()
-        return node
-
-    yield make
-    await asyncio.gather(*(node.stop() for node in made))
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from tests.integration.net import (
     THIRD_NODE,
     connect,
     exchange,
+    free_ports,
     refuses,
     until,
 )
@@ -167,8 +168,9 @@ async def test_a_container_that_is_gone(
 
 
 async def test_a_node_that_hangs_is_not_waited_for(
-    make_proxy: MakeProxy, node: Node, master: Master
+    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("rosproxy.containers.YOUNG", -1.0)  # it is none that is just starting
     proxy = await make_proxy(**PATIENT, probe_timeout=3.0)
     await node.publish(proxy.master)
     node.hang = True
@@ -178,6 +180,20 @@ async def test_a_node_that_hangs_is_not_waited_for(
     assert not everything(master)
     node.hang = False  # the news was wrong
     await until(lambda: master.holds("publishers", "/chatter"), "it is registered again", 8)
+
+
+async def test_a_node_that_has_just_registered_may_take_its_time(
+    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A restarted container has its address again before the news that it was gone."""
+    monkeypatch.setattr("rosproxy.containers.YOUNG", 0.6)
+    proxy = await make_proxy(**PATIENT)
+    await node.publish(proxy.master)
+    node.hang = True
+    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert not await refuses(proxy.lease(node))
+    assert everything(master)
+    await until(lambda: not everything(master), "it had its chance", 5)
 
 
 async def test_its_open_connections_end(make_proxy: MakeProxy, node: Node) -> None:
@@ -250,8 +266,9 @@ class Container:
 
 
 @pytest.fixture
-async def container(make_proxy: MakeProxy, node: Node) -> Container:
+async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
     """A node with one registration of each kind, known by its pid."""
+    node = await make_node(port=free_ports(1))
     proxy = await make_proxy(**PATIENT, probe_interval=60.0)
     await populate(proxy, node)
     moved = Container(node, proxy)

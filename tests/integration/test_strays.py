@@ -16,6 +16,7 @@ from tests.integration.net import (
     OTHER_NODE,
     OUTSIDE,
     THIRD_NODE,
+    free_ports,
     refuses,
     rpc,
     until,
@@ -184,11 +185,9 @@ async def test_another_node_at_the_same_port(proxy: Proxy, master: Master, node:
 
 async def twins(make_node: MakeNode, *topics: str) -> list[Node]:
     """Two containers whose nodes have the same host name and port."""
-    first = await make_node("/first", NODE, "twin")
-    second = await make_node("/second", OTHER_NODE, "twin")
-    await second.slave.stop()
-    second.slave.address = first.slave.address
-    await second.slave.start(OTHER_NODE, first.slave.address[1])
+    port = free_ports(1)
+    first = await make_node("/first", NODE, "twin", port)
+    second = await make_node("/second", OTHER_NODE, "twin", port)
     assert first.uri == second.uri
     for node, topic in zip((first, second), topics, strict=True):
         node.published = {topic: "std_msgs/String"}
@@ -294,6 +293,20 @@ async def test_it_does_so_through_a_proxy_that_has_forgotten(
     await until(lambda: all_of(master).get("/more") == [uri], "the new one is behind the proxy")
     await until(lambda: all_of(master).get("/chatter") == [uri], "and what it had")
     assert not shutdowns(node)
+
+
+async def test_a_shutdown_that_comes_late_is_spared(
+    make_proxy: MakeProxy, master: Master, node: Node
+) -> None:
+    """What it was for is over: the master has the node by its own URI of the proxy again."""
+    proxy = await make_proxy(**PATIENT, probe_interval=60.0)
+    await node.publish(proxy.master)
+    node.published["/lost"] = "std_msgs/String"
+    reason = "[/talker] Reason: new node registered with same name"
+    assert await rpc(proxy.uri(node), "shutdown", "/master", reason) == [1, "", 0]
+    assert not shutdowns(node)
+    await until(lambda: "/lost" in all_of(master), "what it lacked is registered")
+    assert not proxy.endpoint(node).direct
 
 
 async def test_a_shutdown_that_is_meant_is_passed_on(

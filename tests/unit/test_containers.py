@@ -1,5 +1,7 @@
 """Which endpoints the news of containers concerns."""
 
+from dataclasses import replace
+
 import pytest
 
 from rosproxy.core import containers
@@ -22,7 +24,21 @@ def test_only_who_answers_is_alive() -> None:
     addressing = make_addressing()
     found = [add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(3)]
     probes = [Probe.ANSWERED, Probe.REFUSED, Probe.SILENT]
-    assert containers.dead(dict(zip(found, probes, strict=True))) == found[1:]
+    assert containers.dead(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
+
+
+def test_restarted_container_keeps_its_new_node() -> None:
+    """Its address is back, and its node has just registered, but takes its time to answer."""
+    addressing = make_addressing()
+    fresh, old, calling, ended = (
+        add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(4)
+    )
+    for endpoint, since in ((fresh, 7.0), (old, 6.9), (ended, 8.0)):
+        held = add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter", f"/at{since}")
+        addressing.registry.register(endpoint, replace(held, since=since))
+    calling.pending = 1
+    answers = dict.fromkeys((fresh, old, calling), Probe.SILENT) | {ended: Probe.REFUSED}
+    assert containers.dead(answers, 7.0) == [old, ended]
 
 
 def test_who_may_have_moved() -> None:

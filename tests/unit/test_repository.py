@@ -75,3 +75,25 @@ def test_readme_names_tests_that_exist() -> None:
 def test_scripts_can_be_run() -> None:
     scripts = [*(ROOT / "scripts").glob("*.sh"), ROOT / ".ci/run"]
     assert not [path.name for path in scripts if not path.stat().st_mode & 0o111]
+
+
+def test_docker_page_names_every_option_label_and_metric() -> None:
+    from rosproxy_operator.cli import main
+    from rosproxy_operator.core.values import LABELS
+    from rosproxy_operator.metrics import Metrics
+
+    text = (ROOT / "docs/docker.md").read_text()
+    options = [opt for option in main.commands["docker"].params for opt in option.opts]
+    metrics = [family.name for family in Metrics().registry.collect()]
+    wanted = [*options, *LABELS, *(name for name in metrics if not name.startswith("process_"))]
+    assert not [word for word in wanted if word not in text]
+
+
+def test_docker_page_lists_the_engine_calls() -> None:
+    from rosproxy_operator.docker import engine
+
+    assert engine.__doc__ is not None
+    calls = re.findall(r"^    ((?:GET|POST|DELETE) \S+)$", engine.__doc__, re.M)
+    page = (ROOT / "docs/docker.md").read_text().splitlines()
+    assert calls
+    assert [line.strip() for line in page if line.strip() in calls] == calls

@@ -14,12 +14,24 @@ def at(endpoints: Iterable[Endpoint], addresses: Collection[str]) -> list[Endpoi
     return [endpoint for endpoint in endpoints if endpoint.place.address in addresses]
 
 
-def dead(answers: Mapping[Endpoint, Probe]) -> list[Endpoint]:
+def dead(answers: Mapping[Endpoint, Probe], since: float) -> list[Endpoint]:
     """Those of the endpoints at addresses that are gone whose node does not answer.
 
-    Where one answers, the address is in use again, or the news was wrong.
+    Where one answers, the address is in use again, or the news was wrong. One that is silent but
+    has registered ``since`` then is spared: a container that is restarted has its address
+    again, and a node that is just starting may take its time.
     """
-    return [e for e, probe in answers.items() if probe is not Probe.ANSWERED]
+    return [
+        endpoint
+        for endpoint, probe in answers.items()
+        if probe is Probe.REFUSED
+        or (probe is Probe.SILENT and not _registered_since(endpoint, since))
+    ]
+
+
+def _registered_since(endpoint: Endpoint, since: float) -> bool:
+    held = endpoint.registrations.values()
+    return endpoint.pending > 0 or any(one.since >= since for one in held)
 
 
 def movable(

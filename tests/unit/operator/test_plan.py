@@ -502,6 +502,22 @@ def test_ports_are_kept_when_the_proxy_was_removed_and_nothing_is_remembered() -
     assert actions(seen) == [new_proxy(there), Start(NAME)]
 
 
+def test_ports_are_kept_when_the_sandbox_was_removed_and_nothing_is_remembered() -> None:
+    """The proxy, which is of no use without it, says where it was."""
+    there = PortRange(11500, 11531)
+    assert created(look(observed(container(), proxies=[proxy(ports=there)]))) == there
+
+
+def test_a_stopped_sandbox_tells_more_than_memory_only_if_it_has_more_ports() -> None:
+    for ports, kept in (
+        (PortRange(11400, 11439), PortRange(11400, 11439)),
+        (PortRange(11500, 11531), RANGE),
+    ):
+        seen = observed(container(), sandboxes=[sandbox(ports=ports, state="exited")])
+        found = look(seen, memory=Memory(served={KEY: RANGE}))
+        assert found.memory.planned == {KEY: kept}
+
+
 def test_never_fewer_ports() -> None:
     assert actions(observed(container(), **both()), settings=replace(SETTINGS, ports=8)) == []
 
@@ -560,6 +576,7 @@ def test_ports_that_have_served_are_tried_for_a_while(ports: list[int] | None) -
     assert created(last) == (PortRange(11411, 11442) if ports else NEXT)
     assert f"HAS LEFT ITS PORTS 11400-11431 for {created(last)}" in port_problem(last)
     assert last.memory.moved == {KEY: Move(RANGE, 120.0)}
+    assert last.memory.served == {}
 
 
 def test_added_ports_that_are_refused_are_given_up() -> None:
@@ -582,7 +599,8 @@ def test_ports_that_a_stranger_publishes_now_are_left() -> None:
 def test_a_start_that_went_well_is_the_end_of_it() -> None:
     memory = Memory().port_taken(PORTS, None, 0.0)
     found = look(observed(container(), **both()), memory=memory, now=30.0)
-    assert (found.actions, found.memory.refusals, found.again_in) == ((), {}, None)
+    assert (found.actions, found.again_in) == ((), None)
+    assert found.memory == Memory(served={KEY: RANGE}, planned={KEY: RANGE})
 
 
 # all together

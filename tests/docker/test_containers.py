@@ -1,0 +1,213 @@
+"""What becomes of a labelled container's nodes when something happens to the container."""
+
+import time
+
+import pytest
+
+from tests.docker.controller import Controller, proxies, the_proxy
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import Container, Inside
+from tests.docker.nodes import LIBRARIES
+from tests.docker.robot import Robot
+
+
+def talker(net: Inside, network: str, robot: Robot, library: str = "roscpp") -> Container:
+    """A node that publishes, known to the master."""
+    node = net.node(network, library, "pub", "--topic", "/out", "--word", "inside")
+    wait_until(lambda: robot.knows_proxied(node.node), 30, node.log.read)
+    return node
+
+
+@pytest.mark.parametrize("end", ["kill", "rm --force"])
+def test_dead_containers_nodes_are_unregistered_at_once(
+    end: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    network = net.network()
+    neighbour = net.idle(network)
+    node = talker(net, network, named)
+
+    docker(*end.split(), node.name)
+
+    seconds = wait_until(lambda: not named.uri(node.node), 10, "the master forgets the node")
+    print(f"docker {end}: unregistered after {seconds:.1f} s")
+    assert seconds < 2
+    assert neighbour.state == "running"
+
+
+def test_ended_node_signs_off_by_itself(controller: Controller, net: Inside, named: Robot) -> None:
+    node = talker(net, net.network(), named)
+
+    docker("stop", node.name)
+
+    wait_until(lambda: not named.uri(node.node), 2, "the master forgets the node")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_restarted_container_is_heard_again(
+    library: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    node = talker(net, net.network(), named, library)
+    ear = named.node("ear", library, "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+
+        docker("restart", "--time", "0", node.name)
+
+        ear.wait_for("inside", since=time.time())
+    finally:
+        named.end("ear")
+
+
+def test_paused_container_keeps_its_registrations(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    node = talker(net, net.network(), named)
+    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+        uri = named.uri(node.node)
+
+        docker("pause", node.name)
+        wait_until(lambda: silent_for(ear.got()[-1].at, 4), 10, "nothing is heard any more")
+        assert named.uri(node.node) == uri
+        docker("unpause", node.name)
+
+        ear.wait_for("inside", since=time.time())
+        assert named.uri(node.node) == uri
+    finally:
+        named.end("ear")
+
+
+def silent_for(last: float, seconds: float) -> bool:
+    return time.time() - last > seconds
+
+
+def test_renamed_container_goes_on(controller: Controller, net: Inside, named: Robot) -> None:
+    node = talker(net, net.network(), named)
+    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+        before = time.time()
+
+        docker("rename", node.name, node.name + "-renamed")
+
+        ear.wait_for("inside", count=60, since=before)
+        assert ear.longest_gap("inside", before, time.time()) < 1
+        names = {one["name"] for one in controller.status()["containers"]}
+        assert node.name + "-renamed" in names
+    finally:
+        named.end("ear")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_container_moves_to_another_network(
+    library: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    old, new = net.network(), net.network()
+    node = talker(net, old, named, library)
+    proxy = the_proxy()
+    ear = named.node("ear", library, "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+
+        docker("network", "disconnect", old, node.name)
+        docker("network", "connect", new, node.name)
+
+        wait_until(lambda: proxy.networks == {new}, 10, lambda: str(proxy.networks))
+        ear.wait_for("inside", since=time.time())
+    finally:
+        named.end("ear")
+
+
+def test_nodes_of_two_networks_hear_each_other(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    one, other = net.network(), net.network("--internal")
+    speaking = net.node(one, "roscpp", "pub", "--topic", "/across", "--word", "neighbour")
+    hearing = net.node(other, "rospy", "sub", "--topic", "/across")
+
+    hearing.log.wait_for("neighbour")
+
+    assert the_proxy().networks == {one, other}
+    assert named.knows_proxied(speaking.node)
+
+
+def test_container_of_two_networks(controller: Controller, net: Inside, named: Robot) -> None:
+    """It is served on both; leaving one of them cuts nothing."""
+    one, other = net.network(), net.network()
+    node = net.node(one, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create")
+    docker("network", "connect", other, node.name)
+    docker("start", node.name)
+    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+        proxy = the_proxy()
+        assert proxy.networks == {one, other}
+
+        docker("network", "disconnect", proxy_free_network(node, named, one, other), node.name)
+
+        wait_until(lambda: len(proxy.networks) == 1, 10, lambda: str(proxy.networks))
+        ear.wait_for("inside", since=time.time())
+    finally:
+        named.end("ear")
+
+
+def proxy_free_network(node: Container, robot: Robot, *networks: str) -> str:
+    """The network by which the proxy does not reach the node."""
+    address = robot.uri(node.node).rstrip("/").rsplit("/", 1)[1]
+    return next(network for network in networks if node.address(network) != address)
+
+
+def test_network_can_be_removed_when_its_containers_are_gone(
+    controller: Controller, net: Inside
+) -> None:
+    network, kept = net.network(), net.network()
+    node = net.idle(network)
+    net.idle(kept)
+    proxy = the_proxy()
+    wait_until(lambda: proxy.networks == {network, kept}, 10, "the proxy has joined both")
+
+    docker("rm", "--force", node.name)
+    wait_until(lambda: proxy.networks == {kept}, 3, "the proxy has left")
+    docker("network", "rm", network)
+
+    net.networks.remove(network)
+    assert proxy.running
+
+
+def test_proxy_goes_with_its_last_container(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    """After the grace, which is 3 seconds here; and nothing of it is left at the master."""
+    node = talker(net, net.network(), named)
+    assert proxies()
+
+    docker("kill", node.name)
+
+    wait_until(lambda: not proxies(), 15, "the proxy is removed")
+    assert not any(f"//{named.host_address}:" in uri for uri in named.nodes().values())
+
+
+def test_proxy_stays_for_a_container_that_comes_back(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    node = talker(net, net.network(), named)
+    number = the_proxy().id
+
+    docker("restart", "--time", "0", node.name)
+    wait_until(lambda: named.knows_proxied(node.node), 10, node.log.read)
+
+    assert the_proxy().id == number
+
+
+def test_network_taken_away_from_the_proxy_is_joined_again(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    network = net.network()
+    node = talker(net, network, named)
+    proxy = the_proxy()
+
+    docker("network", "disconnect", network, proxy.sandbox)
+
+    wait_until(lambda: network in proxy.networks, 10, "the proxy has joined again")
+    assert node.resolve(named.name) == {proxy.address(network)}

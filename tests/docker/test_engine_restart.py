@@ -1,0 +1,121 @@
+"""An engine that is ended and started again, with its userland proxy turned off.
+
+It is the tests' own, so that nobody else's containers are touched.
+"""
+
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.docker.controller import Process, the_proxy
+from tests.docker.engine import wait_until
+from tests.docker.inside import Inside
+from tests.docker.nodes import LIBRARIES, Log
+from tests.docker.private_engine import PrivateEngine, private_engine
+from tests.docker.robot import Robot, named_robot
+
+NUMBER = 84
+RESTART = ("--restart", "unless-stopped")
+
+
+@pytest.fixture(scope="module")
+def engine(
+    tmp_path_factory: pytest.TempPathFactory, ros_image: str, proxy_image: str
+) -> Iterator[PrivateEngine]:
+    with private_engine(tmp_path_factory.mktemp("private")) as engine:
+        engine.load(ros_image, proxy_image)
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def robot(ros_image: str, engine: PrivateEngine) -> Iterator[Robot]:
+    """A robot that outlives the engine: it runs on this machine's."""
+    with named_robot(ros_image, "android", NUMBER, engine.namespace) as robot:
+        robot.start_master()
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def controller(
+    engine: PrivateEngine, robot: Robot, proxy_image: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Process]:
+    """Beside the engine, in its network namespace."""
+    process = Process(
+        tmp_path_factory.mktemp("controller"), "--proxy-image", proxy_image,
+        names={robot.name: robot.address}, namespace=engine.namespace,
+        environment={"DOCKER_HOST": engine.url},
+    )  # fmt: skip
+    process.start()
+    yield process
+    process.stop()
+    print(process.logs())
+
+
+@pytest.fixture(scope="module")
+def ears(
+    engine: PrivateEngine, robot: Robot, controller: Process, ros_image: str
+) -> Iterator[dict[str, Log]]:
+    """What the robot hears of two nodes inside, in either language."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DOCKER_HOST", engine.url)
+        inside = Inside(ros_image, robot.master_uri)
+        network = inside.network()
+        inside.network()
+        for library in LIBRARIES:
+            inside.node(network, library, "pub", "--topic", f"/{library}", "--word", "inside",
+                        options=RESTART)  # fmt: skip
+        yield {
+            library: robot.node(f"ear_{library}", library, "sub", "--topic", f"/{library}")
+            for library in LIBRARIES
+        }
+
+
+def test_everything_comes_back_with_the_engine(
+    engine: PrivateEngine, controller: Process, ears: dict[str, Log]
+) -> None:
+    """The engine starts the containers again; their addresses may be others."""
+    for ear in ears.values():
+        ear.wait_for("inside")
+    ports, process = the_proxy().ports, controller.process
+
+    engine.end()
+    assert process is not None
+    assert process.poll() is None, controller.logs()
+    engine.start("--live-restore")
+    began = time.time()
+
+    for library, ear in ears.items():
+        heard = ear.wait_for("inside", since=began, seconds=60)
+        print(f"{library}: heard {heard - began:.1f} s after the engine was there again")
+    assert the_proxy().ports == ports
+    assert process.poll() is None, controller.logs()
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_nobody_notices_an_engine_with_live_restore(
+    how: signal.Signals, engine: PrivateEngine, controller: Process, ears: dict[str, Log]
+) -> None:
+    """Containers go on without the engine, and so does the proxy."""
+    began, number = time.time(), the_proxy().id
+
+    engine.end(how)
+    time_without = time.time()
+    engine.start("--live-restore")
+
+    for ear in ears.values():
+        ear.wait_for("inside", since=time.time())
+        assert ear.longest_gap("inside", began, time.time()) < 1
+    print(f"{how.name}: {time.time() - time_without:.1f} s without the engine")
+    assert the_proxy().id == number
+
+
+def test_controller_works_on_after_all_that(
+    engine: PrivateEngine, controller: Process, ears: dict[str, Log], robot: Robot, ros_image: str
+) -> None:
+    inside = Inside(ros_image, robot.master_uri)
+
+    node = inside.node(inside.network(), "roscpp", "pub", "--topic", "/late")
+
+    wait_until(lambda: robot.knows_proxied(node.node), 30, controller.logs)

@@ -1,0 +1,137 @@
+"""The examples with a controller, started as their READMEs say, with real nodes."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+import rosproxy_operator.docker.engine
+from tests.docker.controller import UPLINK, remove_proxies, the_proxy
+from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
+from tests.docker.robot import Robot
+
+EXAMPLES = ROOT / "examples/docker"
+SOCKET_PROXY = EXAMPLES / "socket-proxy"
+
+
+@dataclass
+class Example:
+    """A compose file as it stands, and beside it the robot's name, which no name server knows."""
+
+    directory: Path
+    variables: dict[str, str]
+    extra: Path = field(default=Path())
+
+    def compose(self, *arguments: str) -> str:
+        files = ("--file", "compose.yaml", "--file", str(self.extra))
+        return compose(self.directory, *files, *arguments, variables=self.variables)
+
+    def container(self, service: str) -> str:
+        return self.compose("ps", "--quiet", service).splitlines()[-1]
+
+
+@contextmanager
+def example(
+    directory: Path, robot: Robot, images: dict[str, str], temporary: Path
+) -> Iterator[Example]:
+    extra = temporary / "names.yaml"
+    hosts = f'["{robot.name}:{robot.address}"]'
+    extra.write_text(f"services:\n  controller:\n    extra_hosts: {hosts}\n")
+    variables = {"ROS_MASTER_URI": robot.master_uri, "ADVERTISE_HOST": robot.host_address}
+    found = Example(directory, {**variables, **images}, extra)
+    try:
+        found.compose("up", "--detach", "--no-build")
+        yield found
+    finally:
+        print(found.compose("logs", "controller"))
+        found.compose("rm", "--stop", "--force", "talker", "listener")
+        remove_proxies()
+        found.compose("down", "--timeout", "2")
+        remove_proxies()
+
+
+@pytest.fixture(scope="module")
+def images(
+    ros_image: str, proxy_image: str, controller_image: str, haproxy_image: str
+) -> dict[str, str]:
+    return {
+        "ROS_IMAGE": ros_image,
+        "ROSPROXY_IMAGE": proxy_image,
+        "ROSPROXY_OPERATOR_IMAGE": controller_image,
+        "HAPROXY_IMAGE": haproxy_image,
+    }
+
+
+def works_both_ways(found: Example, robot: Robot) -> None:
+    """What the README says is to be seen."""
+    heard = robot.run("rostopic", "echo", "-n", "3", "/chatter")
+    assert heard.count("hello from inside") == 3
+
+    words = ("rostopic", "pub", "-r", "2", "/command", "std_msgs/String", "hello from outside")
+    robot.start("timeout", "20", *words)
+    wait_until(
+        lambda: found.compose("logs", "listener").count("hello from outside") >= 3, 20,
+        lambda: found.compose("logs", "listener"),
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("_no_other_controller")
+def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Path) -> None:
+    with example(EXAMPLES, named, images, tmp_path) as found:
+        works_both_ways(found, named)
+
+        status = found.compose(
+            "exec", "-T", "controller", "rosproxy-controller", "docker", "status"
+        )
+        assert the_proxy().name in status
+        assert "talker" in status
+        assert "listener" in status
+        assert 11400 in the_proxy().ports
+
+        found.compose("rm", "--stop", "--force", "talker", "listener")
+        wait_until(lambda: not the_proxy().networks, 5, "the proxy has left the network")
+
+
+@pytest.mark.usefixtures("_no_other_controller")
+def test_example_behind_a_socket_proxy(
+    named: Robot, images: dict[str, str], tmp_path: Path
+) -> None:
+    docker("network", "create", UPLINK)
+    with example(SOCKET_PROXY, named, images, tmp_path) as found:
+        works_both_ways(found, named)
+
+        controller = inspect(found.container("controller"))
+        assert controller["Config"]["User"] == "10001:10001"
+        assert not controller["Mounts"]
+        forbidden = (
+            "import os, requests as r; url = os.environ['DOCKER_HOST'].replace('tcp', 'http');"
+            "print([r.get(url + '/v1.41/info').status_code,"
+            "r.post(url + '/v1.41/containers/x/exec').status_code,"
+            "r.delete(url + '/v1.41/networks/x').status_code])"
+        )
+        said = docker("exec", controller["Id"], "/opt/rosproxy/bin/python", "-c", forbidden)
+        assert said == "[403, 403, 403]"
+
+
+def test_socket_proxy_allows_what_the_controller_calls() -> None:
+    """And the documentation lists the same."""
+    listed = r"^ {4}(GET|POST|DELETE) (/\S+)$"
+    calls = re.findall(listed, str(rosproxy_operator.docker.engine.__doc__), re.MULTILINE)
+    text = (SOCKET_PROXY / "haproxy.cfg").read_text()
+    allowed = re.findall(r"acl (get|post|delete)_path path -m reg \^(/\S+)\$", text)
+
+    assert len(calls) > 10
+    assert calls == [(verb.upper(), path.replace("/v[0-9.]+", "")) for verb, path in allowed]
+    documented = (ROOT / "docs/docker.md").read_text()
+    assert calls == re.findall(listed, documented, re.MULTILINE)
+
+
+def test_examples_need_no_more_than_their_readme_says() -> None:
+    """A variable without a default is one that the README tells to set."""
+    for directory in (EXAMPLES, SOCKET_PROXY):
+        needed = set(re.findall(r"\$\{(\w+):\?", (directory / "compose.yaml").read_text()))
+        told = set(re.findall(r"export (\w+)=", (directory / "README.md").read_text()))
+        assert needed == told, directory

@@ -1,0 +1,125 @@
+"""More than one master, and one whose host moves."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.docker.controller import Controller, Process, proxies, remove_proxies, the_proxy
+from tests.docker.engine import run, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.machines import cable
+from tests.docker.robot import Robot, named_robot
+
+ROVER, MOVER = 80, 82
+
+
+@pytest.fixture(scope="module")
+def rover(ros_image: str) -> Iterator[Robot]:
+    """Another robot with a master of its own."""
+    with named_robot(ros_image, "rover", ROVER) as robot:
+        robot.start_master()
+        yield robot
+
+
+def test_two_masters_on_one_network(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot, rover: Robot
+) -> None:
+    """Each name leads to a proxy of its own, with ports of its own."""
+    start_controller(names={rover.name: rover.address})
+    network = net.network()
+    robots = {robot.name: robot for robot in (named, rover)}
+    nodes = {
+        name: net.node(network, "rospy", "pub", "--topic", "/out", "--word", name,
+                       uri=robot.master_uri)
+        for name, robot in robots.items()
+    }  # fmt: skip
+    ears = {name: robot.node("ear", "rospy", "sub", "--topic", "/out")
+            for name, robot in robots.items()}  # fmt: skip
+    try:
+        for name, ear in ears.items():
+            ear.wait_for(name)
+            assert {got.word for got in ear.got()} == {name}
+            assert robots[name].knows_proxied(nodes[name].node)
+        one, other = proxies()
+        assert not set(one.ports) & set(other.ports)
+    finally:
+        for robot in robots.values():
+            robot.end("ear")
+
+
+def test_two_masters_of_one_host(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    """Two roscores on the robot, so one name: in networks of their own both are found by it."""
+    named.start_master(port=11312)
+    start_controller()
+    nodes = {
+        port: net.node(net.network(), "roscpp", "pub", "--topic", "/out",
+                       uri=f"http://{named.name}:{port}")
+        for port in (11311, 11312)
+    }  # fmt: skip
+
+    for port, node in nodes.items():
+        wait_until(lambda: named.knows_proxied(node.node, port), 30, node.log.read)  # noqa: B023
+
+    assert len(proxies()) == 2
+    assert not named.uri(nodes[11311].node, 11312)
+
+
+def test_label_wins_over_the_environment(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot, rover: Robot
+) -> None:
+    start_controller(names={rover.name: rover.address})
+    labels = (ENABLE, f"rosproxy.master-uri={rover.master_uri}")
+    node = net.node(net.network(), "roscpp", "pub", "--topic", "/out", labels=labels,
+                    uri="http://rosproxy:11311")  # fmt: skip
+
+    wait_until(lambda: rover.knows_proxied(node.node), 30, node.log.read)
+    assert not named.uri(node.node)
+
+
+@pytest.mark.usefixtures("_no_other_controller")
+def test_masters_host_gets_another_address(
+    ros_image: str, proxy_image: str, net: Inside, tmp_path: Path
+) -> None:
+    """The proxy follows the name, without being made anew."""
+    with named_robot(ros_image, "mover", MOVER) as robot:
+        robot.start_master()
+        options = ("--proxy-image", proxy_image, "--advertise-host", robot.host_address)
+        controller = Process(tmp_path, *options, names={robot.name: robot.address})
+        controller.start()
+        try:
+            node = net.node(net.network(), "rospy", "pub", "--topic", "/out", "--word", "inside",
+                            uri=robot.master_uri)  # fmt: skip
+            wait_until(lambda: robot.knows_proxied(node.node), 30, controller.logs)
+            number = the_proxy().id
+
+            address = move(robot)
+            controller.name(robot.name, address)
+            later = net.node(net.networks[0], "rospy", "sub", "--topic", "/new",
+                             uri=robot.master_uri)  # fmt: skip
+            moved = replace(robot, address=address)
+
+            wait_until(lambda: moved.knows_proxied(later.node), 40, controller.logs)
+            moved.node("ear", "rospy", "sub", "--topic", "/out").wait_for("inside")
+            assert the_proxy().id == number
+        finally:
+            controller.stop()
+            remove_proxies()
+
+
+def move(robot: Robot) -> str:
+    """Give the robot another address on the same cable; return it."""
+    address = f"198.18.{MOVER + 1}.2"
+    run("ip", "route", "add", f"{address}/32", "dev", cable(MOVER))
+    script = f"""
+        ip address add {address}/32 dev eth0
+        ip address del {robot.address}/30 dev eth0
+        ip route add {robot.host_address}/32 dev eth0 src {address}
+    """
+    pid = run("docker", "inspect", "--format", "{{.State.Pid}}", robot.container)
+    run("nsenter", "--target", pid, "--net", "sh", "-ec", script)
+    robot.run("sh", "-c", f"echo {address} {robot.name} >/etc/hosts")
+    return address

@@ -1,0 +1,125 @@
+"""Which ports a proxy gets on a host where others publish and listen."""
+
+import socket
+import time
+from collections.abc import Callable
+from contextlib import closing
+
+import pytest
+
+from tests.docker.controller import WINDOW, Controller, the_proxy
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.robot import Robot
+from tests.docker.traffic import traffic
+
+FIRST = WINDOW[0]
+
+
+def occupy(port: int, *, listen: bool) -> socket.socket:
+    """Hold a port of this host; one that is only bound is in no list of listening sockets."""
+    found = socket.socket()
+    found.bind(("0.0.0.0", port))
+    if listen:
+        found.listen()
+    return found
+
+
+@pytest.fixture
+def publisher(net: Inside, base_image: str) -> Callable[..., str]:
+    """Makes containers that publish a port and have nothing to do with ROS."""
+
+    def publish(port: int, verb: str = "run") -> str:
+        options = ("--publish", f"{port}:80")
+        return net.idle("bridge", image=base_image, labels=(), uri="", options=options,
+                        verb=verb).name  # fmt: skip
+
+    return publish
+
+
+def test_range_keeps_clear_of_all_others(
+    start_controller: Callable[..., Controller], net: Inside, publisher: Callable[..., str]
+) -> None:
+    """A container that was never started, one that runs, and a program that listens."""
+    publisher(FIRST + 1, "create")
+    publisher(FIRST + 5)
+    with closing(occupy(FIRST + 9, listen=True)):
+        start_controller("--ports", "4")
+        net.idle(net.network())
+
+        assert the_proxy().ports == range(FIRST + 10, FIRST + 14)
+
+
+def test_next_range_when_the_engine_says_taken(
+    start_controller: Callable[..., Controller], net: Inside
+) -> None:
+    with closing(occupy(FIRST + 1, listen=False)):
+        controller = start_controller("--ports", "4")
+        net.idle(net.network())
+
+        ports = the_proxy().ports
+
+    assert len(ports) == 4
+    assert FIRST + 1 not in ports
+    assert str(FIRST + 1) in controller.logs()
+
+
+def test_exhausted_window_is_told_with_numbers(
+    start_controller: Callable[..., Controller], net: Inside
+) -> None:
+    controller = start_controller("--port-window", f"{FIRST}-{FIRST + 7}")
+    node = net.idle(net.network(), labels=(ENABLE, "rosproxy.ports=9"))
+
+    wait_until(lambda: f"{FIRST}-{FIRST + 7}" in controller.logs(), 10, controller.logs)
+
+    text = controller.problems()
+    assert "9" in text
+    assert "--port-window" in text
+    assert node.state == "running"
+
+
+def test_range_grows_in_place(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    """A container that asks for more comes; nodes that are there keep their ports."""
+    start_controller()
+    network = net.network()
+    with traffic(net, named, network, "roscpp") as flow:
+        before, uri = the_proxy().ports, named.uri(flow.talker.node)
+        net.idle(network, labels=(ENABLE, "rosproxy.ports=12"))
+        changed = time.time()
+
+        wait_until(lambda: len(the_proxy().ports) == 12, 30, "the range has grown")
+
+        flow.wait(since=time.time())
+        print(f"range extended: {flow.gaps(changed)}")
+        assert the_proxy().ports[0] == before[0]
+        assert named.uri(flow.talker.node) == uri
+
+
+def test_range_taken_by_another_while_the_proxy_was_down(
+    start_controller: Callable[..., Controller],
+    net: Inside,
+    named: Robot,
+    publisher: Callable[..., str],
+) -> None:
+    """There is a way on, and somebody has to be told: nodes don't register again by themselves."""
+    controller = start_controller("--ports", "4")
+    node = net.node(net.network(), "roscpp", "pub", "--topic", "/out", "--word", "inside")
+    wait_until(lambda: named.knows_proxied(node.node), 30, controller.logs)
+    proxy = the_proxy()
+    before = proxy.ports
+    controller.kill()
+    docker("kill", proxy.name, proxy.sandbox)
+    publisher(before[1])
+
+    controller.start()
+
+    wait_until(lambda: before[1] not in the_proxy(40).ports, 40, controller.logs)
+    assert "HAS LEFT ITS PORTS" in controller.logs()
+    docker("restart", "--time", "0", node.name)
+    ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+    finally:
+        named.end("ear")

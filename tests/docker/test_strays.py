@@ -1,0 +1,85 @@
+"""Nodes that reach the real master before their proxy is there, and register around it.
+
+They are in a network whose name server knows the robot. Nobody outside could reach them then.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tests.docker.controller import Controller, proxies
+from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.inside import Container, Inside
+from tests.docker.name_server import name_server
+from tests.docker.nodes import LIBRARIES
+from tests.docker.robot import Robot
+
+
+@pytest.fixture
+def known(named: Robot) -> Iterator[tuple[str, ...]]:
+    """Options for containers that can resolve the robot's name."""
+    with name_server(named.host_address, {named.name: named.address}):
+        yield ("--dns", named.host_address)
+
+
+def is_stray(robot: Robot, node: Container) -> bool:
+    """Whether the master knows the node by its container's own name."""
+    hostname = inspect(node.name)["Config"]["Hostname"]
+    return robot.uri(node.node).startswith(f"http://{hostname}:")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_nodes_that_were_there_first_are_adopted(
+    library: str, start_controller: Callable[..., Controller], net: Inside, named: Robot,
+    known: tuple[str, ...],
+) -> None:  # fmt: skip
+    network = net.network()
+    node = net.node(network, library, "pub", "--topic", "/out", "--word", "inside", options=known)
+    server = net.node(network, library, "serve", "--service", "/ask", options=known)
+    listener = net.node(network, library, "sub", "--topic", "/in", options=known)
+    for one in (node, server, listener):
+        wait_until(lambda: is_stray(named, one), 30, one.log.read)  # noqa: B023
+    ear = named.node("ear", library, "sub", "--topic", "/out")
+    named.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
+    try:
+        wait_until(lambda: "ready" in ear.read(), 10, ear.read)
+        assert not ear.got()
+        began = time.time()
+
+        start_controller()
+
+        heard = ear.wait_for("inside") - began
+        print(f"{library}: heard {heard:.1f} s after the controller was started")
+        caller = named.node("caller", library, "call", "--service", "/ask", "--count", "3")
+        caller.wait_for("ask", verb="reply")
+        listener.log.wait_for("robot", since=time.time())
+        for one in (node, server, listener):
+            assert named.knows_proxied(one.node)
+            assert inspect(one.name)["RestartCount"] == 0
+            assert "shutdown" not in one.log.read()
+        docker("stop", node.name)
+        wait_until(lambda: not named.uri(node.node), 5, "it is gone from the master")
+    finally:
+        named.end("ear")
+        named.end("mouth")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_node_that_starts_faster_than_its_proxy(
+    library: str, start_controller: Callable[..., Controller], net: Inside, named: Robot,
+    known: tuple[str, ...],
+) -> None:  # fmt: skip
+    start_controller()
+    network = net.network()
+    ear = named.node("ear", library, "sub", "--topic", "/out")
+    try:
+        for word in ("first", "second", "third"):
+            began = time.time()
+            there = bool(proxies())
+            net.node(network, library, "pub", "--topic", "/out", "--word", word, options=known)
+            heard = ear.wait_for(word) - began
+            print(f"{library}: heard {heard:.1f} s after docker run, "
+                  f"{'with' if there else 'without'} a proxy")  # fmt: skip
+    finally:
+        named.end("ear")
