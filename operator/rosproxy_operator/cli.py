@@ -1,51 +1,23 @@
 """The command line ``rosproxy-controller``."""
 
-import contextlib
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import click
 
 from rosproxy import __version__
 from rosproxy.cli import Commands as ProxyCommands
-from rosproxy.cli import UsageError as ProxyUsageError
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
 
-class UsageError(click.ClickException):
-    """A mistake on the command line, told in one line."""
-
-    exit_code = 2
-
-    def show(self, file: Any = None) -> None:
-        """Print it."""
-        click.echo(f"rosproxy-controller: {self.format_message()}", file, err=True)
-
-
 class Commands(ProxyCommands):
-    """Commands whose usage errors are one line that begins with this program's name."""
+    """Commands whose usage errors begin with this program's name."""
 
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Parse the words before the command. Raises UsageError."""
-        with _by_our_name():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Parse the command's words and run it. Raises UsageError."""
-        with _by_our_name():
-            return super().invoke(ctx)
-
-
-@contextlib.contextmanager
-def _by_our_name() -> Iterator[None]:
-    try:
-        yield
-    except ProxyUsageError as error:
-        raise UsageError(error.message) from None
+    program = "rosproxy-controller"
 
 
 @click.group(
@@ -153,11 +125,11 @@ def docker(
     try:
         context.obj = parse_docker_settings(options)
     except SettingError as error:
-        raise UsageError(str(error)) from None
+        raise click.UsageError(str(error)) from None
     if context.invoked_subcommand is None:
         _run(context.obj, once)
     elif once:
-        raise UsageError(f"--once has no meaning for {context.invoked_subcommand}")
+        raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
 
 
 def _run(settings: Any, once: bool) -> None:
@@ -168,7 +140,7 @@ def _run(settings: Any, once: bool) -> None:
         try:
             run(settings)
         except SettingError as error:
-            raise UsageError(str(error)) from None
+            raise click.UsageError(str(error)) from None
         return
     problems = _or_exit(lambda: run_once(settings))
     for problem in problems:

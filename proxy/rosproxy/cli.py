@@ -29,33 +29,39 @@ class UsageError(click.ClickException):
 
     exit_code = 2
 
+    def __init__(self, message: str, program: str) -> None:
+        super().__init__(message)
+        self.program = program
+
     def show(self, file: Any = None) -> None:
         """Print it."""
-        click.echo(f"rosproxy: {self.format_message()}", file, err=True)
+        click.echo(f"{self.program}: {self.format_message()}", file, err=True)
 
 
 class Commands(click.Group):
-    """Commands whose usage errors are one line; click prints four."""
+    """Commands whose usage errors are one line, led by the program's name; click prints four."""
+
+    program = "rosproxy"
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Parse the words before the command. Raises UsageError."""
-        with _in_one_line():
+        with _in_one_line(self.program):
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Parse the command's words and run it. Raises UsageError."""
-        with _in_one_line():
+        with _in_one_line(self.program):
             return super().invoke(ctx)
 
 
 @contextlib.contextmanager
-def _in_one_line() -> Iterator[None]:
+def _in_one_line(program: str) -> Iterator[None]:
     try:
         yield
     except click.UsageError as error:
         if "\n" in error.format_message():  # the help, for want of a command
             raise
-        raise UsageError(error.format_message()) from None
+        raise UsageError(error.format_message(), program) from None
 
 
 @click.group(
