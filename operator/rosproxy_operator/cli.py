@@ -1,5 +1,6 @@
 """The command line ``rosproxy-controller``."""
 
+import importlib.util
 import logging
 import os
 import sys
@@ -119,6 +120,7 @@ def docker(
     from rosproxy.core.settings import SettingError
     from rosproxy_operator.settings import parse_docker_settings
 
+    _need("docker")
     logs.set_up(log_format, log_level)
     logging.getLogger("docker").setLevel(logging.INFO)  # the SDK tells of each request otherwise
     logging.getLogger("urllib3").setLevel(logging.INFO)
@@ -130,6 +132,17 @@ def docker(
         _run(context.obj, once)
     elif once:
         raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
+
+
+def _need(library: str) -> None:
+    """Say how to install a library that one kind of controller needs, if it is not there."""
+    if importlib.util.find_spec(library) is None:
+        click.echo(
+            f"rosproxy-controller: the Python package {library} is not installed here: "
+            f"pip install 'rosproxy[{library}]', or in rosproxy's sources: pip install '.[{library}]'",
+            err=True,
+        )
+        sys.exit(1)
 
 
 def _run(settings: Any, once: bool) -> None:

@@ -92,3 +92,11 @@ def test_health_of_a_controller_that_is_not_there() -> None:
     result = run("health", ROSPROXY_ADMIN_BIND="127.0.0.1:1")
     assert result.exit_code == 1
     assert result.stderr == "rosproxy-controller: no controller answers at http://127.0.0.1:1\n"
+
+
+def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    done = CliRunner().invoke(main, ["docker", "--once"])
+    assert done.exit_code == 1
+    assert "pip install 'rosproxy[docker]'" in done.stderr
+    assert "Traceback" not in done.output
