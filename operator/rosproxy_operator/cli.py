@@ -139,7 +139,7 @@ def _need(library: str) -> None:
     if importlib.util.find_spec(library) is None:
         click.echo(
             f"rosproxy-controller: the Python package {library} is not installed here: "
-            f"pip install 'rosproxy[{library}]', or in rosproxy's sources: pip install '.[{library}]'",
+            f"pip install 'rosproxy[{library}]' (in its sources: pip install '.[{library}]')",
             err=True,
         )
         sys.exit(1)
