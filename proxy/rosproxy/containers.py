@@ -23,6 +23,8 @@ GONE_TIMEOUT = 0.5
 """Seconds that a node has to answer at an address that is said to be gone."""
 YOUNG = 3.0
 """Seconds since its last registration in which a silent node gets a second chance."""
+SECOND_CHANCE = 1.0
+"""Seconds after which it gets it."""
 RETIRE_TIMEOUT = 3.0
 """Seconds that registrations under way get to end before a proxy retires."""
 
@@ -91,24 +93,29 @@ class Containers:
     async def _bury(self, addresses: Sequence[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
         found = containers.at(self._context.registry, addresses)
+        return await self._bury_all(found, self._context.now() - YOUNG)
+
+    async def _bury_all(self, found: Sequence[Endpoint], since: float) -> int:
+        """Unregister those that don't answer; who is silent and registered ``since``, later."""
         probe = self._parts.nodes.probe
         answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in found))
         outcomes = {e: answer.probe for e, answer in zip(found, answers, strict=True)}
-        dead = containers.dead(outcomes, self._context.now() - YOUNG)
+        dead = containers.dead(outcomes, since)
         for endpoint in dead:
             self._close(endpoint)
         for endpoint in set(found) - set(dead):
             endpoint.health.checked = None  # another process may have the address by now
-        spared = {e.place.address for e in set(found) - set(dead) if outcomes[e] is Probe.SILENT}
+        spared = [e for e in found if e not in dead and outcomes[e] is Probe.SILENT]
         if spared:
-            self._context.tasks.spawn(self._bury_later(list(spared)), f"nodes at {spared}")
+            self._context.tasks.spawn(self._bury_later(spared), "second chance of silent nodes")
         return await self._unregister(e for e in dead if not e.health.cleaned)
 
-    async def _bury_later(self, addresses: Sequence[str]) -> None:
+    async def _bury_later(self, spared: Sequence[Endpoint]) -> None:
         """Look again at silent nodes that were spared; upkeep unregisters what can't be now."""
-        await asyncio.sleep(YOUNG)
+        await asyncio.sleep(SECOND_CHANCE)
         async with self._one_at_a_time:
-            await _tried(self._bury(addresses), [])
+            there = [e for e in spared if self._context.registry.by_port.get(e.port) is e]
+            await _tried(self._bury_all(there, float("inf")), [])
 
     def _close(self, endpoint: Endpoint) -> None:
         """Let a port refuse whose node has ended, and end what is still connected to it."""

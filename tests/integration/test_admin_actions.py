@@ -186,7 +186,7 @@ async def test_a_node_that_has_just_registered_may_take_its_time(
     make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A restarted container has its address again before the news that it was gone."""
-    monkeypatch.setattr("rosproxy.containers.YOUNG", 0.6)
+    monkeypatch.setattr("rosproxy.containers.SECOND_CHANCE", 0.6)
     proxy = await make_proxy(**PATIENT)
     await node.publish(proxy.master)
     node.hang = True

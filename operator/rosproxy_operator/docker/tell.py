@@ -77,12 +77,26 @@ class Places:
             before = self._at.get(place, address)
             if before != address:
                 self._moves[before] = address, now
+        self._follow(known, now)
         self._at |= known.addresses
         self._moves = {
             old: (new, since)
             for old, (new, since) in self._moves.items()
             if now < since + MOVING and old not in taken
         }
+
+    def _follow(self, known: Facts, now: float) -> None:
+        """Let nodes of a network that their container has left be found on one that it is on."""
+        for container, network in list(self._absent):
+            elsewhere = [
+                ((container, other) in self._at, address)
+                for (found, other), address in known.addresses.items()
+                if found == container
+            ]
+            if elsewhere:
+                left = self._at.pop((container, network))
+                self._moves[left] = min(elsewhere)[1], now
+                del self._absent[container, network]
 
     @property
     def held(self) -> frozenset[str]:

@@ -171,3 +171,24 @@ def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> Non
     other = Container("o", "other", "running", attachments=(at(OLD),))
     found = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
     assert found.moved({OLD}) == {}
+
+
+def test_container_that_changes_networks_takes_its_nodes_along() -> None:
+    before = Facts(addresses={("t", "app"): "172.18.0.5"}, running=frozenset("t"))
+    between = Facts(running=frozenset("t"))
+    after = Facts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
+
+    found = places((0.0, before), (0.1, between), (1.0, after))
+
+    assert found.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+    assert found.held == {"172.18.0.5"}
+    found.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
+    assert found.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
+
+
+def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> None:
+    app, other = ("t", "app"), ("t", "other")
+    both = Facts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
+    one = replace(both, addresses={other: "172.19.0.9"})
+
+    assert places((0.0, both), (0.1, one)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
