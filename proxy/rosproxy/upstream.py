@@ -71,7 +71,8 @@ class Upstream:
             {LOOP_HEADER: instance},
         )
         self._nodes = _session(
-            aiohttp.TCPConnector(limit=0, force_close=True), {LOOP_HEADER: f"{instance} node"}
+            aiohttp.TCPConnector(resolver=Resolver(), limit=0, force_close=True),
+            {LOOP_HEADER: f"{instance} node"},
         )
 
     async def close(self) -> None:

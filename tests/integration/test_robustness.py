@@ -1,7 +1,9 @@
 """Hostile and clumsy HTTP and XML-RPC, the same on the master port and on a node's port."""
 
 import gzip
+import socket
 import struct
+import threading
 import xmlrpc.client
 from dataclasses import dataclass
 from itertools import product
@@ -10,6 +12,8 @@ from typing import Any
 import pytest
 
 from rosproxy.core.methods import MASTER_METHODS
+from rosproxy.core.uris import HostPort
+from rosproxy.upstream import Unreachable
 from tests.integration.net import HOST, NODE, Where, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
@@ -353,3 +357,14 @@ async def test_length_bytes_of_a_tcpros_header_are_no_http(proxy):
     async with connect(proxy.master) as wire:
         await wire.send(struct.pack("<I", 20) + b"\0" * 20)
         assert (await wire.reply()).status == 400
+
+
+async def test_a_name_server_that_hangs_does_not_hold_up_a_call_to_a_node(proxy, monkeypatch):
+    """aiohttp's own resolver would wait for it, and leave its failure to nobody."""
+    answer = threading.Event()
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_more: answer.wait(20) and [])
+    try:
+        with pytest.raises(Unreachable, match="can't be resolved"):
+            await proxy.app.context.upstream.node(HostPort("nowhere.invalid", 1), b"", within=10)
+    finally:
+        answer.set()
