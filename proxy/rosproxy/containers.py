@@ -78,7 +78,7 @@ class Containers:
             await self._parts.recovered()
             await self._none_under_way()
             endpoints = list(self._context.registry)
-            count = await self._unregister(endpoints)
+            count = await self._unregister(e for e in endpoints if not e.health.cleaned)
             for endpoint in endpoints:
                 self._parts.cut(endpoint.port)
                 self._parts.leases.end(endpoint)

@@ -32,9 +32,9 @@ def test_twenty_containers_at_once(
               f"the last after {max(heard) - started:.1f} s")  # fmt: skip
         assert len({named.uri(node.node) for node in nodes}) == COUNT
         assert all(named.knows_proxied(node.node) for node in nodes)
+        assert len(the_proxy().ports) == COUNT + 4
         docker("kill", *(node.name for node in nodes))
         gone = wait_until(lambda: not any(named.uri(node.node) for node in nodes), 20, "all gone")
         print(f"{COUNT} containers killed: unregistered after {gone:.1f} s")
-        assert len(the_proxy().ports) == COUNT + 4
     finally:
         named.end("ear")

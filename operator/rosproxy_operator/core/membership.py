@@ -17,12 +17,20 @@ def networks(
     Raises Unusable if it has none, or not that one.
     """
     owner = _owner(container, observed)
-    own = owner.networks - BUILT_IN - {uplink}
+    own = (owner.networks or _soon(owner, observed)) - BUILT_IN - {uplink}
     if label is not None:
         return frozenset({_named(label, container, own)})
     if not own:
         raise Unusable(_why_none(owner))
     return own
+
+
+def _soon(container: Container, observed: Observed) -> frozenset[str]:
+    """The network of a container that the engine is just creating, and lists without any."""
+    if container.state != "created":
+        return frozenset()
+    mode = container.network_mode
+    return frozenset(one.name for one in observed.networks if mode in (one.name, one.id))
 
 
 def _named(label: str, container: Container, own: frozenset[str]) -> str:

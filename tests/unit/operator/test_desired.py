@@ -235,3 +235,12 @@ def test_two_masters_on_one_host() -> None:
     assert given[KEY, "app"] == {"rosproxy", "robot", NAME}
     assert given[second, "app"] == {proxy_name(second)}
     assert told == ["b"]
+
+
+@pytest.mark.parametrize("mode", [APP.name, APP.id])
+def test_container_that_is_just_being_created_has_its_network_soon(mode: str) -> None:
+    """The engine lists it without any for a moment; that was told as an error."""
+    seen = observed(container(networks=(), state="created", mode=mode))
+    wishes, problems = read_wishes(seen, SETTINGS)
+    assert [wish.networks for wish in wishes] == [{APP.name}]
+    assert not problems
