@@ -11,6 +11,7 @@ import click
 
 from rosproxy import __version__
 from rosproxy.cli import Commands as ProxyCommands
+from rosproxy.cli import log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
@@ -92,15 +93,7 @@ def main() -> None:
     metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz and /metrics are served.",
 )
-@click.option(
-    "--log-format", type=click.Choice(["text", "json"]), default="text", help="Log format."
-)
-@click.option(
-    "--log-level",
-    type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
-    default="info",
-    help="Least severe messages to log.",
-)
+@log_options
 @click.option(
     "--once",
     is_flag=True,

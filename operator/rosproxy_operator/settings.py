@@ -5,8 +5,14 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any
 
-from rosproxy.core.settings import SettingError, parse_range
-from rosproxy.core.uris import HostPort, is_loopback, parse_host_port, parse_slave_uri
+from rosproxy.core.settings import (
+    SettingError,
+    parse_admin,
+    parse_host,
+    parse_range,
+    parse_seconds,
+)
+from rosproxy.core.uris import HostPort, is_loopback, parse_slave_uri
 from rosproxy_operator.core.settings import MOST_PORTS, PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
@@ -31,15 +37,16 @@ def parse_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
 
     Raises SettingError for the first value that can't be used.
     """
+    host = options.get("advertise_host")
     plan = PlanSettings(
         master_uri=_master(options.get("master_uri") or ""),
-        advertise_host=_host(options.get("advertise_host") or ""),
+        advertise_host=parse_host("--advertise-host", host) if host else "",
         ports=_ports(options["ports"]),
         window=parse_range("--port-window", options["port_window"]),
         publish=tuple(map(_publish, options["publish_address"] or ("0.0.0.0",))),
         image=_image(options["proxy_image"]),
         expose_by_default=options["expose_by_default"],
-        grace=_seconds("--grace", options["grace"], 0.0),
+        grace=parse_seconds("--grace", options["grace"], 0.0),
         uplink=_uplink(options["uplink"]),
     )
     if len(plan.window) < plan.ports:
@@ -48,8 +55,8 @@ def parse_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
         )
     return DockerSettings(
         plan=plan,
-        resync=_seconds("--resync", options["resync"], 1.0),
-        admin=_admin(options["admin_bind"]),
+        resync=parse_seconds("--resync", options["resync"], 1.0),
+        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
     )
 
 
@@ -64,14 +71,6 @@ def _master(uri: str) -> str:
             "master's host, or http://host.docker.internal:PORT for this one",
         )
     return uri
-
-
-def _host(text: str) -> str:
-    bare = text.strip("[]")
-    whole = f"[{bare}]:1" if ":" in bare else f"{bare}:1"
-    if text and parse_host_port(whole) != HostPort(bare, 1):
-        raise SettingError("--advertise-host", f"{text!r} is neither a host name nor an address")
-    return bare
 
 
 def _ports(count: int) -> int:
@@ -97,16 +96,3 @@ def _uplink(text: str) -> str:
     if not text or not text[0].isalnum() or any(c not in _NAME for c in text):
         raise SettingError("--uplink", f"{text!r} is not a network's name")
     return text
-
-
-def _admin(text: str) -> HostPort:
-    where = parse_host_port(text)
-    if where is None:
-        raise SettingError("--admin-bind", f"{text!r} is not of the form 127.0.0.1:11313")
-    return where
-
-
-def _seconds(option: str, value: float, low: float) -> float:
-    if not low <= value <= 86400:
-        raise SettingError(option, f"{value:g} s is not between {low:g} and 86400 s")
-    return float(value)

@@ -64,6 +64,20 @@ def _in_one_line(program: str) -> Iterator[None]:
         raise UsageError(error.format_message(), program) from None
 
 
+def log_options(command: Command) -> Command:
+    """The options ``--log-format`` and ``--log-level``."""
+    form = click.option(
+        "--log-format", type=click.Choice(["text", "json"]), default="text", help="Log format."
+    )
+    level = click.option(
+        "--log-level",
+        type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
+        default="info",
+        help="Least severe messages to log.",
+    )
+    return form(level(command))
+
+
 @click.group(
     cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
@@ -161,15 +175,7 @@ def main() -> None:
     default="any",
     help="Who may call shutdown, publisherUpdate and paramUpdate at inside nodes.",
 )
-@click.option(
-    "--log-format", type=click.Choice(["text", "json"]), default="text", help="Log format."
-)
-@click.option(
-    "--log-level",
-    type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
-    default="info",
-    help="Least severe messages to log.",
-)
+@log_options
 @click.option("--check", is_flag=True, help="Validate the options and exit.")
 def run(check: bool, log_format: str, log_level: str, **options: Any) -> None:
     """Run the proxy.

@@ -69,7 +69,7 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
         master_port=_port("--master-port", options["master_port"]),
         publish_master=_optional_port("--publish-master", options.get("publish_master")),
         bind=_bind(options["bind"]),
-        admin=_admin(options["admin_bind"]),
+        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
         inside_networks=tuple(_network(text) for text in options.get("inside_network") or ()),
         slave_control=options["slave_control"],
         master_address=_master_address(options.get("master_address")),
@@ -139,9 +139,14 @@ def _advertise_host(host: str | None) -> str:
             "missing; give the name or address under which outside nodes reach this host "
             "(ROSPROXY_ADVERTISE_HOST)",
         )
-    bare = host.strip("[]")
+    return parse_host("--advertise-host", host)
+
+
+def parse_host(option: str, text: str) -> str:
+    """Parse a host name or address, without brackets. Raises SettingError that names ``option``."""
+    bare = text.strip("[]")
     if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
-        raise SettingError("--advertise-host", f"{host!r} is neither a host name nor an address")
+        raise SettingError(option, f"{text!r} is neither a host name nor an address")
     return bare
 
 
@@ -162,10 +167,11 @@ def _bind(address: str) -> str:
         raise SettingError("--bind", f"{address!r} is not an IP address of this host") from None
 
 
-def _admin(text: str) -> HostPort:
+def parse_admin(text: str, default: HostPort) -> HostPort:
+    """Parse ``--admin-bind``; ``default`` serves as the example. Raises SettingError."""
     where = parse_host_port(text)
     if where is None:
-        raise SettingError("--admin-bind", f"{text!r} is not of the form 127.0.0.1:11312")
+        raise SettingError("--admin-bind", f"{text!r} is not of the form {default}")
     return where
 
 
@@ -177,8 +183,12 @@ def _network(text: str) -> Network:
 
 
 def _seconds(name: str, value: float) -> float:
-    option = "--" + name.replace("_", "-")
     low = 0.0 if name in _MAY_BE_ZERO else 0.05
+    return parse_seconds("--" + name.replace("_", "-"), value, low)
+
+
+def parse_seconds(option: str, value: float, low: float) -> float:
+    """Check a time between ``low`` and a day. Raises SettingError that names ``option``."""
     if not low <= value <= 86400:
         raise SettingError(option, f"{value:g} s is not between {low:g} and 86400 s")
     return float(value)
