@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterable
 
-from rosproxy_operator.core.model import Problem
+from rosproxy_operator.core.problem import Problem
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from rosproxy.core.settings import (
     parse_seconds,
 )
 from rosproxy.core.uris import HostPort, is_loopback, parse_slave_uri
-from rosproxy_operator.core.settings import MOST_PORTS, PlanSettings
+from rosproxy_operator.core.docker.settings import MOST_PORTS, PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 _NAME = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-"

@@ -79,7 +79,7 @@ def test_scripts_can_be_run() -> None:
 
 def test_docker_page_names_every_option_label_and_metric() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.core.values import LABELS
+    from rosproxy_operator.core.docker.values import LABELS
     from rosproxy_operator.metrics import Metrics
 
     text = (ROOT / "docs/docker.md").read_text()

@@ -10,7 +10,7 @@ import secrets
 from collections.abc import Iterator
 
 from rosproxy.core.uris import HostPort
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Create,
@@ -24,14 +24,14 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.fingerprint import (
+from rosproxy_operator.core.docker.fingerprint import (
     MANAGED,
     container_config,
     master,
     read_own,
     sandbox_config,
 )
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.docker.engine import Engine, Json
 from rosproxy_operator.docker.errors import Conflict, EngineError, Gone
 from rosproxy_operator.docker.observe import Look, Way

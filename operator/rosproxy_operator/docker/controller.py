@@ -7,11 +7,15 @@ import re
 import time
 
 from rosproxy.tasks import Tasks
-from rosproxy_operator.core.actions import Action, Create
-from rosproxy_operator.core.fingerprint import master, proxy_name
-from rosproxy_operator.core.memory import Memory
-from rosproxy_operator.core.model import Problem, Proxy, Sandbox
-from rosproxy_operator.core.plan import Group, Plan, plan
+from rosproxy_operator.core.docker.actions import Action, Create
+from rosproxy_operator.core.docker.fingerprint import master, proxy_name
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import (
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.core.docker.plan import Group, Plan, plan
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.apply import Applier
 from rosproxy_operator.docker.details import Inspector
 from rosproxy_operator.docker.engine import Engine

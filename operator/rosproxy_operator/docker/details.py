@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosproxy_operator.core.fingerprint import TOKEN_VARIABLE
+from rosproxy_operator.core.docker.fingerprint import TOKEN_VARIABLE
 from rosproxy_operator.docker.engine import Engine, Json
 from rosproxy_operator.docker.errors import EngineError, Gone
 from rosproxy_operator.threads import in_thread

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Network, ip_network
 
 from rosproxy_operator import host
-from rosproxy_operator.core.fingerprint import ROLE_SANDBOX, admin_port, read_own
-from rosproxy_operator.core.model import (
+from rosproxy_operator.core.docker.fingerprint import ROLE_SANDBOX, admin_port, read_own
+from rosproxy_operator.core.docker.model import (
     Attachment,
     Container,
     Host,
@@ -16,7 +16,7 @@ from rosproxy_operator.core.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.docker.details import PATIENCE, Details, Inspector
 from rosproxy_operator.docker.engine import Engine, Json
 from rosproxy_operator.threads import in_thread

@@ -8,9 +8,9 @@ import time
 
 from rosproxy import __version__
 from rosproxy.console import WATCH_INTERVAL, draw, size, write
-from rosproxy_operator.core.model import Problem
-from rosproxy_operator.core.report import plan_text, render
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.report import plan_text, render
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.controller import Controller
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.status import Survey, describe, survey

@@ -4,9 +4,13 @@ from dataclasses import replace
 
 from rosproxy.core.uris import is_address, parse_slave_uri
 from rosproxy_operator import host
-from rosproxy_operator.core.labels import masters as master_uris
-from rosproxy_operator.core.model import STARTED, Observed, Problem
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.labels import masters as master_uris
+from rosproxy_operator.core.docker.model import (
+    STARTED,
+    Observed,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.details import PATIENCE
 from rosproxy_operator.docker.observe import Look, Observer
 from rosproxy_operator.masters import THIS_HOST, Masters

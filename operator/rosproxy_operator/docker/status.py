@@ -8,13 +8,19 @@ from typing import Any, TypeVar
 
 from rosproxy import __version__
 from rosproxy.core.uris import HostPort, parse_host_port
-from rosproxy_operator.core.actions import Action
-from rosproxy_operator.core.fingerprint import proxy_name, sandbox_name
-from rosproxy_operator.core.memory import Memory
-from rosproxy_operator.core.model import Container, Key, Problem, Proxy, Sandbox
-from rosproxy_operator.core.plan import Plan, plan
-from rosproxy_operator.core.report import line
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.actions import Action
+from rosproxy_operator.core.docker.fingerprint import proxy_name, sandbox_name
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import (
+    Container,
+    Key,
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.core.docker.plan import Plan, plan
+from rosproxy_operator.core.docker.report import line
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.details import Inspector
 from rosproxy_operator.docker.engine import Engine
 from rosproxy_operator.docker.observe import Look, Observer
@@ -68,7 +74,7 @@ async def survey(settings: PlanSettings) -> Survey:
 
 
 def describe(found: Survey, settings: PlanSettings) -> Json:
-    """A survey as JSON: what `rosproxy_operator.core.report.render` shows."""
+    """A survey as JSON: what `rosproxy_operator.core.docker.report.render` shows."""
     observed = found.look.observed
     keys = {wish.id: wish.key for wish in found.plan.wishes if wish.key in observed.keys}
     listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]

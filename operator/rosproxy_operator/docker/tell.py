@@ -7,8 +7,8 @@ from ipaddress import IPv4Network, ip_address
 from typing import Any
 
 from rosproxy.core.uris import is_address, parse_host_port
-from rosproxy_operator.core.fingerprint import master
-from rosproxy_operator.core.model import STARTED, Container, Proxy, Wish
+from rosproxy_operator.core.docker.fingerprint import master
+from rosproxy_operator.core.docker.model import STARTED, Container, Proxy, Wish
 from rosproxy_operator.docker.observe import Look, sandbox_of
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)

@@ -9,8 +9,12 @@ from typing import Any
 
 from rosproxy.core.uris import HostPort
 from rosproxy.tasks import Tasks
-from rosproxy_operator.core.fingerprint import master
-from rosproxy_operator.core.model import Problem, Proxy, Wish
+from rosproxy_operator.core.docker.fingerprint import master
+from rosproxy_operator.core.docker.model import (
+    Proxy,
+    Wish,
+)
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.observe import Look, Way
 from rosproxy_operator.docker.tell import AGAIN, Arrival, Facts, Places, facts, gone, node_addresses
 from rosproxy_operator.masters import Masters

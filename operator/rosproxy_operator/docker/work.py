@@ -11,15 +11,18 @@ from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 
 from rosproxy.tasks import Tasks
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Disconnect,
 )
-from rosproxy_operator.core.fingerprint import proxy_name
-from rosproxy_operator.core.model import Key, Problem
-from rosproxy_operator.core.plan import Group
-from rosproxy_operator.core.report import line
+from rosproxy_operator.core.docker.fingerprint import proxy_name
+from rosproxy_operator.core.docker.model import (
+    Key,
+)
+from rosproxy_operator.core.docker.plan import Group
+from rosproxy_operator.core.docker.report import line
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.docker.errors import EngineError, PortTaken
 
 log = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from rosproxy_operator.core.model import Problem
+from rosproxy_operator.core.problem import Problem
 from rosproxy_operator.problems import ProblemLog
 
 FATAL = Problem("container talker", "no master is known")

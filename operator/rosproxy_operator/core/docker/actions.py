@@ -6,7 +6,7 @@ Containers are named, not numbered: a plan may start what it has yet to create.
 from dataclasses import dataclass
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.model import Key
+from rosproxy_operator.core.docker.model import Key
 
 
 @dataclass(frozen=True, slots=True)

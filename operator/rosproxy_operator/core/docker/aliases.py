@@ -9,9 +9,15 @@ from dataclasses import dataclass
 
 from rosproxy.core.text import listed
 from rosproxy.core.uris import is_address
-from rosproxy_operator.core.fingerprint import master, proxy_name
-from rosproxy_operator.core.masters import ALIAS
-from rosproxy_operator.core.model import Container, Desired, Key, Observed, Problem
+from rosproxy_operator.core.docker.fingerprint import master, proxy_name
+from rosproxy_operator.core.docker.masters import ALIAS
+from rosproxy_operator.core.docker.model import (
+    Container,
+    Desired,
+    Key,
+    Observed,
+)
+from rosproxy_operator.core.problem import Problem
 
 Aliases = Mapping[tuple[Key, str], tuple[str, ...]]
 """For a key and a network, the names of the key's proxy there."""

@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.actions import Action, Remove, Rename
-from rosproxy_operator.core.aliases import Aliases
-from rosproxy_operator.core.model import Container, Desired, Key, Observed, Proxy, Sandbox
-from rosproxy_operator.core.settings import PlanSettings
-from rosproxy_operator.core.succession import free_name
+from rosproxy_operator.core.docker.actions import Action, Remove, Rename
+from rosproxy_operator.core.docker.aliases import Aliases
+from rosproxy_operator.core.docker.model import Container, Desired, Key, Observed, Proxy, Sandbox
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.docker.succession import free_name
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,17 @@
 
 from collections.abc import Collection, Iterable
 
-from rosproxy_operator.core.membership import BUILT_IN
-from rosproxy_operator.core.memory import Memory
-from rosproxy_operator.core.model import Desired, Key, Network, Observed, Problem, Wish
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.membership import BUILT_IN
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import (
+    Desired,
+    Key,
+    Network,
+    Observed,
+    Wish,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 
 
 def desire(

@@ -10,9 +10,9 @@ from typing import Any
 from rosproxy.core.ports import PortRange
 from rosproxy.core.settings import SettingError, parse_range
 from rosproxy.core.uris import HostPort, parse_slave_uri
-from rosproxy_operator.core.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.core.model import Key
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.core.docker.model import Key
+from rosproxy_operator.core.docker.settings import PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"

@@ -5,13 +5,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rosproxy.core.text import listed
-from rosproxy_operator.core import values
-from rosproxy_operator.core.fingerprint import MANAGED, master
-from rosproxy_operator.core.masters import looks_for, master_uri
-from rosproxy_operator.core.membership import networks
-from rosproxy_operator.core.model import ALIVE, Container, Key, Observed, Problem, Wish
-from rosproxy_operator.core.settings import PlanSettings
-from rosproxy_operator.core.values import ADVERTISE_HOST, ENABLE, LABELS, PORTS, Unusable
+from rosproxy_operator.core.docker import values
+from rosproxy_operator.core.docker.fingerprint import MANAGED, master
+from rosproxy_operator.core.docker.masters import looks_for, master_uri
+from rosproxy_operator.core.docker.membership import networks
+from rosproxy_operator.core.docker.model import (
+    ALIVE,
+    Container,
+    Key,
+    Observed,
+    Wish,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.docker.values import ADVERTISE_HOST, ENABLE, LABELS, PORTS, Unusable
+from rosproxy_operator.core.problem import Problem
 
 _PREFIX = "rosproxy"
 _COUNTED = ALIVE | {"exited"}

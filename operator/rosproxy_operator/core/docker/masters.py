@@ -5,10 +5,10 @@ from collections.abc import Collection
 from urllib.parse import urlsplit
 
 from rosproxy.core.uris import HostPort, is_address, is_loopback, parse_slave_uri, slave_uri
-from rosproxy_operator.core.fingerprint import is_proxy_name, master, proxy_name
-from rosproxy_operator.core.model import Container, Key
-from rosproxy_operator.core.settings import PlanSettings
-from rosproxy_operator.core.values import MASTER_URI, Unusable, quoted
+from rosproxy_operator.core.docker.fingerprint import is_proxy_name, master, proxy_name
+from rosproxy_operator.core.docker.model import Container, Key
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.docker.values import MASTER_URI, Unusable, quoted
 
 ALIAS = "rosproxy"
 """The name under which every proxy is found on the networks of its containers."""

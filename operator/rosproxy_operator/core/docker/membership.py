@@ -1,7 +1,7 @@
 """On which networks a container meets its proxy."""
 
-from rosproxy_operator.core.model import Container, Observed
-from rosproxy_operator.core.values import NETWORK, Unusable, quoted
+from rosproxy_operator.core.docker.model import Container, Observed
+from rosproxy_operator.core.docker.values import NETWORK, Unusable, quoted
 
 BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.model import Desired, Key, Observed, Wish
+from rosproxy_operator.core.docker.model import Desired, Key, Observed, Wish
 from rosproxy_operator.core.ports import within
 
 

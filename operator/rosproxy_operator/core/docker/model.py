@@ -148,19 +148,6 @@ class Observed:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
-    """Something that keeps an object from what its user wants; the text says what to do.
-
-    ``subject`` names the object: ``container talker``, ``network app``, ``proxy rosproxy-…``.
-    With ``fatal`` the object is left out; otherwise the problem is a warning.
-    """
-
-    subject: str
-    text: str
-    fatal: bool = True
-
-
-@dataclass(frozen=True, slots=True)
 class Wish:
     """What a labelled container wants, its labels and settings put together.
 

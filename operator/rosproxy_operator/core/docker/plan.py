@@ -3,25 +3,31 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from rosproxy_operator.core.actions import Action, Connect, CreateNetwork, CreateSandbox, Remove
-from rosproxy_operator.core.aliases import Aliases, assign
-from rosproxy_operator.core.case import Case
-from rosproxy_operator.core.desired import desire
-from rosproxy_operator.core.labels import read_wishes
-from rosproxy_operator.core.memory import Memory, looked, noticed
-from rosproxy_operator.core.model import (
+from rosproxy_operator.core.docker.actions import (
+    Action,
+    Connect,
+    CreateNetwork,
+    CreateSandbox,
+    Remove,
+)
+from rosproxy_operator.core.docker.aliases import Aliases, assign
+from rosproxy_operator.core.docker.case import Case
+from rosproxy_operator.core.docker.desired import desire
+from rosproxy_operator.core.docker.labels import read_wishes
+from rosproxy_operator.core.docker.memory import Memory, looked, noticed
+from rosproxy_operator.core.docker.model import (
     Desired,
     Key,
     Observed,
-    Problem,
     Proxy,
     Sandbox,
     Wish,
 )
-from rosproxy_operator.core.processes import process_steps, retired
-from rosproxy_operator.core.ranges import Ranges, allocate, refused
-from rosproxy_operator.core.sandboxes import leave, sandbox_steps
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.processes import process_steps, retired
+from rosproxy_operator.core.docker.ranges import Ranges, allocate, refused
+from rosproxy_operator.core.docker.sandboxes import leave, sandbox_steps
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator
 
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Create,
     ProxySpec,
@@ -12,12 +12,12 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.case import Case, former_name, lives_in, named, removed
-from rosproxy_operator.core.fingerprint import fingerprint, proxy_name
-from rosproxy_operator.core.memory import SERVING
-from rosproxy_operator.core.model import STARTED, Container, Proxy, Sandbox
-from rosproxy_operator.core.sandboxes import Home
-from rosproxy_operator.core.succession import Succession, free_name, succession
+from rosproxy_operator.core.docker.case import Case, former_name, lives_in, named, removed
+from rosproxy_operator.core.docker.fingerprint import fingerprint, proxy_name
+from rosproxy_operator.core.docker.memory import SERVING
+from rosproxy_operator.core.docker.model import STARTED, Container, Proxy, Sandbox
+from rosproxy_operator.core.docker.sandboxes import Home
+from rosproxy_operator.core.docker.succession import Succession, free_name, succession
 
 
 def process_steps(case: Case, home: Home, gone: Collection[str]) -> tuple[Action, ...] | None:

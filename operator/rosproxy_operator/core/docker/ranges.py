@@ -4,11 +4,18 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.fingerprint import proxy_name, reserved_ports
-from rosproxy_operator.core.memory import SERVING, Memory, Move, Refusal
-from rosproxy_operator.core.model import STARTED, Desired, Key, Observed, Problem, Sandbox
+from rosproxy_operator.core.docker.fingerprint import proxy_name, reserved_ports
+from rosproxy_operator.core.docker.memory import SERVING, Memory, Move, Refusal
+from rosproxy_operator.core.docker.model import (
+    STARTED,
+    Desired,
+    Key,
+    Observed,
+    Sandbox,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.core.ports import PortsExhausted, extended, is_free, negotiate, within
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
 
 RETRY_FOR = 20.0
 """Seconds for which a proxy that has served is tried again on its ports before it leaves them."""

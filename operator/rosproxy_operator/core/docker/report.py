@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from rosproxy.core.text import besides_first, clean, plural, shorten, table, wrap
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Create,

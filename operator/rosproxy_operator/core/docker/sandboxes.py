@@ -10,7 +10,7 @@ them in any order, and may lay the published ports over one and then move them t
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     CreateSandbox,
@@ -21,12 +21,12 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.aliases import holds, needed_by
-from rosproxy_operator.core.case import Case, former_name, inhabitants, named, removed
-from rosproxy_operator.core.fingerprint import sandbox_fingerprint, sandbox_name
-from rosproxy_operator.core.memory import SERVING
-from rosproxy_operator.core.model import Attachment, Container, Desired, Observed
-from rosproxy_operator.core.succession import Succession, free_name, succession
+from rosproxy_operator.core.docker.aliases import holds, needed_by
+from rosproxy_operator.core.docker.case import Case, former_name, inhabitants, named, removed
+from rosproxy_operator.core.docker.fingerprint import sandbox_fingerprint, sandbox_name
+from rosproxy_operator.core.docker.memory import SERVING
+from rosproxy_operator.core.docker.model import Attachment, Container, Desired, Observed
+from rosproxy_operator.core.docker.succession import Succession, free_name, succession
 
 _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 

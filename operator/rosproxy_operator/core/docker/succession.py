@@ -7,8 +7,8 @@ controller was killed in between, or when somebody has meddled.
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
-from rosproxy_operator.core.memory import SERVING
-from rosproxy_operator.core.model import Container
+from rosproxy_operator.core.docker.memory import SERVING
+from rosproxy_operator.core.docker.model import Container
 
 IDLE = frozenset({"created", "exited"})
 """States of a container that can be started; a dead one can't."""

@@ -3,7 +3,7 @@
 import re
 
 from rosproxy.core.uris import is_address, is_loopback
-from rosproxy_operator.core.settings import MOST_PORTS
+from rosproxy_operator.core.docker.settings import MOST_PORTS
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.core.fingerprint import (
+from rosproxy_operator.core.docker.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.core.docker.fingerprint import (
     fingerprint,
     master,
     own_labels,
@@ -14,7 +14,7 @@ from rosproxy_operator.core.fingerprint import (
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.model import (
+from rosproxy_operator.core.docker.model import (
     Attachment,
     Container,
     Host,
@@ -24,7 +24,7 @@ from rosproxy_operator.core.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.settings import PlanSettings
 
 ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.actions import Action, CreateSandbox, Start
-from rosproxy_operator.core.fingerprint import (
+from rosproxy_operator.core.docker.actions import Action, CreateSandbox, Start
+from rosproxy_operator.core.docker.fingerprint import (
     ROLE_PROXY,
     ROLE_SANDBOX,
     Own,
@@ -19,13 +19,13 @@ from rosproxy_operator.core.fingerprint import (
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.labels import read_wishes
-from rosproxy_operator.core.memory import Memory
-from rosproxy_operator.core.model import STARTED, Key, Wish
-from rosproxy_operator.core.plan import Plan
+from rosproxy_operator.core.docker.labels import read_wishes
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import STARTED, Key, Wish
+from rosproxy_operator.core.docker.plan import Plan
+from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.core.ports import overlap
-from rosproxy_operator.core.settings import PlanSettings
-from tests.unit.operator.simulation import SERVING, Box, Controller, Engine, Failed, Refused
+from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engine, Failed, Refused
 
 HERE = "192.0.2.10"
 ROBOT = Key("http://robot:11311", HERE)

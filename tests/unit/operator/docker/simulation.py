@@ -5,7 +5,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Create,
@@ -18,9 +18,15 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.fingerprint import ROLE_PROXY, ROLE_SANDBOX, Own, own_labels, read_own
-from rosproxy_operator.core.memory import Memory
-from rosproxy_operator.core.model import (
+from rosproxy_operator.core.docker.fingerprint import (
+    ROLE_PROXY,
+    ROLE_SANDBOX,
+    Own,
+    own_labels,
+    read_own,
+)
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import (
     STARTED,
     Attachment,
     Container,
@@ -30,8 +36,8 @@ from rosproxy_operator.core.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.core.plan import Plan, plan
-from rosproxy_operator.core.settings import PlanSettings
+from rosproxy_operator.core.docker.plan import Plan, plan
+from rosproxy_operator.core.docker.settings import PlanSettings
 
 SERVING = {"running", "paused", "restarting"}
 

@@ -5,14 +5,21 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.core.aliases import assign
-from rosproxy_operator.core.desired import desire
-from rosproxy_operator.core.fingerprint import proxy_name
-from rosproxy_operator.core.labels import read_wishes
-from rosproxy_operator.core.memory import Memory, noticed
-from rosproxy_operator.core.model import Container, Desired, Key, Network, Observed, Problem
-from rosproxy_operator.core.settings import PlanSettings
-from tests.unit.operator.builders import (
+from rosproxy_operator.core.docker.aliases import assign
+from rosproxy_operator.core.docker.desired import desire
+from rosproxy_operator.core.docker.fingerprint import proxy_name
+from rosproxy_operator.core.docker.labels import read_wishes
+from rosproxy_operator.core.docker.memory import Memory, noticed
+from rosproxy_operator.core.docker.model import (
+    Container,
+    Desired,
+    Key,
+    Network,
+    Observed,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
+from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
     HERE,

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from rosproxy.core.ports import PortRange
 from rosproxy.core.settings import parse_settings
-from rosproxy_operator.core.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.core.fingerprint import (
+from rosproxy_operator.core.docker.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.core.docker.fingerprint import (
     Own,
     admin_port,
     container_config,
@@ -23,8 +23,8 @@ from rosproxy_operator.core.fingerprint import (
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.model import Key
-from tests.unit.operator.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
+from rosproxy_operator.core.docker.model import Key
+from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
 
 SANDBOX = SandboxSpec("s", KEY, PortRange(11400, 11401), "f1", "0-rosproxy")
 PROXY = ProxySpec("p", KEY, PortRange(11400, 11401), "f2", "s")

@@ -6,10 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.core.labels import masters, read_wishes
-from rosproxy_operator.core.model import Container, Key, Problem, Wish
-from rosproxy_operator.core.settings import PlanSettings
-from tests.unit.operator.builders import (
+from rosproxy_operator.core.docker.labels import masters, read_wishes
+from rosproxy_operator.core.docker.model import (
+    Container,
+    Key,
+    Wish,
+)
+from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.problem import Problem
+from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,
     KEY,

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.model import Container, Host, Key, Network, Observed, Sandbox
+from rosproxy_operator.core.docker.model import Container, Host, Key, Network, Observed, Sandbox
 from rosproxy_operator.docker.details import Details, bound_ports, read_details, signature
 from rosproxy_operator.docker.observe import Look, read_container, read_network, read_subnets
-from tests.unit.operator import captured
+from tests.unit.operator.docker import captured
 
 APP = Network(captured.APP_ID, "app")
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Create,
@@ -22,17 +22,17 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.fingerprint import (
+from rosproxy_operator.core.docker.fingerprint import (
     fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.memory import Memory, Move
-from rosproxy_operator.core.model import Key, Network, Observed
-from rosproxy_operator.core.plan import Plan, plan
-from rosproxy_operator.core.settings import PlanSettings
-from tests.unit.operator.builders import (
+from rosproxy_operator.core.docker.memory import Memory, Move
+from rosproxy_operator.core.docker.model import Key, Network, Observed
+from rosproxy_operator.core.docker.plan import Plan, plan
+from rosproxy_operator.core.docker.settings import PlanSettings
+from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
     HERE,

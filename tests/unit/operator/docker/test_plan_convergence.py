@@ -9,10 +9,10 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.core.model import Container
-from rosproxy_operator.core.plan import plan
-from tests.unit.operator.builders import container
-from tests.unit.operator.hosts import SETTINGS, Hosts
+from rosproxy_operator.core.docker.model import Container
+from rosproxy_operator.core.docker.plan import plan
+from tests.unit.operator.docker.builders import container
+from tests.unit.operator.docker.hosts import SETTINGS, Hosts
 
 CONTAINERS = (
     Hosts.run, Hosts.change, Hosts.remove, Hosts.attach, Hosts.detach, Hosts.rename, Hosts.stranger,

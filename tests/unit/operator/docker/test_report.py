@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.core.text import width
-from rosproxy_operator.core.actions import (
+from rosproxy_operator.core.docker.actions import (
     Action,
     Connect,
     Create,
@@ -20,8 +20,8 @@ from rosproxy_operator.core.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.report import line, plan_text, render
-from tests.unit.operator.builders import KEY, RANGE
+from rosproxy_operator.core.docker.report import line, plan_text, render
+from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {
     "name": "rosproxy-robot-eefee4",

@@ -3,10 +3,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.core.model import Container
-from rosproxy_operator.core.succession import IDLE, free_name, succession
-from tests.unit.operator.builders import container
-from tests.unit.operator.simulation import SERVING
+from rosproxy_operator.core.docker.model import Container
+from rosproxy_operator.core.docker.succession import IDLE, free_name, succession
+from tests.unit.operator.docker.builders import container
+from tests.unit.operator.docker.simulation import SERVING
 
 STATES = ["running", "paused", "restarting", "created", "exited", "dead", "removing"]
 SOME = st.lists(st.tuples(st.sampled_from(STATES), st.booleans(), st.booleans()), max_size=4)

@@ -4,7 +4,7 @@ from dataclasses import replace
 from ipaddress import IPv4Network
 
 from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.model import (
+from rosproxy_operator.core.docker.model import (
     Attachment,
     Container,
     Host,

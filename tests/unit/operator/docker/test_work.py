@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 import pytest
 
 from rosproxy.tasks import Tasks
-from rosproxy_operator.core.actions import Action, Connect, CreateNetwork, Remove, Start
-from rosproxy_operator.core.model import Key
-from rosproxy_operator.core.plan import Group
+from rosproxy_operator.core.docker.actions import Action, Connect, CreateNetwork, Remove, Start
+from rosproxy_operator.core.docker.model import Key
+from rosproxy_operator.core.docker.plan import Group
 from rosproxy_operator.docker.errors import EngineError, PortTaken
 from rosproxy_operator.docker.work import Work
 

@@ -1,0 +1,1 @@
+"""What is decided on a Docker host. Sees, waits and does nothing: plain functions over data."""
