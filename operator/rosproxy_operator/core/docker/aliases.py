@@ -16,6 +16,7 @@ from rosproxy_operator.core.docker.model import (
     Desired,
     Key,
     Observed,
+    Sandbox,
 )
 from rosproxy_operator.core.problem import Problem
 
@@ -97,14 +98,20 @@ def _claim(network: str, alias: str, there: list[Desired], observed: Observed) -
         for container in observed.containers
         if container.state not in _GONE and holds(container, network, alias)
     ]
-    having = {s.key for s in observed.sandboxes if holds(s.container, network, alias)}
+    having = [s for s in observed.sandboxes if holds(s.container, network, alias)]
+    staying = [one.key for one in there if one.key in {s.key for s in having}]
     return _Claim(
         network,
         alias,
         claimants=tuple(one for one in there if one.live and alias in _names(one.key)),
         others=tuple(sorted(others)),
-        holders=tuple(one.key for one in there if one.key in having),
+        holders=tuple(dict.fromkeys([*staying, *_stuck(having)])),
     )
+
+
+def _stuck(sandboxes: Iterable[Sandbox]) -> list[Key]:
+    """Whose sandboxes can't leave a network: it answers there again as soon as it is restarted."""
+    return sorted(one.key for one in sandboxes if one.container.state == "restarting")
 
 
 def _problems(claim: _Claim) -> Iterator[Problem]:

@@ -230,6 +230,19 @@ def test_the_one_who_leaves_gives_it_back() -> None:
     assert (given[KEY, "app"], told) == ({"rosproxy", "robot", NAME}, [])
 
 
+def test_the_one_who_can_not_leave_now_keeps_it_until_then() -> None:
+    """The engine restarts it just now, and then both would answer."""
+    restarting = sandbox(ARM, state="restarting")
+    given, told = names(container("a"), sandboxes=[restarting])
+    assert (given[KEY, "app"], told) == ({"robot", NAME}, ["a"])
+
+
+def test_the_one_who_stays_has_it_before_the_one_who_can_not_leave_now() -> None:
+    restarting = sandbox(ARM, state="restarting")
+    given, told = names(container("a"), sandboxes=[restarting, sandbox()])
+    assert (given[KEY, "app"], told) == ({"rosproxy", "robot", NAME}, ["a"])
+
+
 def test_two_masters_on_one_host() -> None:
     """Both proxies can't be called robot; the second one's containers are told."""
     second = Key("http://robot:11312", HERE)
