@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rosproxy.core.ports import PortRange
 from rosproxy_operator.core.docker.model import Desired, Key, Observed, Wish
+from rosproxy_operator.core.moves import MOVED_FOR, TAKEN_FOR, Move
 from rosproxy_operator.core.ports import within
 
 
@@ -17,14 +18,6 @@ class Refusal:
 
     since: float
     ports: frozenset[int] | None
-
-
-@dataclass(frozen=True, slots=True)
-class Move:
-    """A proxy had to leave the range on which it had served."""
-
-    ports: PortRange
-    at: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +48,6 @@ class Memory:
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
-TAKEN_FOR = 300.0
-"""Seconds for which a port is avoided that the engine has refused."""
-MOVED_FOR = 600.0
-"""Seconds for which it is told that a proxy had to leave its range."""
 SERVING = frozenset({"running", "paused", "restarting"})
 """States of a container that runs, or does again in a moment."""
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}

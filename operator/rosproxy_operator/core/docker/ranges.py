@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from rosproxy.core.ports import PortRange
 from rosproxy_operator.core.docker.fingerprint import proxy_name, reserved_ports
-from rosproxy_operator.core.docker.memory import SERVING, Memory, Move, Refusal
+from rosproxy_operator.core.docker.memory import SERVING, Memory, Refusal
 from rosproxy_operator.core.docker.model import (
     STARTED,
     Desired,
@@ -14,11 +14,9 @@ from rosproxy_operator.core.docker.model import (
     Sandbox,
 )
 from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.moves import RETRY_FOR, Move
 from rosproxy_operator.core.ports import PortsExhausted, extended, is_free, negotiate, within
 from rosproxy_operator.core.problem import Problem
-
-RETRY_FOR = 20.0
-"""Seconds for which a proxy that has served is tried again on its ports before it leaves them."""
 
 
 def refused(observed: Observed, live: Iterable[Key], memory: Memory, now: float) -> Memory:

@@ -28,10 +28,11 @@ from rosproxy_operator.core.docker.fingerprint import (
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.docker.memory import Memory, Move
+from rosproxy_operator.core.docker.memory import Memory
 from rosproxy_operator.core.docker.model import Key, Network, Observed
 from rosproxy_operator.core.docker.plan import Plan, plan
 from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.core.moves import Move
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
