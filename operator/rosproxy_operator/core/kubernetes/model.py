@@ -23,6 +23,10 @@ class Name:
         return f"{self.namespace}/{self.name}"
 
 
+NOBODY = Name("", "")
+"""The name of no object."""
+
+
 @dataclass(frozen=True, slots=True)
 class Selector:
     """A label selector (``metav1.LabelSelector``): all parts must fit.
@@ -121,13 +125,18 @@ class Node:
     deleting: bool = False
 
 
+ELSEWHERE = "$()"
+"""Stands for a value that is only known once the container runs."""
+
+
 @dataclass(frozen=True, slots=True)
 class Pod:
     """A pod. ``node`` and ``ip`` are empty until it has them.
 
-    ``host_ports`` are the TCP ports that its containers take on the node. ``own_master`` is a
-    ROS_MASTER_URI that its template sets itself, so that the webhook left it alone; ``wired`` is
-    the one that the webhook has set. Both are empty if there is none.
+    ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
+    the ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that
+    is not a plain text (from a ConfigMap, for one) is `ELSEWHERE`. ``wired`` is the one that the
+    webhook has set, empty if it has not.
     """
 
     id: Name
@@ -139,7 +148,7 @@ class Pod:
     host_ports: frozenset[int] = frozenset()
     host_network: bool = False
     deleting: bool = False
-    own_master: str = ""
+    own_masters: tuple[str, ...] = ()
     wired: str = ""
 
     @property
@@ -212,6 +221,59 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class NodeState:
+    """What one RosProxy has on one node, and what it gets there: a line of its status.
+
+    ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
+    told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
+    had. ``proxy`` is the pod that serves the node, None where there is none yet or any more.
+    ``problem`` is what keeps the node without one, ``reason`` the same in one CamelCase word.
+    """
+
+    name: str
+    advertise_host: str
+    range: PortRange | None
+    proxy: ProxyPod | None = None
+    pods: tuple[Pod, ...] = ()
+    answer: Answer | None = None
+    problem: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What a Kubernetes Event is about (``involvedObject``)."""
+
+    kind: str
+    id: Name
+    uid: str
+
+
+@dataclass(frozen=True, slots=True)
+class Finding(Problem):
+    """A problem as conditions and Kubernetes Events tell it.
+
+    ``reason`` is one word in CamelCase; ``of`` the RosProxy that it belongs to. ``about`` is the
+    object that the Event is about; None means that the problem gets no Event.
+    """
+
+    reason: str = "Problem"
+    of: Name = NOBODY
+    about: Reference | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InvalidRosProxy:
+    """A RosProxy that can't be read: ``text`` says why, the rest is as it is there."""
+
+    id: Name
+    uid: str
+    generation: int
+    text: str
+    status: Json = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Failure:
     """An action on an object that the API server refused; ``text`` is what it said."""
 
@@ -226,8 +288,8 @@ class Observed:
     ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
     wrong; one of them is empty. ``answers`` are by the uid of the proxy's pod. ``unusable`` are the
-    problems of RosProxies that can't be read at all, ``failures`` those of the last try to carry
-    something out.
+    RosProxies that can't be read at all: what they have is left as it is. ``failures`` are those of
+    the last try to carry something out.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -237,5 +299,5 @@ class Observed:
     services: Mapping[Name, Service] = field(default_factory=dict)
     masters: Mapping[Name, tuple[str, str]] = field(default_factory=dict)
     answers: Mapping[str, Answer] = field(default_factory=dict)
-    unusable: Mapping[Name, Problem] = field(default_factory=dict)
+    unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
     failures: Mapping[Name, tuple[Failure, ...]] = field(default_factory=dict)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from rosproxy.core.ports import PortRange
 
-
 NODE_PORTS = PortRange(30000, 32767)
 """The API server's own default of --service-node-port-range."""
 EPHEMERAL = PortRange(32768, 60999)

@@ -1,0 +1,154 @@
+"""Objects as the API server gives them, for tests."""
+
+from typing import Any
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.kubernetes.model import (
+    Answer,
+    Master,
+    Name,
+    NodeState,
+    Pod,
+    ProxyPod,
+    RosProxy,
+    Selector,
+    Spec,
+    Stuck,
+)
+from rosproxy_operator.core.kubernetes.names import own_labels, proxy_name, service_name
+
+Obj = dict[str, Any]
+
+NAMESPACE = "robots"
+ROBOT = "http://robot:11311"
+CLUSTER_IP = "10.96.7.7"
+URI = f"http://{CLUSTER_IP}:11311"
+RANGE = PortRange(11400, 11431)
+STAMP = "2026-11-21T14:00:00Z"
+LATER = "2026-11-21T15:00:00Z"
+
+
+def rosproxy_obj(spec: Any = None, name: str = "arm", status: Obj | None = None) -> Obj:
+    """A RosProxy; ``spec`` is put over the least that it needs."""
+    return {
+        "apiVersion": "rosproxy.io/v1alpha1",
+        "kind": "RosProxy",
+        "metadata": {"name": name, "namespace": NAMESPACE, "uid": f"uid-{name}", "generation": 3},
+        "spec": {"master": {"uri": ROBOT}, **(spec or {})},
+        "status": status or {},
+    }
+
+
+def pod_obj(name: str = "talker", labels: Obj | None = None, **spec: Any) -> Obj:
+    """A user's pod that runs."""
+    meta: Obj = {"name": name, "namespace": NAMESPACE, "uid": f"uid-{name}", "labels": labels or {}}
+    containers = [{"name": "ros", "image": "ros"}]
+    return {
+        "metadata": meta,
+        "spec": {"nodeName": "node1", "containers": containers, **spec},
+        "status": {"phase": "Running", "podIP": "10.244.1.5"},
+    }
+
+
+def proxy_obj(of: str = "arm", node: str = "node1", status: Obj | None = None) -> Obj:
+    """A proxy's pod."""
+    name = proxy_name(of, node)
+    owner = {
+        "apiVersion": "rosproxy.io/v1alpha1",
+        "kind": "RosProxy",
+        "name": of,
+        "uid": f"uid-{of}",
+        "controller": True,
+    }
+    return {
+        "metadata": {
+            "name": name,
+            "namespace": NAMESPACE,
+            "uid": f"uid-{name}",
+            "labels": own_labels(of),
+            "annotations": {
+                "rosproxy.io/node": node,
+                "rosproxy.io/port-range": str(RANGE),
+                "rosproxy.io/fingerprint": "0123456789abcdef",
+                "rosproxy.io/advertise-host": "192.0.2.11",
+            },
+            "ownerReferences": [owner],
+        },
+        "spec": {
+            "nodeName": node,
+            "containers": [
+                {
+                    "name": "proxy",
+                    "image": "rosproxy:1",
+                    "env": [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}],
+                    "ports": [
+                        {"containerPort": port, "hostPort": port, "protocol": "TCP"}
+                        for port in RANGE.ports()
+                    ],
+                }
+            ],
+        },
+        "status": status or {"phase": "Running", "podIP": "10.244.1.9"},
+    }
+
+
+def service_obj(of: str = "arm", **meta: Any) -> Obj:
+    """The Service of a RosProxy."""
+    owners = proxy_obj(of)["metadata"]["ownerReferences"]
+    return {
+        "metadata": {
+            "name": service_name(of),
+            "namespace": NAMESPACE,
+            "uid": "uid-service",
+            "labels": own_labels(of),
+            "annotations": {"rosproxy.io/fingerprint": "f"},
+            "ownerReferences": owners,
+            **meta,
+        },
+        "spec": {"clusterIP": CLUSTER_IP},
+    }
+
+
+def rosproxy(name: str = "arm", selector: Selector | None = None, **more: Any) -> RosProxy:
+    """A RosProxy that has been read."""
+    master = more.pop("master", Master(uri=ROBOT))
+    spec = Spec(master, 32, PortRange(11400, 29999), pod_selector=selector)
+    namespace = more.pop("namespace", NAMESPACE)
+    return RosProxy(Name(namespace, name), f"uid-{name}", 3, spec, **more)
+
+
+def pod(name: str = "talker", labels: Obj | None = None, **more: Any) -> Pod:
+    """A pod that has been read; labelled unless told otherwise."""
+    given = {"rosproxy.io/inject": "true"} if labels is None else labels
+    id = Name(more.pop("namespace", NAMESPACE), name)
+    return Pod(id, f"uid-{name}", given, **{"node": "node1", "phase": "Running", **more})
+
+
+def proxy(node: str = "node1", ready: bool = True, **more: Any) -> ProxyPod:
+    """A proxy that has been read."""
+    name = proxy_name("arm", node)
+    own = pod(name, own_labels("arm"), node=node, ip="10.244.1.9", **more.pop("pod", {}))
+    of = Name(NAMESPACE, "arm")
+    return ProxyPod(own, of, "uid-arm", node, RANGE, "f", "rosproxy:1", ready=ready, **more)
+
+
+def stuck_proxy(why: Stuck, message: str = "because") -> ProxyPod:
+    """A proxy that does not run."""
+    return proxy(ready=False, stuck=why, message=message)
+
+
+def answer(*names: str, **more: Any) -> Answer:
+    """The answer of a proxy whose master is up, with ROS nodes in one pod."""
+    there = {"10.244.1.5": names} if names else {}
+    return Answer(**{"answered": True, "master_up": True, "nodes": there, **more})
+
+
+def state(node: str = "node1", **more: Any) -> NodeState:
+    """A node with a pod, a proxy and its answer, unless told otherwise."""
+    found = {
+        "proxy": proxy(node),
+        "pods": (pod(),),
+        "answer": answer("/talker", topics=frozenset({"/chatter"})),
+        **more,
+    }
+    return NodeState(node, "192.0.2.11", found.pop("range", RANGE), **found)

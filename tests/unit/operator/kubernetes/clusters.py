@@ -1,0 +1,208 @@
+"""A cluster in which everything happens that happens in clusters, and what must always hold there.
+
+Each event is a method of two numbers, which choose what it happens to.
+"""
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from rosproxy_operator.core.kubernetes import names
+from rosproxy_operator.core.kubernetes.model import Name
+from tests.unit.operator.kubernetes.simulation import (
+    BAD_IMAGE,
+    NAMESPACE,
+    Refused,
+    deleting,
+    is_own,
+    meta,
+    node_of,
+)
+from tests.unit.operator.kubernetes.worlds import FIRST, NODES, World, spec
+
+ROSPROXIES = ("robot", "arm")
+SERVICE = {"service": {"name": "roscore", "namespace": NAMESPACE, "port": 11311}}
+CHANGES: tuple[dict[str, Any], ...] = (
+    {"ports": 2},
+    {"ports": 3},
+    {"ports": 6},
+    {"master": {"uri": "http://robot:11311"}},
+    {"master": {"uri": "http://192.0.2.77:11311"}},
+    {"master": SERVICE},
+    {"master": {**SERVICE, "publish": 11500}},
+    {"master": {**SERVICE, "publish": 11403}},
+    {"image": "rosproxy:2"},
+    {"image": BAD_IMAGE},
+    {"image": "rosproxy:1"},
+    {"portWindow": {"first": 11400, "last": 11409}},
+    {"portWindow": {"first": 11405, "last": 11416}},
+    {"portWindow": {"first": 11306, "last": 11315}},
+    {"nodeSelector": {"zone": "e"}},
+    {"nodeSelector": {}},
+    {"podSelector": {"matchLabels": {"app": "x"}}},
+    {"podSelector": None},
+    {"advertise": "ExternalIP"},
+    {"advertise": "InternalIP"},
+    {"cleanupAfterSeconds": 7},
+)
+LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"})
+T = TypeVar("T")
+
+
+def pick(items: Sequence[T], number: int) -> T:
+    return items[number % len(items)]
+
+
+class Clusters(World):
+    """A world with labelled pods, and people who meddle."""
+
+    # pods of users
+
+    def run(self, n: int, m: int) -> None:
+        if self.nodes:
+            self.pods += 1
+            node = pick(self.nodes, n)
+            self.cluster.add_pod(f"pod-{self.pods}", node, pick(LABELS, m))
+
+    def remove(self, n: int, _: int) -> None:
+        if self.users():
+            self.cluster.delete_pod(pick(self.users(), n))
+
+    def end(self, n: int, _: int) -> None:
+        if pods := [pod for pod in self.users() if not deleting(pod)]:
+            pick(pods, n)["status"]["phase"] = "Succeeded"
+
+    def stranger(self, n: int, m: int) -> None:
+        """A pod that takes a hostPort, if it can have it."""
+        if self.nodes:
+            self.pods += 1
+            with contextlib.suppress(Refused):
+                self.cluster.add_pod(f"pod-{self.pods}", pick(self.nodes, n), {}, [FIRST + m % 14])
+            self.cluster.schedule()
+
+    def namesake(self, n: int, m: int) -> None:
+        """A pod that is called as a proxy would be."""
+        name = names.proxy_name(pick(ROSPROXIES, n), pick(list(NODES), m))
+        if self.nodes and Name(NAMESPACE, name) not in self.cluster.state.pods:
+            self.cluster.add_pod(name, pick(self.nodes, n), {})
+
+    def register(self, n: int, _: int) -> None:
+        """ROS nodes of all pods on a node register at its proxies, before anybody knows them."""
+        if not self.nodes:
+            return
+        node = pick(self.nodes, n)
+        there = [meta(pod)["uid"] for pod in self.users() if node_of(pod) == node]
+        known = {self.cluster.addresses[uid] for uid in there if uid in self.cluster.addresses}
+        for pod, proxy in self.proxies():
+            if proxy.on == node and proxy.pod.uid in self.cluster.ros:
+                self.cluster.ros[meta(pod)["uid"]] |= known
+
+    # nodes
+
+    def toggle_ready(self, n: int, _: int) -> None:
+        if self.nodes:
+            node = self.cluster.state.nodes[pick(self.nodes, n)]
+            condition = node["status"]["conditions"][0]
+            condition["status"] = "Unknown" if condition["status"] == "True" else "True"
+
+    def cordon(self, n: int, m: int) -> None:
+        if self.nodes:
+            self.cluster.state.nodes[pick(self.nodes, n)]["spec"]["unschedulable"] = bool(m % 2)
+
+    def lose_node(self, n: int, _: int) -> None:
+        if len(self.nodes) > 1:
+            node = pick(self.nodes, n)
+            del self.cluster.state.nodes[node]
+            self.held = {place: r for place, r in self.held.items() if place.node != node}
+
+    def join_node(self, n: int, _: int) -> None:
+        name = pick(list(NODES), n)
+        if name not in self.nodes:
+            self.cluster.add_node(name, NODES[name])
+
+    def annotate(self, n: int, m: int) -> None:
+        if self.nodes:
+            host = pick(("gate.example", "bad host!", ""), m)
+            node = self.cluster.state.nodes[pick(self.nodes, n)]
+            meta(node)["annotations"] = {names.ADVERTISE_HOST: host}
+
+    # RosProxies
+
+    def change(self, n: int, m: int) -> None:
+        if every := sorted(self.cluster.state.rosproxies.items()):
+            _, rosproxy = pick(every, n)
+            rosproxy["spec"] |= pick(CHANGES, m)
+            rosproxy["metadata"]["generation"] += 1
+
+    def create(self, n: int, m: int) -> None:
+        name = pick(ROSPROXIES, n)
+        if Name(NAMESPACE, name) not in self.cluster.state.rosproxies:
+            self.cluster.add_rosproxy(name, spec(m))
+
+    def delete(self, n: int, _: int) -> None:
+        if every := sorted(self.cluster.state.rosproxies):
+            of = pick(every, n)
+            del self.cluster.state.rosproxies[of]
+            self.held = {place: r for place, r in self.held.items() if place.of != of}
+
+    def replace(self, n: int, m: int) -> None:
+        """Deleted and created again at once, as `kubectl replace --force` does."""
+        self.delete(n, m)
+        self.create(n, m)
+
+    # what people and clusters do to what the controller has made
+
+    def delete_proxy(self, n: int, _: int) -> None:
+        if self.own():
+            self.cluster.delete_pod(pick(self.own(), n))
+
+    def reject(self, n: int, m: int) -> None:
+        """The kubelet ends a proxy: its ports are taken, or it needs the room."""
+        if pods := [pod for pod in self.own() if node_of(pod)]:
+            pod, reason = pick(pods, n), pick(("NodePorts", "Evicted", "NodePorts"), m)
+            pod["status"] = {"phase": "Failed", "reason": reason, "message": "so it is"}
+
+    def delete_service(self, n: int, m: int) -> None:
+        """A Service is deleted, and maybe its address is given to another one."""
+        if every := list(self.cluster.state.services):
+            gone = self.cluster.state.services.pop(pick(every, n))
+            if m % 3 == 0 and is_own(gone):
+                other = {"metadata": {"name": f"s-{self.cluster.uid('s')}", "namespace": NAMESPACE}}
+                where = {"clusterIP": gone["spec"]["clusterIP"]}
+                with contextlib.suppress(Refused):
+                    self.cluster.create_service({**other, "spec": where})
+
+    def forbid(self, n: int, _: int) -> None:
+        self.cluster.forbidden = bool(n % 2)
+
+    def toggle_master(self, n: int, _: int) -> None:
+        self.cluster.master_ip = pick(("10.96.0.7", "", "10.96.0.8"), n)
+
+    # the controller
+
+    def step(self, _n: int, _m: int) -> None:
+        self.cluster.step()
+
+    def wait(self, n: int, _: int) -> None:
+        self.controller.old = None
+        self.controller.now += pick((0.5, 5.0, 30.0), n)
+
+    def lag(self, _n: int, _m: int) -> None:
+        """From now on until something is waited for, nothing new is seen of pods and nodes."""
+        self.controller.remember()
+
+    def look(self, n: int, _: int) -> None:
+        found = self.seen()
+        self.carry_out(found)
+        if n % 2:
+            self.cluster.step()
+
+    def look_and_be_killed(self, n: int, _: int) -> None:
+        found = self.seen()
+        self.carry_out(found, n % (len(found.actions) + 1))
+        self.controller.lose_memory()
+        self.held = {place: r for place, r in self.held.items() if self.in_status(place) == r}
+
+    def look_and_stall(self, n: int, _: int) -> None:
+        found = self.seen()
+        self.carry_out(found, n % (len(found.actions) + 1))

@@ -1,0 +1,158 @@
+"""RosProxies, nodes, pods and what the controller makes of them, for tests."""
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.kubernetes import manifests, names, parse
+from rosproxy_operator.core.kubernetes.actions import Action, Emit, PatchStatus
+from rosproxy_operator.core.kubernetes.manifests import Site, Upstream
+from rosproxy_operator.core.kubernetes.memory import Memory
+from rosproxy_operator.core.kubernetes.model import (
+    Finding,
+    Master,
+    Name,
+    Node,
+    Observed,
+    Pod,
+    ProxyPod,
+    RosProxy,
+    Service,
+    Spec,
+    Stuck,
+)
+from rosproxy_operator.core.kubernetes.plan import Plan, plan
+from rosproxy_operator.core.kubernetes.settings import ClusterSettings
+
+SETTINGS = ClusterSettings(image="rosproxy:1")
+STAMP = "2026-01-01T00:00:00Z"
+RANGE = PortRange(11400, 11403)
+ROBOT = Name("ros", "robot")
+
+
+def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
+    """A RosProxy in namespace ros with four ports per node. ``changes`` are of it or its spec."""
+    words: dict[str, Any] = {
+        "master": Master("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
+    }  # fmt: skip
+    own = {key: changes.pop(key) for key in ("former", "cluster_ip", "status", "deleting")
+           if key in changes}  # fmt: skip
+    return RosProxy(Name("ros", name), uid or f"uid-{name}", 1, Spec(**words | changes), **own)
+
+
+def node(name: str = "one", **changes: Any) -> Node:
+    words: dict[str, Any] = {
+        "addresses": {"InternalIP": "192.0.2.1", "Hostname": name},
+        "pod_networks": ("10.244.1.0/24",),
+    }
+    return Node(name, **words | changes)
+
+
+def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **changes: Any) -> Pod:
+    """A pod that runs and asks for a proxy; or, with ``ports``, a stranger that takes those."""
+    taken = frozenset(ports)
+    words: dict[str, Any] = {
+        "labels": {} if taken else {names.INJECT: "true"},
+        "node": on,
+        "phase": "Running",
+        "ip": f"10.244.1.{sum(name.encode()) % 250 + 2}",
+        "host_ports": taken,
+        "wired": "" if taken else "http://10.96.1.1:11311",
+    }
+    return Pod(Name("ros", name), f"uid-{name}", **words | changes)
+
+
+def site(of: RosProxy, on: Node, ports: PortRange = RANGE, publish: int = 0) -> Site:
+    host = on.advertise_host or on.addresses["InternalIP"]
+    return Site(of, on, host, ports, Upstream(of.spec.master.uri, of.spec.master.address), publish)
+
+
+def proxy(
+    of: RosProxy | None = None,
+    on: Node | None = None,
+    ports: PortRange = RANGE,
+    stuck: Stuck | None = None,
+    phase: str = "Running",
+    publish: int = 0,
+    settings: ClusterSettings = SETTINGS,
+    **changes: Any,
+) -> ProxyPod:
+    """A proxy's pod, by default one that runs; ``changes`` are of its `Pod`."""
+    of, on = of or rosproxy(), on or node()
+    body: dict[str, Any] = copy.deepcopy(
+        dict(manifests.proxy_pod(site(of, on, ports, publish), settings))
+    )
+    body["metadata"]["uid"] = f"uid-proxy-{of.id.name}-{on.name}"
+    running = phase == "Running" and stuck is None
+    found = parse.proxy_pod({**body, "status": {"phase": "Pending" if stuck else phase}})
+    assert found is not None
+    where = {"node": "" if stuck else on.name, "ip": "10.244.1.200" if running else ""}
+    own = replace(found.pod, **where | changes)
+    return replace(found, pod=own, ready=running, stuck=stuck, message="so it is" if stuck else "")
+
+
+def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -> Service:
+    of = of or rosproxy()
+    print_ = manifests.fingerprint_of(manifests.service(of))
+    found = Service(of.id, of.uid, f"uid-service-{of.id.name}", ip, print_)
+    return replace(found, **changes)
+
+
+def observed(*things: RosProxy | Node | Pod | ProxyPod | Service, **more: Any) -> Observed:
+    """A cluster with these. Node one is there unless other nodes are given."""
+    nodes = [one for one in things if isinstance(one, Node)] or [node()]
+    services = [one for one in things if isinstance(one, Service)]
+    return Observed(
+        rosproxies=tuple(one for one in things if isinstance(one, RosProxy)),
+        nodes={one.name: one for one in nodes},
+        pods=tuple(one for one in things if isinstance(one, Pod)),
+        proxies=tuple(one for one in things if isinstance(one, ProxyPod)),
+        services={one.of: one for one in services},
+        **more,
+    )
+
+
+def complete(**changes: Any) -> Observed:
+    """A pod, its proxy, and the Service."""
+    return replace(observed(rosproxy(), pod(), proxy(), service()), **changes)
+
+
+def look(
+    seen: Observed,
+    memory: Memory | None = None,
+    now: float = 100.0,
+    settings: ClusterSettings = SETTINGS,
+) -> Plan:
+    return plan(seen, settings, memory or Memory(), now, STAMP)
+
+
+def written(seen: Observed, found: Plan | None = None) -> Observed:
+    """The cluster with the status that a plan, or the first one, writes."""
+    found = found or look(seen)
+    new = {one.of: one.status for one in found.actions if isinstance(one, PatchStatus)}
+    rosproxies = (replace(one, status=new.get(one.id, one.status)) for one in seen.rosproxies)
+    return replace(seen, rosproxies=tuple(rosproxies))
+
+
+def done(found: Plan) -> list[Action]:
+    """What a plan does to pods and Services."""
+    return [action for action in found.actions if not isinstance(action, Emit | PatchStatus)]
+
+
+def status(found: Plan, of: Name = ROBOT) -> Mapping[str, Any]:
+    """The status that a plan writes."""
+    written = [action for action in found.actions if isinstance(action, PatchStatus)]
+    return next(action.status for action in written if action.of == of)
+
+
+def told(found: Plan, reason: str) -> list[str]:
+    """The texts of findings with a reason."""
+    some = (one for one in found.problems if isinstance(one, Finding))
+    return [f"{one.subject}: {one.text}" for one in some if one.reason == reason]
+
+
+def ports_of(action: Any) -> str:
+    """The range with which a proxy is created."""
+    return str(action.body["metadata"]["annotations"][names.PORT_RANGE])

@@ -1,0 +1,371 @@
+"""A cluster reduced to what matters: API server, scheduler, kubelets, garbage collector.
+
+Objects are as the API server has them, and are read by the same code as there.
+"""
+
+import copy
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from rosproxy_operator.core.kubernetes import names, parse, parse_rosproxy
+from rosproxy_operator.core.kubernetes.actions import (
+    Action,
+    CreateProxy,
+    CreateService,
+    DeleteProxy,
+    DeleteService,
+    Emit,
+    PatchStatus,
+    SetImage,
+)
+from rosproxy_operator.core.kubernetes.manifests import with_token, without_cluster_ip
+from rosproxy_operator.core.kubernetes.memory import Memory
+from rosproxy_operator.core.kubernetes.model import Answer, Failure, Name, Observed
+from rosproxy_operator.core.kubernetes.plan import Plan, plan
+from rosproxy_operator.core.kubernetes.settings import ClusterSettings
+
+NAMESPACE = "ros"
+BAD_IMAGE = "no-such-image"
+PORTS_TAKEN = "1 node(s) didn't have free ports for the requested pod ports."
+STAMP = "2026-01-01T00:00:00Z"
+Object = dict[str, Any]
+
+
+class Refused(Exception):
+    """The API server does not do it."""
+
+
+def meta(obj: Object) -> Object:
+    return obj["metadata"]
+
+
+def name_of(obj: Object) -> Name:
+    return Name(meta(obj)["namespace"], meta(obj)["name"])
+
+
+def deleting(obj: Object) -> bool:
+    return "deletionTimestamp" in meta(obj)
+
+
+def ended(pod: Object) -> bool:
+    return pod["status"]["phase"] in ("Succeeded", "Failed")
+
+
+def node_of(pod: Object) -> str:
+    return pod["spec"].get("nodeName", "")
+
+
+def host_ports(pod: Object) -> set[int]:
+    return set(parse.pod(pod).host_ports)
+
+
+def is_own(obj: Object) -> bool:
+    """Whether the controller has made an object."""
+    owned = any(ref["kind"] == names.KIND for ref in meta(obj).get("ownerReferences", ()))
+    return names.is_own(meta(obj).get("labels", {})) and owned
+
+
+def bound_to(pod: Object) -> str:
+    """The only node on which a pod may run, empty if any will do."""
+    affinity = pod["spec"].get("affinity")
+    if not affinity:
+        return ""
+    required = affinity["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"]
+    return required["nodeSelectorTerms"][0]["matchFields"][0]["values"][0]
+
+
+@dataclass
+class State:
+    """What the API server holds."""
+
+    rosproxies: dict[Name, Object] = field(default_factory=dict)
+    nodes: dict[str, Object] = field(default_factory=dict)
+    pods: dict[Name, Object] = field(default_factory=dict)
+    services: dict[Name, Object] = field(default_factory=dict)
+
+
+class Cluster:
+    """The cluster. ``forbidden``: no pod with hostPorts is admitted.
+
+    ``addresses`` are those that pods really have, by uid, before anybody is told; ``ros`` is what
+    a proxy knows: the addresses of ROS nodes by the uid of the proxy's pod.
+    """
+
+    def __init__(self) -> None:
+        self.state = State()
+        self.forbidden = False
+        self.numbers = itertools.count(1)
+        self.addresses: dict[str, str] = {}
+        self.ros: dict[str, set[str]] = {}
+        self.master_ip = "10.96.0.7"
+        self.made = 0
+
+    # what users do
+
+    def add_node(self, name: str, ip: str) -> None:
+        number = ip.rpartition(".")[2]
+        self.state.nodes[name] = {
+            "metadata": {"name": name, "uid": self.uid("node"), "labels": {"zone": name[-1]}},
+            "spec": {"podCIDRs": [f"10.244.{number}.0/24"]},
+            "status": {
+                "addresses": [{"type": "InternalIP", "address": ip}],
+                "conditions": [{"type": "Ready", "status": "True"}],
+            },
+        }
+
+    def add_rosproxy(self, name: str, spec: Object) -> None:
+        self.state.rosproxies[Name(NAMESPACE, name)] = {
+            "metadata": {
+                "name": name, "namespace": NAMESPACE, "uid": self.uid("rosproxy"), "generation": 1,
+            },
+            "spec": spec,
+        }  # fmt: skip
+
+    def add_pod(
+        self, name: str, node: str, labels: dict[str, str], ports: Iterable[int] = ()
+    ) -> None:
+        """A pod of a user, bound to a node at once, or left to the scheduler if it takes ports."""
+        taken = [{"containerPort": port, "hostPort": port} for port in ports]
+        pod: Object = {
+            "metadata": {"name": name, "namespace": NAMESPACE, "labels": labels},
+            "spec": {"containers": [{"name": "main", "image": "user", "ports": taken}]},
+        }
+        if taken:
+            terms = {"nodeSelectorTerms": [{"matchFields": [{"values": [node]}]}]}
+            key = "requiredDuringSchedulingIgnoredDuringExecution"
+            pod["spec"]["affinity"] = {"nodeAffinity": {key: terms}}
+        else:
+            pod["spec"]["nodeName"] = node
+        self.create_pod(pod)
+
+    def uid(self, kind: str) -> str:
+        return f"{kind}-{next(self.numbers)}"
+
+    # what the API server does
+
+    def create_pod(self, body: Object) -> None:
+        if name_of(body) in self.state.pods:
+            raise Refused("AlreadyExists")
+        if self.forbidden and host_ports({**body, "status": {}}):
+            raise Refused('pods "p" is forbidden: violates PodSecurity "baseline:latest"')
+        pod = copy.deepcopy(body)
+        pod["metadata"]["uid"] = self.uid("pod")
+        pod["status"] = {"phase": "Pending"}
+        self.state.pods[name_of(pod)] = pod
+
+    def delete_pod(self, pod: Object) -> None:
+        """What no kubelet knows of goes at once."""
+        if not node_of(pod) or node_of(pod) not in self.state.nodes:
+            self.state.pods.pop(name_of(pod), None)
+        meta(pod)["deletionTimestamp"] = STAMP
+
+    def create_service(self, body: Object) -> None:
+        if name_of(body) in self.state.services:
+            raise Refused("AlreadyExists")
+        held = {one["spec"]["clusterIP"] for one in self.state.services.values()}
+        service = copy.deepcopy(body)
+        wanted = service["spec"].setdefault("clusterIP", f"10.96.1.{next(self.numbers) % 250}")
+        if wanted in held:
+            raise Refused("provided IP is already allocated")
+        service["metadata"]["uid"] = self.uid("service")
+        self.state.services[name_of(service)] = service
+
+    # what goes on by itself
+
+    def step(self) -> None:
+        """Everybody does what he has to."""
+        self.collect()
+        self.schedule()
+        for name in list(self.state.nodes):
+            self.kubelet(name)
+        self.collect()
+
+    def collect(self) -> None:
+        """The garbage collectors: owners and nodes that are gone."""
+        uids = {meta(one)["uid"] for one in self.state.rosproxies.values()}
+        for pod in list(self.state.pods.values()):
+            owners = meta(pod).get("ownerReferences", ())
+            orphaned = any(ref["uid"] not in uids for ref in owners)
+            if (orphaned and not deleting(pod)) or (
+                node_of(pod) and node_of(pod) not in self.state.nodes
+            ):
+                self.delete_pod(pod)
+        for name, service in list(self.state.services.items()):
+            if any(ref["uid"] not in uids for ref in meta(service).get("ownerReferences", ())):
+                del self.state.services[name]
+
+    def schedule(self) -> None:
+        for pod in self.state.pods.values():
+            if not node_of(pod) and not ended(pod) and not deleting(pod):
+                why = self._bind(pod, bound_to(pod))
+                unbound = {"type": "PodScheduled", "status": "False", "reason": "Unschedulable"}
+                pod["status"]["conditions"] = [{**unbound, "message": why}] if why else []
+
+    def _bind(self, pod: Object, node: str) -> str:
+        if node not in self.state.nodes or not self.is_ready(node):
+            return "node(s) didn't match Pod's node affinity/selector"
+        if host_ports(pod) & self.held(node):
+            return PORTS_TAKEN
+        pod["spec"]["nodeName"] = node
+        return ""
+
+    def held(self, node: str) -> set[int]:
+        """The hostPorts that the scheduler counts on a node."""
+        there = [pod for pod in self.state.pods.values() if node_of(pod) == node]
+        return {port for pod in there if not ended(pod) for port in host_ports(pod)}
+
+    def running(self) -> set[str]:
+        pods = self.state.pods.values()
+        return {meta(pod)["uid"] for pod in pods if pod["status"]["phase"] == "Running"}
+
+    def is_ready(self, node: str) -> bool:
+        return self.state.nodes[node]["status"]["conditions"][0]["status"] == "True"
+
+    def kubelet(self, node: str) -> None:
+        if not self.is_ready(node):
+            return
+        for name, pod in list(self.state.pods.items()):
+            if node_of(pod) == node and deleting(pod):
+                del self.state.pods[name]
+            elif node_of(pod) == node and not ended(pod):
+                self._run(pod)
+
+    def _run(self, pod: Object) -> None:
+        uid, container = meta(pod)["uid"], pod["spec"]["containers"][0]
+        if uid not in self.addresses:
+            network = self.state.nodes[node_of(pod)]["spec"]["podCIDRs"][0]
+            self.addresses[uid] = network.replace(".0/24", f".{next(self.numbers)}")
+            return  # its containers run, and nobody has been told yet
+        state: Object = {"running": {}}
+        if container["image"] == BAD_IMAGE:
+            state = {"waiting": {"reason": "ImagePullBackOff", "message": "not found"}}
+        ready = "running" in state
+        pod["status"] = {
+            "phase": "Running" if ready else "Pending",
+            "podIP": self.addresses[uid],
+            "conditions": [{"type": "Ready", "status": str(ready)}],
+            "containerStatuses": [{"name": container["name"], "state": state, "restartCount": 0}],
+        }
+        if is_own(pod) and ready:
+            self.ros.setdefault(uid, set())
+
+    # what the controller sees
+
+    def observe(self, old: State | None, failures: dict[Name, tuple[Failure, ...]]) -> Observed:
+        """What is there; pods, nodes and Services as they were before, if ``old`` is given."""
+        seen = old or self.state
+        pods = [parse.pod(one) for one in seen.pods.values()]
+        own = [found for one in seen.pods.values() if (found := parse.proxy_pod(one))]
+        services = filter(None, map(parse.service, seen.services.values()))
+        of = tuple(parse_rosproxy.rosproxy(one) for one in self.state.rosproxies.values())
+        masters = {one.spec.master.service for one in of if one.spec.master.service}
+        there = (self.master_ip, "") if self.master_ip else ("", "does not exist")
+        return Observed(
+            rosproxies=of,
+            nodes={name: parse.node(one) for name, one in seen.nodes.items()},
+            pods=tuple(pods),
+            proxies=tuple(own),
+            services={one.of: one for one in services},
+            masters=dict.fromkeys(masters, there),
+            answers={
+                uid: Answer(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
+                for uid, known in self.ros.items()
+                if uid in self.running()
+            },
+            failures=failures,
+        )
+
+    # what the controller does
+
+    def apply(self, action: Action) -> None:  # noqa: C901, PLR0912 - one case per action
+        """Raises Refused. An AssertionError means that the plan is wrong in itself."""
+        match action:
+            case CreateService(body=body):
+                self.made += 1
+                try:
+                    self.create_service(dict(body))
+                except Refused as error:
+                    if "allocated" not in str(error):
+                        raise
+                    self.create_service(dict(without_cluster_ip(body)))
+            case CreateProxy(body=body):
+                self.made += 1
+                self.create_pod(dict(with_token(body, "t0ken-t0ken")))
+            case DeleteProxy(id=id, uid=uid):
+                if pod := self._own(self.state.pods, id, uid):
+                    self.delete_pod(pod)
+            case DeleteService(id=id, uid=uid):
+                if self._own(self.state.services, id, uid):
+                    del self.state.services[id]
+            case SetImage(id=id, uid=uid, image=image):
+                if pod := self._own(self.state.pods, id, uid):
+                    pod["spec"]["containers"][0]["image"] = image
+            case PatchStatus(of=of, status=status):
+                if of in self.state.rosproxies:
+                    self.state.rosproxies[of]["status"] = copy.deepcopy(dict(status))
+            case Emit():
+                pass
+
+    def _own(self, objects: dict[Name, Object], id: Name, uid: str) -> Object | None:
+        """An object to do something to, if it is still the one that is meant."""
+        found = objects.get(id)
+        if found is None or meta(found)["uid"] != uid:
+            return None
+        assert is_own(found), f"{id} is not the controller's"
+        self.made += 1
+        return found
+
+
+class Controller:
+    """A controller that looks, plans, carries out, and may be killed anywhere."""
+
+    def __init__(self, cluster: Cluster, settings: ClusterSettings) -> None:
+        self.cluster, self.settings = cluster, settings
+        self.memory = Memory()
+        self.failures: dict[Name, tuple[Failure, ...]] = {}
+        self.now = 1000.0
+        self.old: State | None = None
+
+    def remember(self) -> None:
+        """What is there now is what the next looks see, until `forget`."""
+        self.old = self.old or copy.deepcopy(self.cluster.state)
+
+    def look(self) -> Plan:
+        observed = self.cluster.observe(self.old, self.failures)
+        stamp = f"2026-01-01T{int(self.now) // 3600 % 24:02}:00:00Z"
+        found = plan(observed, self.settings, self.memory, self.now, stamp)
+        self.memory = found.memory
+        for uid, addresses in found.gone.items():
+            self.cluster.ros[uid] -= set(addresses)
+        return found
+
+    def carry_out(self, found: Plan, most: int | None = None) -> None:
+        """Carry out a plan's actions, or the first few."""
+        actions = found.actions[:most]
+        failed: dict[Name, list[Failure]] = {action.of: [] for action in actions}
+        for action in actions:
+            if error := self._try(action):
+                failed[action.of].append(error)
+        self.failures |= {of: tuple(some) for of, some in failed.items()}
+
+    def _try(self, action: Action) -> Failure | None:
+        try:
+            self.cluster.apply(action)
+        except Refused as error:
+            assert isinstance(action, CreateProxy | CreateService)
+            name = name_of(dict(action.body))
+            kind = self.cluster.state.pods if isinstance(action, CreateProxy) else None
+            there = (self.cluster.state.services if kind is None else kind).get(name)
+            if str(error) == "AlreadyExists" and there is not None:
+                text = "a Pod of this name that is not the controller's is there"
+                return None if is_own(there) else Failure(str(name), text)
+            return Failure(str(name), str(error))
+        return None
+
+    def lose_memory(self) -> None:
+        self.memory, self.failures, self.old = Memory(), {}, None
+
+
+SETTINGS = replace(ClusterSettings(), image="rosproxy:1")

@@ -1,0 +1,173 @@
+"""The conditions of a RosProxy: what is wrong, and what to do."""
+
+import pytest
+
+from rosproxy_operator.core.kubernetes.model import (
+    Answer,
+    Failure,
+    Finding,
+    Master,
+    Name,
+    Reference,
+    Stuck,
+)
+from rosproxy_operator.core.kubernetes.parse_answer import no_answer
+from rosproxy_operator.core.kubernetes.statuses import findings
+from rosproxy_operator.core.problem import Problem
+from tests.unit.operator.kubernetes.builders_api import answer, proxy, rosproxy, state, stuck_proxy
+from tests.unit.operator.kubernetes.status_cases import judged, message, status
+
+NAME = "rosproxy-arm-node1-"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (state(proxy=None, answer=None), "node node1: its proxy is being created"),
+        (
+            state(proxy=proxy(pod={"deleting": True}), answer=None),
+            "node node1: its proxy is being created",
+        ),
+        (
+            state(proxy=proxy(ready=False), answer=None),
+            f"node node1: its proxy {proxy().pod.id.name} is starting",
+        ),
+    ],
+)
+def test_a_proxy_that_is_yet_to_come_is_no_problem(given, said):
+    found = status(given, state("node2"))
+
+    assert judged(found, "Ready") == ("False", "ProxiesStarting")
+    assert message(found) == said
+    assert judged(found, "Degraded") == ("False", "AsExpected")
+    assert found["proxies"] == "1/2"
+
+
+@pytest.mark.parametrize(
+    ("why", "reason", "said"),
+    [
+        (Stuck.PORTS, "PortConflict", "ports 11400-11431 are not all free there (because)"),
+        (Stuck.SCHEDULING, "ProxyStuck", "it is not admitted (because): make room"),
+        (Stuck.IMAGE, "ProxyStuck", "can't get the image rosproxy:1 (because): load it there"),
+        (Stuck.CRASHING, "ProxyStuck", "kubectl -n robots logs --previous rosproxy-arm-node1-"),
+        (Stuck.SANDBOX, "ProxyStuck", "kubectl -n robots describe pod rosproxy-arm-node1-"),
+    ],
+)
+def test_a_proxy_that_does_not_run(why, reason, said):
+    found = status(state(proxy=stuck_proxy(why), answer=None))
+
+    assert judged(found, "Ready") == ("False", reason)
+    assert message(found).startswith(f"proxy {NAME}")
+    assert said in message(found)
+    assert judged(found, "Degraded") == ("True", reason)
+    assert said[:20] in found["perNode"][0]["message"]
+    ports = ("False", "PortConflict") if why is Stuck.PORTS else ("True", "Allocated")
+    assert judged(found, "PortsAllocated") == ports
+
+
+def test_a_node_without_ports():
+    text = "no 32 free ports in a row between 11400 and 11410: widen spec.portWindow"
+    found = status(state(range=None, proxy=None, answer=None, problem=text))
+
+    for type in ("Ready", "PortsAllocated"):
+        assert judged(found, type) == ("False", "PortsExhausted")
+        assert message(found, type) == f"node node1: {text}"
+    assert found["perNode"][0]["message"] == f"node node1: {text}"
+    assert "ports" not in found["perNode"][0]
+
+
+def test_another_reason_for_a_node_without_proxy():
+    found = status(state(proxy=None, answer=None, problem="is not ready", reason="NodeNotReady"))
+
+    assert judged(found, "Ready") == ("False", "NodeNotReady")
+
+
+def test_the_master_is_not_reached():
+    down = Answer(True, False, "refused", problems=("master: refused", "/a: hangs"))
+    found = status(state("node2"), state(proxy=proxy(ready=False), answer=down))
+
+    assert judged(found, "MasterReachable") == ("False", "MasterUnreachable")
+    assert judged(found, "Ready") == ("False", "MasterUnreachable")
+    assert "(refused): start roscore there" in message(found)
+    assert message(found, "Degraded").count("refused") == 1
+    assert "/a: hangs" in message(found, "Degraded")
+
+
+def test_a_master_in_the_cluster_is_told_by_its_service():
+    of = rosproxy(master=Master(service=Name("robots", "roscore")))
+    down = state(proxy=proxy(ready=False), answer=Answer(True, False, "refused"))
+
+    assert "start roscore behind Service robots/roscore, port 11311" in message(status(down, of=of))
+
+
+def test_a_proxy_that_does_not_answer_the_controller():
+    found = status(state(answer=no_answer("timed out")))
+
+    assert judged(found, "Ready") == ("False", "ProxyUnreachable")
+    assert "(timed out): let the controller's pod connect to port 11312" in message(found)
+    assert judged(found, "MasterReachable") == ("Unknown", "NotAsked")
+
+
+def test_what_proxies_warn_of_keeps_nobody_from_being_served():
+    found = status(state(answer=answer("/a", problems=("/a: does not answer",))))
+
+    assert judged(found, "Ready") == ("True", "Serving")
+    assert judged(found, "Degraded") == ("True", "ProxyWarns")
+    assert message(found, "Degraded").endswith("/a: does not answer")
+
+
+def test_a_pod_that_is_left_out_keeps_the_others_ready():
+    about = Reference("Pod", Name("robots", "x"), "u")
+    one = Finding("pod robots/x", "is ambiguous", reason="Ambiguous", of=rosproxy().id, about=about)
+
+    assert judged(status(state(), more=(one,)), "Ready") == ("True", "Serving")
+    assert judged(status(state(), more=(one,)), "Degraded") == ("True", "Ambiguous")
+    starting = status(state(proxy=None, answer=None), more=(one,))
+    assert judged(starting, "Ready") == ("False", "ProxiesStarting")
+
+
+def test_a_problem_without_a_reason():
+    found = status(state(proxy=None, answer=None), more=(Problem("service x", "is not there"),))
+
+    assert judged(found, "Ready") == ("False", "Problem")
+    assert message(found) == "service x: is not there"
+
+
+@pytest.mark.parametrize(
+    ("text", "fix"),
+    [
+        (
+            'pods "x" is forbidden: violates PodSecurity "baseline:latest": hostPort',
+            "kubectl label namespace robots pod-security.kubernetes.io/enforce=privileged",
+        ),
+        ('pods "x" is forbidden: exceeded quota: q, requested: cpu=50m', "ResourceQuota"),
+        ('Pod "x" is invalid: spec.tolerations[0].effect: Unsupported value', "RosProxy's spec"),
+        (
+            'pods is forbidden: User "system:serviceaccount:a:b" cannot create resource "pods"',
+            "install its chart or manifests anew",
+        ),
+        ("a Pod of this name that is not the controller's is there: x", "rename"),
+        ("internal error", "tried again"),
+    ],
+)
+def test_what_the_api_server_refuses(text, fix):
+    failure = Failure("robots/rosproxy-arm-node1-1", text)
+
+    found = status(state(proxy=None, answer=None), failures=(failure,))
+
+    assert judged(found, "Ready") == ("False", "ProxyNotAdmitted")
+    assert message(found).startswith("robots/rosproxy-arm-node1-1: the API server refused it")
+    assert fix in message(found)
+
+
+def test_a_namespace_that_is_being_deleted_is_no_problem():
+    text = "unable to create new content in namespace robots because it is being terminated"
+
+    assert findings(rosproxy(), (), (Failure("robots/x", text),)) == ()
+
+
+def test_findings_are_told_at_the_rosproxy():
+    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(Stuck.PORTS), answer=None)])
+
+    assert (found.reason, found.of) == ("PortConflict", rosproxy().id)
+    assert found.about == Reference("RosProxy", rosproxy().id, "uid-arm")

@@ -1,0 +1,243 @@
+"""What is created: hardened, bound to its node, and recognized when it is seen again."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import Settings, parse_settings
+from rosproxy_operator.core.kubernetes import manifests, parse
+from rosproxy_operator.core.kubernetes.manifests import Site, Upstream
+from rosproxy_operator.core.kubernetes.model import Json, Master
+from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
+
+
+def body(place: Site | None = None, **changes: Any) -> Json:
+    return manifests.proxy_pod(place or site(rosproxy(**changes), node()), SETTINGS)
+
+
+def spec(place: Site | None = None, **changes: Any) -> Json:
+    return dict(body(place, **changes)["spec"])
+
+
+def container(place: Site | None = None, **changes: Any) -> Json:
+    return dict(spec(place, **changes)["containers"][0])
+
+
+def env(place: Site | None = None, **changes: Any) -> dict[str, str]:
+    return {one["name"]: one["value"] for one in container(place, **changes)["env"]}
+
+
+def settings_of(variables: dict[str, str]) -> Settings:
+    """The settings of the proxy that is started with such variables."""
+    variables = {name.removeprefix("ROSPROXY_").lower(): text for name, text in variables.items()}
+    defaults = {
+        "bind": "0.0.0.0", "probe_interval": 5.0, "probe_timeout": 3.0, "linger": 30.0,
+        "master_interval": 2.0,
+    }  # fmt: skip
+    numbers = {"master_port": int, "publish_master": int, "cleanup_after": float}
+    read = {name: numbers.get(name, str)(text) for name, text in variables.items()}
+    networks = str(read.pop("inside_networks", "")).split()
+    return parse_settings(
+        {**defaults, **read, "master_uri": read["ros_master_uri"], "inside_network": networks}
+    )
+
+
+def test_the_proxy_understands_all_of_its_variables() -> None:
+    of = rosproxy(cleanup_after=0.5, slave_control="master")
+    on = node(pod_networks=("10.244.1.0/24", "fd00::/64"))
+    place = Site(of, on, "192.0.2.1", RANGE, Upstream("http://roscore.ros.svc:1", "10.96.0.9"), 999)
+    found = settings_of(env(place))
+    assert found.master_uri == "http://roscore.ros.svc:1"
+    assert found.master_address == "10.96.0.9"
+    assert found.advertise_host == "192.0.2.1"
+    assert found.ports.listen == found.ports.advertise == RANGE
+    assert (found.master_port, found.publish_master) == (11311, 999)
+    assert str(found.admin) == "0.0.0.0:11312"
+    assert list(map(str, found.inside_networks)) == ["10.244.1.0/24", "fd00::/64"]
+    assert (found.cleanup_after, found.slave_control) == (0.5, "master")
+    assert found.admin_token is None
+
+
+def test_what_is_not_known_is_left_to_the_proxy() -> None:
+    names = env(site(rosproxy(), node(pod_networks=())))
+    left_out = {"MASTER_ADDRESS", "PUBLISH_MASTER", "INSIDE_NETWORKS"}
+    assert not {f"ROSPROXY_{name}" for name in left_out} & names.keys()
+
+
+def test_clean_up_can_be_switched_off() -> None:
+    assert settings_of(env(cleanup_after=0.0)).cleanup_after == 0.0
+
+
+def test_each_port_is_the_same_on_the_node() -> None:
+    ports = container(site(rosproxy(), node(), publish=11500))["ports"]
+    assert ports == [
+        {"containerPort": port, "hostPort": port, "protocol": "TCP"}
+        for port in (11400, 11401, 11402, 11403, 11500)
+    ]
+
+
+def test_it_can_do_nothing_that_it_need_not() -> None:
+    pod, box = spec(), container()
+    assert pod["automountServiceAccountToken"] is False
+    assert pod["enableServiceLinks"] is False
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    assert pod["securityContext"]["runAsUser"] == 10001
+    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert box["securityContext"] == {
+        "allowPrivilegeEscalation": False,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"]},
+    }
+    assert not {"hostNetwork", "hostPID", "hostIPC", "volumes", "priorityClassName"} & pod.keys()
+
+
+def test_it_is_bound_to_its_node_but_placed_by_the_scheduler() -> None:
+    pod = spec()
+    assert "nodeName" not in pod
+    required = pod["affinity"]["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"]
+    field = {"key": "metadata.name", "operator": "In", "values": ["one"]}
+    assert required == {"nodeSelectorTerms": [{"matchFields": [field]}]}
+
+
+def test_it_stays_where_pods_of_daemon_sets_stay() -> None:
+    own = {"key": "robot", "operator": "Exists", "effect": "NoSchedule"}
+    found = {(one["key"], one["effect"]) for one in spec(tolerations=(own,))["tolerations"]}
+    assert found == {
+        ("node.kubernetes.io/not-ready", "NoExecute"),
+        ("node.kubernetes.io/unreachable", "NoExecute"),
+        ("node.kubernetes.io/disk-pressure", "NoSchedule"),
+        ("node.kubernetes.io/memory-pressure", "NoSchedule"),
+        ("node.kubernetes.io/pid-pressure", "NoSchedule"),
+        ("node.kubernetes.io/unschedulable", "NoSchedule"),
+        ("robot", "NoSchedule"),
+    }
+
+
+def test_what_spec_says_goes_into_the_pod() -> None:
+    more: dict[str, Any] = {
+        "image": "rosproxy:7",
+        "image_pull_policy": "Never",
+        "image_pull_secrets": ({"name": "secret"},),
+        "host_aliases": ({"ip": "192.0.2.9", "hostnames": ["robot"]},),
+        "resources": {"requests": {"cpu": "1"}},
+    }
+    pod, box = spec(**more), container(**more)
+    assert pod["imagePullSecrets"] == [{"name": "secret"}]
+    assert pod["hostAliases"] == [{"ip": "192.0.2.9", "hostnames": ["robot"]}]
+    assert (box["image"], box["imagePullPolicy"]) == ("rosproxy:7", "Never")
+    assert box["resources"] == {"requests": {"cpu": "1"}}
+
+
+def test_without_a_pull_policy_kubernetes_decides() -> None:
+    assert "imagePullPolicy" not in container()
+
+
+@pytest.mark.parametrize(
+    ("ports", "local"),
+    [
+        (RANGE, "1024 11000"),
+        (PortRange(2000, 2003), "32768 60999"),
+        (PortRange(10998, 11001), "32768 60999"),
+        (PortRange(40000, 40003), "1024 11000"),
+    ],
+)
+def test_outgoing_connections_start_on_no_port_of_the_range(ports: PortRange, local: str) -> None:
+    (sysctl,) = spec(site(rosproxy(), node(), ports))["securityContext"]["sysctls"]
+    assert sysctl == {"name": "net.ipv4.ip_local_port_range", "value": local}
+
+
+def test_the_master_in_the_cluster_counts_too() -> None:
+    context = spec(site(rosproxy(), node(), publish=2000))["securityContext"]
+    assert context["sysctls"][0]["value"] == "32768 60999"
+
+
+def test_a_pod_is_read_back_as_it_was_made() -> None:
+    made = manifests.with_token(body(), "t0ken-t0ken")
+    found = parse.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
+    assert found is not None
+    assert (found.of, found.owner, found.on) == (rosproxy().id, "uid-robot", "one")
+    assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "t0ken-t0ken")
+    assert found.fingerprint == manifests.fingerprint_of(body())
+    assert found.pod.host_ports == set(RANGE.ports())
+
+
+def test_the_token_changes_nothing_but_itself() -> None:
+    one = manifests.with_token(body(), "one")
+    assert one != body()
+    assert manifests.with_token(one, "") == body()
+
+
+def test_a_fingerprint_tells_whether_nodes_are_found_again() -> None:
+    own = manifests.fingerprint_of(body())
+    same = manifests.fingerprint_of(body(cleanup_after=1.0))
+    assert manifests.finds_again(own, same)
+    assert manifests.finds_again("", own)
+    for other in (body(master=Master("http://arm:11311")),
+                  body(site(rosproxy(), node(advertise_host="gate")))):  # fmt: skip
+        assert not manifests.finds_again(own, manifests.fingerprint_of(other))
+
+
+def test_it_goes_on_for_a_moment_after_its_deletion() -> None:
+    assert container()["lifecycle"] == {"preStop": {"exec": {"command": ["sleep", "2"]}}}
+    assert spec()["terminationGracePeriodSeconds"] > 2
+
+
+def test_the_fingerprint_does_not_depend_on_image_and_token() -> None:
+    bodies = [body(), body(image="rosproxy:2"), manifests.with_token(body(), "t")]
+    assert len({manifests.fingerprint_of(one) for one in bodies}) == 1
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        site(rosproxy(), node("two")),
+        site(rosproxy(uid="other"), node()),
+        site(rosproxy("arm"), node()),
+        site(rosproxy(), node(advertise_host="gate")),
+        site(rosproxy(), node(pod_networks=())),
+        site(rosproxy(), node(), PortRange(11400, 11404)),
+        site(rosproxy(), node(), publish=11500),
+        site(rosproxy(master=Master("http://arm:11311")), node()),
+        site(rosproxy(master=Master("http://robot:11311", "192.0.2.7")), node()),
+        site(rosproxy(cleanup_after=1.0), node()),
+        site(rosproxy(image_pull_policy="Never"), node()),
+    ],
+)
+def test_the_fingerprint_depends_on_all_else(other: Site) -> None:
+    assert manifests.fingerprint_of(body(other)) != manifests.fingerprint_of(body())
+
+
+def test_a_service_leads_to_the_proxy_on_the_callers_own_node() -> None:
+    found = manifests.service(rosproxy())
+    assert found["spec"]["internalTrafficPolicy"] == "Local"
+    assert found["spec"]["publishNotReadyAddresses"] is True
+    assert found["spec"]["selector"] == body()["metadata"]["labels"]
+    assert [(one["port"], one["targetPort"]) for one in found["spec"]["ports"]] == [(11311, 11311)]
+
+
+def test_a_service_is_read_back_as_it_was_made() -> None:
+    made = manifests.service(rosproxy(), "10.96.1.1")
+    found = parse.service({**made, "metadata": {**made["metadata"], "uid": "u"}})
+    assert found is not None
+    assert (found.of, found.owner, found.cluster_ip) == (rosproxy().id, "uid-robot", "10.96.1.1")
+    assert found.fingerprint == manifests.fingerprint_of(manifests.service(rosproxy()))
+
+
+def test_a_service_can_do_without_its_former_address() -> None:
+    made = manifests.service(rosproxy(), "10.96.1.1")
+    assert manifests.without_cluster_ip(made) == manifests.service(rosproxy())
+
+
+@pytest.mark.parametrize("made", [body(), manifests.service(rosproxy())])
+def test_all_goes_with_its_rosproxy(made: Json) -> None:
+    (owner,) = made["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["uid"], owner["controller"]) == ("RosProxy", "uid-robot", True)
+    assert "finalizers" not in made["metadata"]
+
+
+def test_the_default_policy_is_that_of_the_settings() -> None:
+    settings = replace(SETTINGS, image_pull_policy="Always")
+    made = manifests.proxy_pod(site(rosproxy(), node()), settings)
+    assert made["spec"]["containers"][0]["imagePullPolicy"] == "Always"

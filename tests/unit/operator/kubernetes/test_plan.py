@@ -1,0 +1,371 @@
+"""What is done for RosProxies: their Services, and a proxy on each node that needs one."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.kubernetes import names
+from rosproxy_operator.core.kubernetes.actions import (
+    CreateProxy,
+    CreateService,
+    DeleteProxy,
+    DeleteService,
+    Emit,
+    SetImage,
+)
+from rosproxy_operator.core.kubernetes.model import (
+    Advertise,
+    InvalidRosProxy,
+    Master,
+    Name,
+    Observed,
+)
+from rosproxy_operator.core.kubernetes.plan import Plan
+from tests.unit.operator.kubernetes.objects import (
+    ROBOT,
+    SETTINGS,
+    complete,
+    done,
+    look,
+    node,
+    observed,
+    pod,
+    proxy,
+    rosproxy,
+    service,
+    status,
+    told,
+    written,
+)
+
+PROXY = names.proxy_id(ROBOT, "one")
+MASTER = Name("ros", "roscore")
+INSIDE = Master(service=MASTER)
+
+
+def env(action: Any) -> dict[str, str]:
+    variables = action.body["spec"]["containers"][0]["env"]
+    return {one["name"]: one["value"] for one in variables}
+
+
+def reasons(found: Plan) -> list[str]:
+    return [action.reason for action in found.actions if isinstance(action, Emit)]
+
+
+def test_a_rosproxy_gets_a_service_and_a_proxy_on_each_node_with_selected_pods() -> None:
+    nodes = [node("one"), node("two"), node("three")]
+    pods = [pod("a", "one"), pod("b", "two"), pod("c", "two")]
+    found = look(observed(rosproxy(), *nodes, *pods))
+    assert [(type(one), getattr(one, "node", "")) for one in done(found)] == [
+        (CreateService, ""),
+        (CreateProxy, "one"),
+        (CreateProxy, "two"),
+    ]
+    assert reasons(found) == ["ProxyCreated", "ProxyCreated"]
+
+
+def test_a_service_is_there_before_any_pod_is() -> None:
+    assert [type(one) for one in done(look(observed(rosproxy())))] == [CreateService]
+
+
+def test_when_all_is_there_nothing_is_done() -> None:
+    first = look(complete())
+    assert done(first) == []
+    of = rosproxy(status=status(first), cluster_ip="10.96.1.1")
+    second = look(complete(rosproxies=(of,)), first.memory, 101.0)
+    assert (second.actions, second.again_in) == ((), None)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        pod("ended", phase="Succeeded"),
+        pod("going", deleting=True),
+        pod("nowhere", on=""),
+        pod("on-a-node-nobody-knows", on="four"),
+        pod("no-label", labels={}),
+        pod("off", labels={names.INJECT: "false"}),
+        replace(pod("elsewhere"), id=Name("other", "elsewhere")),
+        pod("a-proxy", labels=names.own_labels("robot") | {names.INJECT: "true"}),
+    ],
+    ids=lambda one: one.id.name,
+)
+def test_other_pods_get_no_proxy(other: Any) -> None:
+    assert done(look(observed(rosproxy(), service(), other))) == []
+
+
+def test_a_cordoned_node_gets_its_proxy_nonetheless() -> None:
+    found = look(observed(rosproxy(), service(), node(cordoned=True), pod()))
+    assert [type(one) for one in done(found)] == [CreateProxy]
+
+
+def test_on_a_node_that_is_not_ready_nothing_is_created_nor_deleted() -> None:
+    away = node(ready=False)
+    found = look(observed(rosproxy(), service(), away, pod()))
+    assert done(found) == []
+    (text,) = told(found, "NodeNotReady")
+    assert text.startswith("node one: is not ready")
+    assert "kubectl describe node one" in text
+    alone = observed(rosproxy(grace=0.0), service(), away, proxy())
+    assert done(look(alone)) == []
+
+
+def test_a_node_that_is_being_deleted_gets_no_proxy() -> None:
+    assert done(look(observed(rosproxy(), service(), node(deleting=True), pod()))) == []
+
+
+def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
+    alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
+    first = look(alone, now=100.0)
+    assert (done(first), first.again_in) == ([], 30.0)
+    second = look(alone, first.memory, 120.0)
+    assert (done(second), second.again_in) == ([], 10.0)
+    (gone,) = done(look(alone, second.memory, 130.0))
+    assert gone == DeleteProxy(
+        ROBOT, PROXY, "uid-proxy-robot-one", "no pod on node one wants it since 30 s", retire=True
+    )
+
+
+def test_the_grace_begins_anew_when_pods_come_back() -> None:
+    alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
+    memory = look(complete(), look(alone, now=100.0).memory, 110.0).memory
+    assert look(alone, memory, 135.0).again_in == 30.0
+
+
+def test_a_proxy_on_a_node_that_is_gone_is_deleted_after_a_while() -> None:
+    gone = written(observed(rosproxy(), service(), node("two"), proxy()))
+    first = look(gone)
+    assert (done(first), first.again_in) == ([], 10.0)
+    (deleted,) = done(look(gone, first.memory, 110.0))
+    assert isinstance(deleted, DeleteProxy)
+    assert (deleted.why, deleted.retire) == ("its node is gone", False)
+
+
+def test_another_image_is_given_to_the_pod_that_is_there() -> None:
+    found = look(complete(rosproxies=(rosproxy(image="rosproxy:2"),)))
+    assert done(found) == [SetImage(ROBOT, PROXY, "uid-proxy-robot-one", "rosproxy:2")]
+    assert reasons(found) == ["ImageSet"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"master": Master("http://robot2:11311")},
+        {"ports": 5},
+        {"cleanup_after": 5.0},
+        {"slave_control": "master"},
+        {"image_pull_policy": "Never"},
+        {"resources": {"limits": {"memory": "1Gi"}}},
+        {"tolerations": ({"operator": "Exists"},)},
+    ],
+    ids=lambda one: next(iter(one)),
+)
+def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: dict) -> None:
+    of = rosproxy(**changes)
+    first = look(complete(rosproxies=(of,)))
+    (deleted,) = done(first)
+    assert isinstance(deleted, DeleteProxy)
+    assert deleted.retire == ("master" in changes)
+    assert deleted.why.startswith("made anew: ")
+    ending = observed(of, pod(), service(of), proxy(deleting=True))
+    second = look(ending, first.memory, 101.0)
+    assert done(second) == []
+    third = look(observed(of, pod(), service(of)), second.memory, 102.0)
+    assert [type(one) for one in done(third)] == [CreateProxy]
+
+
+@pytest.mark.parametrize(
+    ("seen", "retire"),
+    [
+        (complete(nodes={"one": node(advertise_host="gate.example")}), True),
+        (complete(nodes={"one": node(pod_networks=())}), False),
+        (complete(rosproxies=(rosproxy(window=PortRange(11410, 11420)),)), True),
+        (complete(rosproxies=(rosproxy(ports=2),)), False),
+    ],
+)
+def test_who_is_not_found_again_at_the_master_is_unregistered(seen: Observed, retire: bool) -> None:
+    (deleted,) = done(look(seen))
+    assert isinstance(deleted, DeleteProxy)
+    assert deleted.retire == retire
+
+
+# RosProxies that are gone, or can't be read
+
+
+def test_what_a_deleted_rosproxy_has_made_goes() -> None:
+    found = look(complete(rosproxies=()))
+    why = "its RosProxy is gone"
+    assert done(found) == [
+        DeleteProxy(ROBOT, PROXY, "uid-proxy-robot-one", why, retire=True),
+        DeleteService(ROBOT, Name("ros", "rosproxy-robot"), "uid-service-robot", why),
+    ]
+
+
+def test_a_proxy_that_the_garbage_collector_deletes_is_retired_nonetheless() -> None:
+    found = look(complete(rosproxies=(), proxies=(proxy(deleting=True),)))
+    assert [getattr(one, "retire", None) for one in done(found)] == [True, None]
+    never = proxy(deleting=True, phase="Pending")
+    assert [type(one) for one in done(look(complete(rosproxies=(), proxies=(never,))))] == [
+        DeleteService
+    ]
+
+
+def test_a_rosproxy_that_is_being_deleted_counts_as_gone() -> None:
+    found = look(complete(rosproxies=(rosproxy(deleting=True),)))
+    assert [type(one) for one in found.actions] == [DeleteProxy, DeleteService]
+
+
+def test_one_of_the_same_name_takes_over_once_all_is_gone() -> None:
+    """Its pods were wired to an address: the new Service is to have it again."""
+    new = rosproxy(uid="uid-new")
+    first = look(complete(rosproxies=(new,)))
+    assert [(type(one), getattr(one, "retire", None)) for one in done(first)] == [
+        (DeleteProxy, False),
+        (DeleteService, None),
+    ]
+    service_, proxy_ = done(look(observed(new, pod()), first.memory, 110.0))
+    assert isinstance(service_, CreateService)
+    assert service_.body["spec"]["clusterIP"] == "10.96.1.1"
+    assert isinstance(proxy_, CreateProxy)
+
+
+def test_what_an_unreadable_rosproxy_has_stays_as_it_is() -> None:
+    bad = InvalidRosProxy(ROBOT, "uid-robot", 2, "spec.ports: is no number: write one")
+    found = look(complete(rosproxies=(), unusable={ROBOT: bad}))
+    assert done(found) == []
+    assert told(found, "Invalid") == ["rosproxy ros/robot: spec.ports: is no number: write one"]
+    assert status(found)["conditions"][0]["reason"] == "Invalid"
+
+
+def test_ports_of_an_unreadable_rosproxy_are_not_given_to_others() -> None:
+    bad = InvalidRosProxy(ROBOT, "uid-robot", 2, "bad")
+    arm = rosproxy("arm")
+    found = look(observed(arm, proxy(), pod(), service(arm), unusable={ROBOT: bad}))
+    (created,) = done(found)
+    assert isinstance(created, CreateProxy)
+    assert env(created)["ROSPROXY_PORT_RANGE"] == "11404-11407"
+
+
+# obstacles
+
+
+def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
+    namesake = pod(PROXY.name, labels={})
+    found = look(observed(rosproxy(), service(), pod(), namesake))
+    assert done(found) == []
+    (text,) = told(found, "NameTaken")
+    assert f"a pod called {PROXY} is there already, and is not the controller's" in text
+    assert "delete or rename it" in text
+
+
+def test_a_proxy_under_a_name_of_former_times_goes_first() -> None:
+    old = replace(proxy(), pod=replace(proxy().pod, id=Name("ros", "rosproxy-old")))
+    first = look(observed(rosproxy(), service(), pod(), old))
+    assert [getattr(one, "id", None) for one in done(first)] == [Name("ros", "rosproxy-old")]
+    second = look(observed(rosproxy(), service(), pod()), first.memory, 101.0)
+    assert [type(one) for one in done(second)] == [CreateProxy]
+
+
+@pytest.mark.parametrize(
+    ("changes", "host"),
+    [
+        ({"advertise": Advertise.INTERNAL_IP}, "192.0.2.1"),
+        ({"advertise": Advertise.HOSTNAME}, "one"),
+    ],
+)
+def test_outside_is_told_the_address_that_spec_names(changes: dict, host: str) -> None:
+    (created,) = done(look(observed(rosproxy(**changes), service(), pod())))
+    assert env(created)["ROSPROXY_ADVERTISE_HOST"] == host
+
+
+def test_the_nodes_annotation_comes_first() -> None:
+    (created,) = done(look(observed(rosproxy(), service(), pod(), node(advertise_host="gate"))))
+    assert env(created)["ROSPROXY_ADVERTISE_HOST"] == "gate"
+
+
+def test_a_node_without_such_an_address_gets_no_proxy_and_it_is_told_why() -> None:
+    found = look(observed(rosproxy(advertise=Advertise.EXTERNAL_IP), service(), pod()))
+    assert done(found) == []
+    (text,) = told(found, "NoAdvertiseHost")
+    assert "node one: it has no address of type ExternalIP (it has: Hostname, InternalIP)" in text
+    assert "kubectl annotate node one rosproxy.io/advertise-host=HOST" in text
+
+
+def test_an_annotation_that_is_no_host_is_told() -> None:
+    found = look(observed(rosproxy(), service(), pod(), node(advertise_host="a b")))
+    assert done(found) == []
+    (text,) = told(found, "NoAdvertiseHost")
+    assert "node one: its annotation rosproxy.io/advertise-host" in text
+
+
+def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
+    there = {MASTER: ("10.96.0.9", "")}
+    (created,) = done(look(observed(rosproxy(master=INSIDE), service(), pod(), masters=there)))
+    assert env(created)["ROS_MASTER_URI"] == "http://roscore.ros.svc:11311"
+    assert env(created)["ROSPROXY_MASTER_ADDRESS"] == "10.96.0.9"
+
+
+@pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist: create it")}])
+def test_while_the_masters_service_is_missing_everything_stays(masters: dict) -> None:
+    of = rosproxy(master=INSIDE)
+    found = look(observed(of, service(of), pod(), proxy(), masters=masters))
+    assert done(found) == []
+    assert "spec.master.service: Service ros/roscore" in told(found, "MasterUnknown")[0]
+
+
+def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
+    of = rosproxy(node_selector={"zone": "a"})
+    found = look(observed(of, service(of), pod("a"), pod("b")))
+    assert done(found) == []
+    (text,) = told(found, "NodeLeftOut")
+    assert "node one, which spec.nodeSelector leaves out" in text
+    assert "ros/a, ros/b" in text
+
+
+def test_a_pod_that_is_not_wired_is_told() -> None:
+    found = look(complete(pods=(pod(wired=""),)))
+    assert "create the pod anew" in told(found, "NotWired")[0]
+
+
+# Services
+
+
+def test_a_service_that_is_lost_is_made_with_the_address_that_it_had() -> None:
+    found = look(observed(rosproxy(cluster_ip="10.96.3.3"), proxy(), pod()))
+    (created,) = done(found)
+    assert isinstance(created, CreateService)
+    assert created.body["spec"]["clusterIP"] == "10.96.3.3"
+
+
+def test_a_service_of_former_times_is_made_anew() -> None:
+    found = look(complete(services={ROBOT: service(fingerprint="other")}))
+    (deleted,) = done(found)
+    assert isinstance(deleted, DeleteService)
+    assert deleted.why == "made anew"
+
+
+# status
+
+
+def test_the_status_keeps_the_ranges_of_nodes_that_have_no_proxy_now() -> None:
+    former = {"one": proxy().range, "gone": proxy().range}
+    found = look(observed(rosproxy(former=former), service()))
+    assert [(one["name"], one["ports"]) for one in status(found)["perNode"]] == [
+        ("one", "11400-11403")
+    ]
+
+
+def test_one_bad_rosproxy_does_not_stop_another() -> None:
+    bad = rosproxy("arm", advertise=Advertise.EXTERNAL_IP)
+    pods = [pod("a", labels={names.INJECT: "arm"}), pod("b", labels={names.INJECT: "robot"})]
+    found = look(observed(bad, rosproxy(), service(), service(bad), *pods))
+    assert [(type(one), one.of.name) for one in done(found)] == [(CreateProxy, "robot")]
+
+
+def test_the_default_image_is_that_of_the_settings() -> None:
+    found = look(complete(), settings=replace(SETTINGS, image="rosproxy:9"))
+    (changed,) = done(found)
+    assert isinstance(changed, SetImage)
+    assert changed.image == "rosproxy:9"

@@ -1,0 +1,245 @@
+"""What must always hold in a cluster with a controller, and what when nothing else happens."""
+
+import copy
+from collections.abc import Iterator
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.kubernetes import names, parse, parse_rosproxy
+from rosproxy_operator.core.kubernetes.actions import CreateProxy, DeleteProxy
+from rosproxy_operator.core.kubernetes.memory import Place
+from rosproxy_operator.core.kubernetes.model import Finding, Name, ProxyPod
+from rosproxy_operator.core.kubernetes.plan import Plan
+from rosproxy_operator.core.kubernetes.select import chosen, on_node
+from tests.unit.operator.kubernetes.simulation import (
+    BAD_IMAGE,
+    SETTINGS,
+    Cluster,
+    Controller,
+    Object,
+    deleting,
+    ended,
+    is_own,
+    meta,
+    name_of,
+    node_of,
+)
+
+NODES = {"one": "192.0.2.1", "two": "192.0.2.2", "three": "192.0.2.3"}
+FIRST = 11400
+
+
+def spec(number: int = 0) -> Object:
+    return {
+        "master": {"uri": "http://robot:11311"},
+        "ports": 2 + number % 2,
+        "portWindow": {"first": FIRST, "last": FIRST + 11},
+        "graceSeconds": 10,
+    }
+
+
+class World:
+    """A cluster with a controller, and what must always hold there."""
+
+    def __init__(self) -> None:
+        self.cluster = Cluster()
+        self.controller = Controller(self.cluster, SETTINGS)
+        for name, ip in list(NODES.items())[:2]:
+            self.cluster.add_node(name, ip)
+        self.cluster.add_rosproxy("robot", spec())
+        self.pods = 0
+        self.held: dict[Place, PortRange] = {}
+        self.may_move: set[Place] = set()
+
+    @property
+    def nodes(self) -> list[str]:
+        return sorted(self.cluster.state.nodes)
+
+    def own(self) -> list[Object]:
+        return [pod for pod in self.cluster.state.pods.values() if is_own(pod)]
+
+    def users(self) -> list[Object]:
+        return [pod for pod in self.cluster.state.pods.values() if not is_own(pod)]
+
+    def proxies(self) -> Iterator[tuple[Object, ProxyPod]]:
+        for pod in self.own():
+            found = parse.proxy_pod(pod)
+            assert found is not None
+            yield pod, found
+
+    # what the controller does
+
+    def in_status(self, place: Place) -> PortRange | None:
+        rosproxy = self.cluster.state.rosproxies.get(place.of)
+        return parse_rosproxy.rosproxy(rosproxy).former.get(place.node) if rosproxy else None
+
+    def seen(self) -> Plan:
+        """A look, which must not take a pod for gone that runs."""
+        found = self.controller.look()
+        pods = self.cluster.state.pods.values()
+        live = {meta(pod)["uid"] for pod in pods if not ended(pod)}
+        here = {ip for uid, ip in self.cluster.addresses.items() if uid in live}
+        assert not here & {ip for some in found.gone.values() for ip in some}, "it runs"
+        return found
+
+    def carry_out(self, found: Plan, most: int | None = None) -> None:
+        for action in found.actions:
+            if isinstance(action, CreateProxy):
+                self.check_new_range(action)
+                assert self.seen_ready(action.node)
+            elif isinstance(action, DeleteProxy):
+                on = {one.pod.uid: one.on for _, one in self.proxies()}.get(action.uid, "")
+                gone = action.why == "its RosProxy is gone"
+                assert gone or on not in self.nodes or self.seen_ready(on)
+        self.controller.carry_out(found, most)
+
+    def seen_ready(self, node: str) -> bool:
+        """Whether a node is ready, as far as the controller sees."""
+        nodes = (self.controller.old or self.cluster.state).nodes
+        return node not in nodes or nodes[node]["status"]["conditions"][0]["status"] == "True"
+
+    # what must hold
+
+    def check_new_range(self, action: CreateProxy) -> None:
+        place = Place(action.of, action.node)
+        text = action.body["metadata"]["annotations"][names.PORT_RANGE]
+        first, last = map(int, text.split("-"))
+        assert self.is_lawful(action.of, PortRange(first, last))
+        before = self.held.get(place)
+        if before is None and self.in_status(place) is None:
+            seen = self.controller.old or self.cluster.state
+            there = [pod for pod in seen.pods.values() if node_of(pod) == place.node]
+            others = (pod for pod in there if not ended(pod) and not is_own(pod))
+            taken = {port for pod in others for port in parse.pod(pod).host_ports}
+            assert not taken.intersection(range(first, last + 1)), "held by others"
+        if before is not None and place not in self.may_move:
+            count = self.cluster.state.rosproxies[action.of]["spec"]["ports"]
+            cut = PortRange(before.first, min(before.last, before.first + count - 1))
+            if self.is_lawful(action.of, cut):
+                assert before.first == first, f"{place} moves from {before} to {text}"
+
+    def is_lawful(self, of: Name, ports: PortRange) -> bool:
+        """Whether the RosProxy allows a range."""
+        spec = self.cluster.state.rosproxies[of]["spec"]
+        own = {names.MASTER_PORT, names.ADMIN_PORT, spec["master"].get("publish", 0)}
+        inside = (
+            spec["portWindow"]["first"] <= ports.first and ports.last <= spec["portWindow"]["last"]
+        )
+        return inside and not any(port in ports for port in own)
+
+    def note_conflicts(self) -> None:
+        """Who does not get his ports, or whose ports somebody else has, may move."""
+        for place, ports in self.held.items():
+            others = [
+                pod
+                for state in (self.cluster.state, self.controller.old)
+                for pod in (state.pods.values() if state else ())
+                if place.node in (node_of(pod), meta(pod).get("annotations", {}).get(names.NODE))
+                and name_of(pod) != names.proxy_id(place.of, place.node)
+            ]
+            taken = {port for pod in others for port in parse.pod(pod).host_ports}
+            refused = {port for node, port in self.controller.memory.taken if node == place.node}
+            if any(port in ports for port in taken | refused):
+                self.may_move.add(place)
+        for _, proxy in self.proxies():
+            if proxy.stuck is not None:
+                self.may_move.add(Place(proxy.of, proxy.on))
+
+    def check(self) -> None:
+        """What holds at any moment."""
+        self.note_conflicts()
+        there: list[Place] = []
+        for pod, proxy in self.proxies():
+            place = Place(proxy.of, proxy.on)
+            if not ended(pod) and not deleting(pod):
+                there.append(place)
+            if pod["status"]["phase"] == "Running" and place.of in self.cluster.state.rosproxies:
+                uid = meta(self.cluster.state.rosproxies[place.of])["uid"]
+                if proxy.owner == uid and place.node in self.nodes:
+                    self.held[place] = proxy.range
+                    self.may_move.discard(place)
+        assert len(there) == len(set(there)), "one proxy for each RosProxy on a node"
+        for node in self.nodes:
+            pods = [p for p in self.cluster.state.pods.values() if node_of(p) == node]
+            ports = [port for p in pods if not ended(p) for port in sorted(parse.pod(p).host_ports)]
+            assert len(ports) == len(set(ports))
+
+    def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
+        """Nothing else happens: everything must be as wished after some looks."""
+        self.cluster.forbidden, self.controller.old = False, None
+        self.cluster.step()
+        self.check()
+        self.cluster.made = 0
+        for _ in range(100):
+            found = self.seen()
+            self.carry_out(found)
+            self.cluster.step()
+            self.check()
+            if not found.actions and found.again_in is None:
+                break
+            self.controller.now += 1.0 if found.again_in is None else found.again_in
+        else:
+            raise AssertionError(f"never comes to rest: {found.actions} {found.again_in}")
+        assert self.cluster.made <= 40, "it is done over and over again"
+        self.check_all_is_as_wished(found)
+
+    def check_all_is_as_wished(self, found: Plan) -> None:
+        state = self.cluster.state
+        rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
+        wanted = set()
+        for pod in map(parse.pod, state.pods.values()):
+            of = chosen(pod, rosproxies).rosproxy
+            node = state.nodes.get(pod.node)
+            if of and node and not pod.ended and not pod.deleting and on_node(of, parse.node(node)):
+                wanted.add(Place(of.id, pod.node))
+        unready = {node for node in self.nodes if not self.cluster.is_ready(node)}
+        self.check_proxies(found, {place for place in wanted if place.node not in unready}, unready)
+        services = [one for one in state.services.values() if is_own(one)]
+        owners = sorted(one["metadata"]["ownerReferences"][0]["uid"] for one in services)
+        assert owners == sorted(one.uid for one in rosproxies)
+        self.check_addresses(unready)
+
+    def check_proxies(self, found: Plan, wanted: set[Place], unready: set[str]) -> None:
+        there = {Place(one.of, one.on): (pod, one) for pod, one in self.proxies()}
+        assert {place for place in there if place.node not in unready} <= wanted
+        for place in wanted:
+            rosproxy = self.cluster.state.rosproxies[place.of]["spec"]
+            if self.obstacles(found, place):
+                continue
+            pod, proxy = there[place]
+            assert not deleting(pod)
+            container = pod["spec"]["containers"][0]
+            assert container["image"] == rosproxy.get("image", "rosproxy:1")
+            assert pod["status"]["phase"] == "Running" or container["image"] == BAD_IMAGE
+            assert len(proxy.range) == rosproxy["ports"] or self.told(
+                found, place, "PortsExhausted"
+            )
+            env = {one["name"]: one["value"] for one in container["env"]}
+            service = "http://roscore.ros.svc:11311"
+            assert env["ROS_MASTER_URI"] == rosproxy["master"].get("uri", service)
+            publish = rosproxy["master"].get("publish")
+            if publish and not self.told(found, place, "PortConflict"):
+                assert env["ROSPROXY_PUBLISH_MASTER"] == str(publish)
+
+    def obstacles(self, found: Plan, place: Place) -> bool:
+        reasons = ("MasterUnknown", "NoAdvertiseHost", "NameTaken")
+        fatal = self.told(found, place, "PortsExhausted", fatal=True)
+        return fatal or any(self.told(found, place, reason) for reason in reasons)
+
+    def told(self, found: Plan, place: Place, reason: str, fatal: bool | None = None) -> bool:
+        return any(
+            one.reason == reason
+            and one.of == place.of
+            and place.node in f"{one.subject} {one.text}".split(": ")[0] + one.text
+            and fatal in (None, one.fatal)
+            for one in found.problems
+            if isinstance(one, Finding)
+        )
+
+    def check_addresses(self, unready: set[str]) -> None:
+        """A proxy knows no ROS node of a pod that is gone."""
+        for pod, proxy in self.proxies():
+            if proxy.on in unready or proxy.pod.uid not in self.cluster.running():
+                continue
+            live = [one for one in self.users() if node_of(one) == proxy.on and not ended(one)]
+            here = {self.cluster.addresses[meta(one)["uid"]] for one in live}
+            assert self.cluster.ros.get(meta(pod)["uid"], set()) <= here
