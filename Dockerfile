@@ -58,7 +58,7 @@ CMD ["run"]
 
 FROM builder AS operator-builder
 # Which controllers: docker, kubernetes, or operator for both.
-ARG OPERATOR_EXTRAS=docker
+ARG OPERATOR_EXTRAS=operator
 COPY operator operator
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
       ".[$OPERATOR_EXTRAS]"
@@ -70,9 +70,10 @@ LABEL org.opencontainers.image.title="rosproxy-operator" \
       org.opencontainers.image.licenses="Apache-2.0"
 COPY --from=operator-builder /opt/rosproxy /opt/rosproxy
 ENV PATH=/opt/rosproxy/bin:$PATH
-# A number, as above. It writes no file and opens no port but its own health check, on
-# loopback. The engine's socket belongs to root: who mounts it runs this as 0:0, still
-# without any capability (examples/docker), or puts a socket proxy between.
+# A number, as above. It writes no file at all; the key of the admission webhook is served from
+# memory. Docker's controller opens no port but its own health check, on loopback. The engine's
+# socket belongs to root: who mounts it runs this as 0:0, still without any capability
+# (examples/docker), or puts a socket proxy between. In Kubernetes the command is `kubernetes`.
 USER 10001:10001
 WORKDIR /
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy-controller", "health"]

@@ -27,7 +27,7 @@ class Commands(ProxyCommands):
 )
 @click.version_option(__version__, prog_name="rosproxy-controller")
 def main() -> None:
-    """Sets up rosproxy by itself for the containers of a host."""
+    """Sets up rosproxy by itself for the containers of a host or the pods of a cluster."""
 
 
 @main.group(
@@ -113,7 +113,7 @@ def docker(
     from rosproxy.core.settings import SettingError
     from rosproxy_operator.settings import parse_docker_settings
 
-    _need("docker")
+    _need("docker", "docker")
     logs.set_up(log_format, log_level)
     logging.getLogger("docker").setLevel(logging.INFO)  # the SDK tells of each request otherwise
     logging.getLogger("urllib3").setLevel(logging.INFO)
@@ -127,12 +127,12 @@ def docker(
         raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
 
 
-def _need(library: str) -> None:
+def _need(library: str, extra: str) -> None:
     """Say how to install a library that one kind of controller needs, if it is not there."""
     if importlib.util.find_spec(library) is None:
         click.echo(
             f"rosproxy-controller: the Python package {library} is not installed here: "
-            f"pip install 'rosproxy[{library}]' (in its sources: pip install '.[{library}]')",
+            f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')",
             err=True,
         )
         sys.exit(1)
@@ -180,6 +180,114 @@ def plan(settings: Any) -> None:
     from rosproxy_operator.docker import run
 
     _or_exit(lambda: run.show_plan(settings.plan))
+
+
+@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
+@click.option(
+    "--namespace",
+    multiple=True,
+    metavar="NAME",
+    help="Look after the RosProxies of this namespace only (repeatable). Default: of all.",
+)
+@click.option(
+    "--proxy-image",
+    default="rosproxy:latest",
+    metavar="IMAGE",
+    help="Image of the proxies whose RosProxy names none.",
+)
+@click.option(
+    "--proxy-image-pull-policy",
+    type=click.Choice(["Always", "IfNotPresent", "Never"]),
+    help="Their imagePullPolicy. Default: left to Kubernetes.",
+)
+@click.option(
+    "--node-port-range",
+    default="30000-32767",
+    metavar="A-B",
+    help="The API server's --service-node-port-range: no proxy gets a port of it.",
+)
+@click.option(
+    "--ephemeral-range",
+    default="32768-60999",
+    metavar="A-B",
+    help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
+)
+@click.option(
+    "--resync", type=float, default=30.0, metavar="S", help="Longest time between two looks."
+)
+@click.option(
+    "--webhook-bind",
+    default="none",
+    metavar="ADDRESS:PORT",
+    help="Where the admission webhook is served that wires pods; none: it is not.",
+)
+@click.option(
+    "--webhook-service",
+    metavar="NAMESPACE/NAME",
+    help="The webhook's Service: the names for which its certificate is made.",
+)
+@click.option(
+    "--webhook-secret",
+    metavar="NAMESPACE/NAME",
+    help="An existing Secret in which that certificate is kept over restarts.",
+)
+@click.option(
+    "--webhook-configuration",
+    metavar="NAME",
+    help="The MutatingWebhookConfiguration into which its CA is written.",
+)
+@click.option(
+    "--webhook-cert-dir",
+    metavar="DIR",
+    help="Take the certificate from here instead (tls.crt, tls.key), anew when it changes.",
+)
+@click.option(
+    "--admin-bind",
+    default="0.0.0.0:11313",
+    metavar="ADDRESS:PORT",
+    help="Where /healthz, /readyz and /metrics are served.",
+)
+@click.option(
+    "--liveness-bind",
+    default="0.0.0.0:8080",
+    metavar="ADDRESS:PORT",
+    help="Where /healthz is served for the kubelet: it fails when any part hangs.",
+)
+@log_options
+def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
+    """Look after the RosProxies of a Kubernetes cluster.
+
+    The cluster is the one that this runs in, else the one that KUBECONFIG names. Every option has
+    an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
+    """
+    from rosproxy.core.settings import SettingError
+    from rosproxy_operator.settings import parse_kubernetes_settings
+
+    for library in ("kubernetes", "kopf", "cryptography"):
+        _need(library, "kubernetes")
+    try:
+        settings = parse_kubernetes_settings(options)
+    except SettingError as error:
+        raise click.UsageError(str(error)) from None
+    _run_kubernetes(settings, log_format, log_level)
+
+
+def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
+    from rosproxy import logs
+    from rosproxy.core.settings import SettingError
+    from rosproxy_operator.kubernetes.errors import ApiError
+    from rosproxy_operator.kubernetes.kopf_log import quieten
+    from rosproxy_operator.kubernetes.run import run
+
+    logs.set_up(log_format, log_level)
+    quieten()
+    try:
+        run(settings)
+    except SettingError as error:
+        raise click.UsageError(str(error)) from None
+    except ApiError as error:
+        click.echo(f"rosproxy-controller: {error}", err=True)
+        sys.exit(1)
 
 
 @main.command()

@@ -1,7 +1,8 @@
-"""Prometheus metrics of a controller."""
+"""Prometheus metrics of the controllers."""
 
+import re
 from collections import Counter as Tally
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from prometheus_client import (
     CollectorRegistry,
@@ -16,22 +17,26 @@ from rosproxy import __version__
 
 STATES = ("created", "restarting", "running", "paused", "exited", "dead", "removing")
 """The states of a container, in the engine's words."""
+POD_STATES = ("ready", "starting", "stuck")
+"""The states of a proxy's pod."""
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 20)
+_WORD = re.compile(r"(?<!^)(?=[A-Z])")
 
 
-class Metrics:
-    """All metrics of a controller, in a registry of their own."""
+class CommonMetrics:
+    """The metrics of any controller, in a registry of their own.
 
-    def __init__(self) -> None:
+    ``of`` is what it looks at, ``on`` what it acts on, ``states`` those that a proxy can be in.
+    """
+
+    def __init__(self, of: str, on: str, states: Sequence[str]) -> None:
         self.registry = registry = CollectorRegistry()
+        self._states = states
         ProcessCollector(registry=registry)
         build = Info("rosproxy_controller_build", "The controller's version.", registry=registry)
         build.info({"version": __version__})
-        self.looks = Counter(
-            "rosproxy_controller_looks",
-            "Looks at the engine by outcome (ok, unavailable, failed).",
-            ["outcome"],
-            registry=registry,
+        self.looks = self.counter(
+            "looks", f"Looks at the {of} by outcome (ok, unavailable, failed).", "outcome"
         )
         self.look_time = Histogram(
             "rosproxy_controller_look_seconds",
@@ -39,27 +44,59 @@ class Metrics:
             registry=registry,
             buckets=_BUCKETS,
         )
-        self.actions = Counter(
-            "rosproxy_controller_actions",
-            "What was done to the host by action and outcome (ok, failed, taken: a port was).",
-            ["action", "outcome"],
-            registry=registry,
+        self.actions = self.counter(
+            "actions",
+            f"What was done to the {on} by action and outcome (ok, failed, taken: a port was).",
+            "action",
+            "outcome",
         )
-        self.containers = self._gauge("containers", "Containers that a proxy is there for.")
-        self.problems = self._gauge("problems", "Problems that are there now.")
-        self.engine_up = self._gauge("engine_up", "Whether the engine answers.")
-        self.proxies = Gauge(
-            "rosproxy_controller_proxies",
-            "Proxy containers by state.",
-            ["state"],
-            registry=registry,
-        )
+        self.problems = self.gauge("problems", "Problems that are there now.")
+        self.proxies = self.gauge("proxies", "Proxies by state.", "state")
 
     def show_proxies(self, states: Iterable[str]) -> None:
         """Set the number of proxies in each state."""
         tally = Tally(states)
-        for state in STATES:
+        for state in self._states:
             self.proxies.labels(state).set(tally[state])
 
-    def _gauge(self, name: str, text: str) -> Gauge:
-        return Gauge(f"rosproxy_controller_{name}", text, registry=self.registry)
+    def count(self, action: object, outcome: str) -> None:
+        """Count an action, named after its class."""
+        word = _WORD.sub("_", type(action).__name__).lower()
+        self.actions.labels(word, outcome).inc()
+
+    def counter(self, name: str, text: str, *labels: str) -> Counter:
+        """A new counter."""
+        return Counter(f"rosproxy_controller_{name}", text, labels, registry=self.registry)
+
+    def gauge(self, name: str, text: str, *labels: str) -> Gauge:
+        """A new gauge."""
+        return Gauge(f"rosproxy_controller_{name}", text, labels, registry=self.registry)
+
+
+class Metrics(CommonMetrics):
+    """All metrics of a Docker controller."""
+
+    def __init__(self) -> None:
+        super().__init__("engine", "host", STATES)
+        self.containers = self.gauge("containers", "Containers that a proxy is there for.")
+        self.engine_up = self.gauge("engine_up", "Whether the engine answers.")
+
+
+class ClusterMetrics(CommonMetrics):
+    """All metrics of a Kubernetes controller."""
+
+    def __init__(self) -> None:
+        super().__init__("API server", "cluster", POD_STATES)
+        self.api_up = self.gauge("api_up", "Whether the API server answers.")
+        self.rosproxies = self.gauge("rosproxies", "RosProxies that can be read.")
+        self.pods = self.gauge("pods", "Running pods that a RosProxy selects.")
+        self.admissions = self.counter(
+            "admissions", "Pods at admission by outcome (wired, left, failed).", "outcome"
+        )
+        self.certificate_expiry = self.gauge(
+            "certificate_expiry_seconds",
+            "When the admission webhook's certificate expires, in seconds of Unix time.",
+        )
+        self.watch_restarts = self.counter(
+            "watch_restarts", "How often watching had to be started anew; looks go on meanwhile."
+        )

@@ -97,3 +97,44 @@ def test_docker_page_lists_the_engine_calls() -> None:
     page = (ROOT / "docs/docker.md").read_text().splitlines()
     assert calls
     assert [line.strip() for line in page if line.strip() in calls] == calls
+
+
+def test_kubernetes_page_names_every_option_label_and_metric() -> None:
+    from rosproxy_operator.cli import main
+    from rosproxy_operator.core.kubernetes import names
+    from rosproxy_operator.metrics import ClusterMetrics
+
+    text = (ROOT / "docs/kubernetes.md").read_text()
+    options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]
+    labels = [names.INJECT, names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT]
+    annotations = [names.ADVERTISE_HOST, names.MASTER_URI]
+    metrics = [family.name for family in ClusterMetrics().registry.collect()]
+    own = [name for name in metrics if not name.startswith("process_")]
+    assert not [word for word in [*options, *labels, *annotations, *own] if word not in text]
+
+
+def rules() -> dict[str, set[str]]:
+    """What the controller's service account has to be allowed, by resource, as its code says."""
+    from rosproxy_operator.kubernetes import api
+
+    lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", api.__doc__ or "", re.M)
+    return {resource: set(verbs.split()) for resource, verbs in lines}
+
+
+def test_the_chart_grants_what_the_code_calls_and_no_more() -> None:
+    granted: dict[str, set[str]] = {}
+    text = (ROOT / "charts/rosproxy/templates/rbac.yaml").read_text()
+    text = text.partition(".Values.rbac.aggregate")[0]  # what follows is for users
+    text += (ROOT / "charts/rosproxy/templates/_rules.tpl").read_text()
+    for resources, verbs in re.findall(
+        r"resources: \[([^\]]+)\](?:\n *resourceNames:.*)?\n *verbs: \[([^\]]+)\]", text
+    ):
+        for resource in resources.split(","):
+            granted.setdefault(resource.strip(), set()).update(map(str.strip, verbs.split(",")))
+    assert rules()
+    assert {resource: granted.get(resource) for resource in rules()} == rules()
+
+
+def test_kubernetes_page_names_every_rule() -> None:
+    text = (ROOT / "docs/kubernetes.md").read_text()
+    assert not [resource for resource in rules() if resource not in text]

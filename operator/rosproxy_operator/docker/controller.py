@@ -3,11 +3,10 @@
 import asyncio
 import contextlib
 import logging
-import re
 import time
 
 from rosproxy.tasks import Tasks
-from rosproxy_operator.core.docker.actions import Action, Create
+from rosproxy_operator.core.docker.actions import Create
 from rosproxy_operator.core.docker.fingerprint import master, proxy_name
 from rosproxy_operator.core.docker.memory import Memory
 from rosproxy_operator.core.docker.model import (
@@ -42,7 +41,6 @@ PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until an engine is asked again that did not answer; the last is repeated."""
 LONGEST_LOOK = 60.0
 """Seconds after which a look that has not ended means that the controller hangs."""
-_WORD = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 class Controller:
@@ -58,7 +56,7 @@ class Controller:
         self._inspector = Inspector(engine, self._wake)
         self._observer = Observer(engine, settings.plan, self._inspector)
         self._applier = Applier(engine, settings.plan, self._proxies, self._masters)
-        self._work = Work(self._tasks, self._wake, self._port_taken, self._count)
+        self._work = Work(self._tasks, self._wake, self._port_taken, metrics.count)
         uplink = settings.plan.uplink
         self._teller = Teller(self._tasks, self._proxies, self._masters, uplink, self._wake)
         self._events = Events(engine, self._happened)
@@ -257,10 +255,6 @@ class Controller:
     def _port_taken(self, name: str, port: int | None) -> None:
         ports = None if port is None else [port]
         self._memory = self._memory.port_taken(name, ports, time.monotonic())
-
-    def _count(self, action: Action, outcome: str) -> None:
-        word = _WORD.sub("_", type(action).__name__).lower()
-        self._metrics.actions.labels(word, outcome).inc()
 
     def _happened(self) -> None:
         self._look_in(SETTLED)

@@ -1,0 +1,1 @@
+"""The controller for a Kubernetes cluster: thin adapters around the planning core."""

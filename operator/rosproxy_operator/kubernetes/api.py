@@ -1,0 +1,243 @@
+"""The API server as far as the controller needs it: a thin layer over the `kubernetes` client.
+
+Its service account may do exactly this; ``watch`` is what kopf does. Those of the second part are
+for single objects, by name::
+
+    nodes                   list watch
+    pods                    get list watch create delete patch
+    services                get list watch create delete
+    events                  get list create patch
+    rosproxies              list watch
+    rosproxies/status       patch
+
+    secrets                                get patch
+    mutatingwebhookconfigurations          get patch
+
+Objects go in and out as JSON: the client's models would drop fields that are newer than they are.
+"""
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+from urllib.parse import quote
+
+from kubernetes.client import ApiClient, Configuration
+from kubernetes.client.exceptions import ApiException
+from kubernetes.config import ConfigException, load_incluster_config, load_kube_config
+from urllib3.exceptions import HTTPError
+
+from rosproxy import __version__
+from rosproxy_operator.core.kubernetes.model import Json, Name
+from rosproxy_operator.core.kubernetes.names import (
+    GROUP,
+    OWN_SELECTOR,
+    PLURAL,
+    VERSION,
+)
+from rosproxy_operator.kubernetes.errors import ApiError, Kind, refusal, unreachable
+
+Found = dict[str, Any]
+Timeout = tuple[float, float]
+WITHIN: Timeout = (3.0, 15.0)
+"""Seconds to connect and to wait for an answer."""
+SOON: Timeout = (1.0, 2.0)
+"""The same while somebody waits for a pod to be admitted."""
+_CORE = "/api/v1"
+_CUSTOM = f"/apis/{GROUP}/{VERSION}"
+_WEBHOOKS = "/apis/admissionregistration.k8s.io/v1/mutatingwebhookconfigurations"
+_CONNECTIONS = 16
+
+
+class Api:
+    """The cluster that this process runs in, else the one that KUBECONFIG names.
+
+    Can be used by many threads. Every method raises ApiError. ``namespaces`` are those that are
+    looked after; all if there are none.
+    """
+
+    def __init__(self, namespaces: Sequence[str] = ()) -> None:
+        self._namespaces = tuple(namespaces)
+        configuration = _configuration()
+        self.server = str(configuration.host)
+        self._client = ApiClient(configuration)
+        self._client.user_agent = f"rosproxy-controller/{__version__}"
+        self._versions: dict[str, str] = {}
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._client.close()  # type: ignore[no-untyped-call]
+
+    def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[Found]:
+        """All RosProxies, or those of a namespace, as they are at this moment."""
+        places = (namespace,) if namespace else self._places
+        return [
+            found
+            for place in places
+            for found in self._items(self._ask("GET", _path(_CUSTOM, place, PLURAL), within=within))
+        ]
+
+    def nodes(self) -> list[Found]:
+        """All nodes."""
+        return self._cached("", "nodes", {})
+
+    def own(self, kind: str) -> list[Found]:
+        """The ``pods`` or ``services`` that the controller has made."""
+        query = {"labelSelector": OWN_SELECTOR}
+        return [found for place in self._places for found in self._cached(place, kind, query)]
+
+    def pods(self, namespace: str, selector: str) -> list[Found]:
+        """The pods of a namespace that a label selector fits."""
+        return self._cached(namespace, "pods", {"labelSelector": selector})
+
+    def pods_on(self, node: str) -> list[Found]:
+        """All pods on a node, whatever their namespace: all of them may hold ports there."""
+        return self._cached("", "pods", {"fieldSelector": f"spec.nodeName={node}"})
+
+    def events_of(self, pod: Name, uid: str, reason: str) -> list[Found]:
+        """The Events with a reason about a pod."""
+        query = {"fieldSelector": f"involvedObject.uid={uid},reason={reason}"}
+        return self._items(self._ask("GET", _path(_CORE, pod.namespace, "events"), query))
+
+    def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> Found:
+        """One object of the core group, for example of the kind ``services``."""
+        return self._ask("GET", _path(_CORE, id.namespace, kind, id.name), within=within)
+
+    def create(self, kind: str, body: Json, within: Timeout = WITHIN) -> Found:
+        """Create an object of the core group in the namespace that it names."""
+        path = _path(_CORE, body["metadata"]["namespace"], kind)
+        return self._ask("POST", path, body=body, within=within)
+
+    def delete(self, kind: str, id: Name, uid: str) -> None:
+        """Delete an object of the core group if it still has this uid."""
+        options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": {"uid": uid}}
+        self._ask("DELETE", _path(_CORE, id.namespace, kind, id.name), body=options)
+
+    def patch(self, kind: str, id: Name, operations: list[Json]) -> Found:
+        """Change an object of the core group by a JSON patch."""
+        return self._ask("PATCH", _path(_CORE, id.namespace, kind, id.name), body=operations)
+
+    def patch_status(self, id: Name, operations: list[Json]) -> None:
+        """Change the status of a RosProxy by a JSON patch."""
+        path = _path(_CUSTOM, id.namespace, PLURAL, id.name)
+        self._ask("PATCH", f"{path}/status", body=operations)
+
+    def webhook_configuration(self, name: str) -> Found:
+        """A MutatingWebhookConfiguration."""
+        return self._ask("GET", f"{_WEBHOOKS}/{quote(name, safe='')}")
+
+    def patch_webhook_configuration(self, name: str, operations: list[Json]) -> None:
+        """Change a MutatingWebhookConfiguration by a JSON patch."""
+        self._ask("PATCH", f"{_WEBHOOKS}/{quote(name, safe='')}", body=operations)
+
+    @property
+    def _places(self) -> tuple[str, ...]:
+        """The namespaces to list; an empty name means all at once."""
+        return self._namespaces or ("",)
+
+    def _cached(self, namespace: str, kind: str, query: Mapping[str, str]) -> list[Found]:
+        """List from what the API server has in memory, which costs etcd nothing.
+
+        It may lag behind a little, but never behind a list before: another API server, which lags
+        more, would otherwise make pods seem gone that are not.
+        """
+        path = _path(_CORE, namespace, kind)
+        version = {"resourceVersion": self._versions.get(kind, "0")}
+        if kind in self._versions:
+            version["resourceVersionMatch"] = "NotOlderThan"
+        try:
+            found = self._ask("GET", path, {**query, **version})
+        except ApiError as error:
+            if "resource version" not in str(error).lower():
+                raise
+            # The store was set back, or no API server has caught up: ask the store itself.
+            self._versions.pop(kind, None)
+            found = self._ask("GET", path, query)
+        items = self._items(found)
+        metadata = found.get("metadata")
+        self._note(kind, metadata if isinstance(metadata, dict) else {})
+        return items
+
+    def _note(self, kind: str, metadata: Found) -> None:
+        """Remember how new a list was. Lists of a kind are asked for side by side."""
+        version = str(metadata.get("resourceVersion") or "")
+        if version.isdecimal() and int(version) > int(self._versions.get(kind, "0")):
+            self._versions[kind] = version
+
+    def _items(self, found: Found) -> list[Found]:
+        items = found.get("items")
+        if not isinstance(items, list):
+            raise ApiError(Kind.AWAY, f"what answers at {self.server} is no API server")
+        return [item for item in items if isinstance(item, dict)]
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Json | list[Json] | None = None,
+        within: Timeout = WITHIN,
+    ) -> Found:
+        try:
+            status, reason, data = self._call(method, path, query or {}, body, within)
+        except (HTTPError, ApiException, ConfigException, OSError) as error:
+            raise unreachable(self.server, error) from error
+        if not 200 <= status <= 299:
+            raise refusal(status, reason, data)
+        try:
+            found = json.loads(data)
+        except ValueError:
+            found = None
+        if not isinstance(found, dict):
+            raise ApiError(Kind.AWAY, f"what answers at {self.server}{path} is no API server")
+        return found
+
+    def _call(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str],
+        body: Json | list[Json] | None,
+        within: Timeout,
+    ) -> tuple[int, str, bytes]:
+        """HTTP status, reason phrase and body of what is answered."""
+        patch = isinstance(body, list)
+        headers = {
+            "Accept": "application/json",
+            "Content-Type": "application/json-patch+json" if patch else "application/json",
+        }
+        request = self._client.param_serialize(
+            method,
+            path,
+            query_params=list(query.items()),
+            header_params=headers,
+            body=body,
+            auth_settings=["BearerToken"],
+        )
+        answer: Any = self._client.call_api(*request, _request_timeout=within)
+        return int(answer.status), str(answer.reason or ""), bytes(answer.read())
+
+
+def _configuration() -> Any:
+    """How to reach the API server. Raises ApiError."""
+    configuration = Configuration()
+    try:
+        if os.environ.get("KUBERNETES_SERVICE_HOST"):
+            load_incluster_config(client_configuration=configuration)  # type: ignore[no-untyped-call]
+        else:
+            load_kube_config(client_configuration=configuration)  # type: ignore[no-untyped-call]
+    except (ConfigException, OSError) as error:
+        raise ApiError(
+            Kind.AWAY,
+            f"no cluster is known here ({error}): run it in a pod with a service account, or name "
+            "a kubeconfig (KUBECONFIG)",
+        ) from error
+    # Whoever asks tries again, and is to know at once.
+    configuration.retries = False
+    configuration.connection_pool_maxsize = _CONNECTIONS
+    return configuration
+
+
+def _path(root: str, namespace: str, kind: str, name: str = "") -> str:
+    parts = ["namespaces", namespace, kind] if namespace else [kind]
+    return "/".join([root, *(quote(part, safe="") for part in [*parts, name] if part)])

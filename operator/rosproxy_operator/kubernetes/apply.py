@@ -1,0 +1,270 @@
+"""Carrying out what was planned.
+
+Every action may be carried out twice, or after somebody else did it, or on something that has
+vanished meanwhile: that is no error, the next look sees what is left to do.
+"""
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable, Iterable
+
+from rosproxy.tasks import Tasks
+from rosproxy_operator.core.kubernetes.actions import (
+    Action,
+    CreateProxy,
+    CreateService,
+    DeleteProxy,
+    DeleteService,
+    Emit,
+    PatchStatus,
+    SetImage,
+)
+from rosproxy_operator.core.kubernetes.manifests import with_token, without_cluster_ip
+from rosproxy_operator.core.kubernetes.model import Failure, Json, Name, Observed
+from rosproxy_operator.core.kubernetes.names import CONTAINER, KIND, is_own
+from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.kubernetes.api import WITHIN, Api, Timeout
+from rosproxy_operator.kubernetes.converse import address_of
+from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.happen import emit
+from rosproxy_operator.proxies import Proxies, ProxyError
+from rosproxy_operator.threads import in_thread
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 8
+"""RosProxies that are acted for, or Events that are made, at the same time."""
+RETIRING = 10.0
+"""Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
+
+Count = Callable[[Action, str], None]
+
+
+class Applier:
+    """Carries out actions, those of one RosProxy one after the other.
+
+    ``counted`` is called with each action and its outcome (ok, failed).
+    """
+
+    def __init__(self, api: Api, proxies: Proxies, tasks: Tasks, counted: Count) -> None:
+        self._api, self._proxies, self._tasks, self._counted = api, proxies, tasks, counted
+        self._room = asyncio.Semaphore(AT_ONCE)
+        self._retiring: set[str] = set()
+        self._retired: set[str] = set()
+        self.failures: dict[Name, tuple[Failure, ...]] = {}
+        self.problems: dict[Name, Problem] = {}
+
+    async def carry_out(self, actions: Iterable[Action], observed: Observed) -> None:
+        """Carry out what was planned from what was observed. What fails is noted, not raised."""
+        groups: dict[Name, list[Action]] = {}
+        for action in actions:
+            groups.setdefault(action.of, []).append(action)
+        await asyncio.gather(*(self._group(of, some, observed) for of, some in groups.items()))
+        there = {each.id for each in observed.rosproxies} | set(observed.unusable)
+        self.failures = {of: some for of, some in self.failures.items() if of in there}
+        self.problems = {of: each for of, each in self.problems.items() if of in there}
+        self._retired &= {proxy.pod.uid for proxy in observed.proxies}
+
+    async def _group(self, of: Name, actions: list[Action], observed: Observed) -> None:
+        async with self._room:
+            doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
+            failures = [failure for a in doing if (failure := await self._one(a, observed))]
+            if doing:
+                self.failures[of] = tuple(failures)
+            for action in actions:
+                if isinstance(action, PatchStatus):
+                    await self._status(action, observed)
+        emits = [action for action in actions if isinstance(action, Emit)]
+        told = [each for each in emits if not (failures and each.type == "Normal")]
+        await asyncio.gather(*(self._tell(each, observed) for each in told))
+
+    async def _tell(self, event: Emit, observed: Observed) -> None:
+        async with self._room:
+            await self._one(event, observed)
+
+    async def _status(self, action: PatchStatus, observed: Observed) -> None:
+        failure = await self._one(action, observed)
+        self.problems.pop(action.of, None)
+        if failure:
+            text = f"its status can't be written: {failure.text}"
+            self.problems[action.of] = Problem(f"rosproxy {action.of}", text)
+
+    async def _one(self, action: Action, observed: Observed) -> Failure | None:
+        """Carry out one action; what went wrong."""
+        if isinstance(action, DeleteProxy) and action.retire and action.uid not in self._retired:
+            self._retire(action, observed)
+            return None
+        try:
+            await in_thread(self._do, action, observed)
+        except ApiError as error:
+            if error.kind in _nothing_left(action):
+                log.debug("%s: nothing to do: %s", line(action), error)
+                return None
+            return self._failed(action, str(error))
+        except Exception as error:  # a mistake of ours must not stop the others
+            log.exception("%s failed", line(action))
+            return self._failed(action, f"the controller failed: {error!r}")
+        self._done(action)
+        return None
+
+    def _done(self, action: Action) -> None:
+        quiet = isinstance(action, PatchStatus | Emit)
+        log.log(logging.DEBUG if quiet else logging.INFO, "%s", line(action))
+        self._counted(action, "ok")
+
+    def _failed(self, action: Action, text: str) -> Failure:
+        failure = Failure(str(_subject(action)), text)
+        known = failure in self.failures.get(action.of, ())
+        quiet = known or isinstance(action, PatchStatus)  # that one is told as a problem
+        log.log(logging.DEBUG if quiet else logging.WARNING, "%s: %s", line(action), text)
+        self._counted(action, "failed")
+        return failure
+
+    def _do(self, action: Action, observed: Observed) -> None:
+        api = self._api
+        match action:
+            case CreateService():
+                create_service(api, action.body)
+            case CreateProxy():
+                _create(api, "pods", with_token(action.body, secrets.token_hex(16)))
+            case DeleteService():
+                api.delete("services", action.id, action.uid)
+            case DeleteProxy():
+                api.delete("pods", action.id, action.uid)
+            case SetImage():
+                api.patch("pods", action.id, _image_patch(action))
+            case PatchStatus():
+                self._patch_status(action, observed)
+            case Emit():
+                emit(api, action)
+
+    def _patch_status(self, action: PatchStatus, observed: Observed) -> None:
+        found = next((each for each in observed.rosproxies if each.id == action.of), None)
+        there = found or observed.unusable.get(action.of)
+        if there is None or there.status == action.status:
+            return
+        self._api.patch_status(action.of, status_patch(there.uid, action.status))
+
+    def _retire(self, action: DeleteProxy, observed: Observed) -> None:
+        """Let a proxy unregister its nodes, then delete it, beside everything else."""
+        if action.uid not in self._retiring:
+            self._retiring.add(action.uid)
+            self._tasks.spawn(self._retire_and_delete(action, observed), f"retiring {action.id}")
+
+    async def _retire_and_delete(self, action: DeleteProxy, observed: Observed) -> None:
+        try:
+            proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
+            if proxy is not None and proxy.pod.ip:
+                async with asyncio.timeout(RETIRING):
+                    told = await self._proxies.retire(address_of(proxy), proxy.token)
+                log.info("%s has unregistered its nodes: %s", action.id, told)
+        except (ProxyError, TimeoutError) as error:
+            reason = str(error) or f"no answer in {RETIRING:g} s"
+            log.info("%s could not unregister its nodes at the master: %s", action.id, reason)
+        finally:
+            self._retired.add(action.uid)
+            self._retiring.discard(action.uid)
+            await self._one(action, observed)
+
+
+def create_service(api: Api, body: Json, within: Timeout = WITHIN) -> None:
+    """Create a RosProxy's Service, if need be under another address than before.
+
+    Raises ApiError.
+    """
+    try:
+        _create(api, "services", body, within)
+    except ApiError as error:
+        if error.kind is not Kind.INVALID or "clusterIP" not in body["spec"]:
+            raise
+        log.info("%s: %s; taking another address", _id(body), error)
+        _create(api, "services", without_cluster_ip(body), within)
+
+
+def status_patch(uid: str, status: Json) -> list[Json]:
+    """The JSON patch that replaces the whole status, of the RosProxy with this uid only."""
+    return [
+        {"op": "test", "path": "/metadata/uid", "value": uid},
+        {"op": "add", "path": "/status", "value": status},
+    ]
+
+
+def line(action: Action) -> str:
+    """An action in one line."""
+    match action:
+        case CreateService() | CreateProxy():
+            return f"create {action.body.get('kind')} {_id(action.body)}"
+        case DeleteService() | DeleteProxy():
+            kind = "Service" if isinstance(action, DeleteService) else "Pod"
+            return f"delete {kind} {action.id}: {action.why}"
+        case SetImage():
+            return f"set image of Pod {action.id} to {action.image}"
+        case PatchStatus():
+            return f"write status of RosProxy {action.of}"
+        case Emit():
+            return f"event for {action.of}: {action.reason}: {action.message}"
+
+
+def _create(api: Api, kind: str, body: Json, within: Timeout = WITHIN) -> None:
+    try:
+        api.create(kind, body, within)
+    except ApiError as error:
+        if error.kind is not Kind.CONFLICT:
+            raise
+        _check_ours(api, kind, body)
+
+
+def _check_ours(api: Api, kind: str, body: Json) -> None:
+    """Raise ApiError if the object that has the name already is not the controller's.
+
+    If it is, the list that was planned from was a little old, or a RosProxy of the same name has
+    just been deleted.
+    """
+    try:
+        there = api.get(kind, _id(body))["metadata"]
+    except ApiError as error:
+        if error.kind is Kind.GONE:
+            return
+        raise
+    owners = there.get("ownerReferences") or ()
+    if not is_own(there.get("labels") or {}) or KIND not in {one.get("kind") for one in owners}:
+        raise ApiError(
+            Kind.CONFLICT,
+            f"a {body.get('kind')} of this name that is not the controller's is there: rename it, "
+            "or rename the RosProxy",
+        )
+
+
+def _image_patch(action: SetImage) -> list[Json]:
+    container = "/spec/containers/0"
+    return [
+        {"op": "test", "path": "/metadata/uid", "value": action.uid},
+        {"op": "test", "path": f"{container}/name", "value": CONTAINER},
+        {"op": "replace", "path": f"{container}/image", "value": action.image},
+    ]
+
+
+def _subject(action: Action) -> Name:
+    """The object that an action is about."""
+    match action:
+        case CreateService() | CreateProxy():
+            return _id(action.body)
+        case DeleteService() | DeleteProxy() | SetImage():
+            return action.id
+        case _:
+            return action.of
+
+
+def _id(body: Json) -> Name:
+    return Name(str(body["metadata"]["namespace"]), str(body["metadata"]["name"]))
+
+
+def _nothing_left(action: Action) -> tuple[Kind, ...]:
+    """The errors that mean that there is nothing left to do.
+
+    The object is gone, or its whole namespace is about to be; or it is another one by now.
+    """
+    if isinstance(action, DeleteService | DeleteProxy | SetImage | PatchStatus):
+        return Kind.GONE, Kind.CONFLICT
+    return (Kind.GONE,)

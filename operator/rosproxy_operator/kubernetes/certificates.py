@@ -1,0 +1,196 @@
+"""The admission webhook's certificate, made here.
+
+The CA signs one certificate and its key is then forgotten: nobody can ever sign another with it.
+"""
+
+import base64
+import os
+import secrets
+import ssl
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+LIFE = timedelta(days=90)
+RENEW_AFTER = 2 / 3
+"""The part of its life after which a certificate is made anew."""
+_BACKDATED = timedelta(hours=1)
+"""So that an API server whose clock is slow takes it as well."""
+CERTIFICATE, KEY, CA = "tls.crt", "tls.key", "ca.crt"
+"""Keys of the Secret; ``ca.crt`` also has the CAs before, as long as they are valid."""
+
+
+class Unfit(Exception):
+    """What was found is no certificate with its key; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A certificate with its key, and the CAs by which it is trusted, all as PEM.
+
+    ``ca`` is empty where that is somebody else's affair.
+    """
+
+    certificate: bytes
+    key: bytes
+    ca: bytes = b""
+
+    @property
+    def expires(self) -> datetime:
+        """When it is not valid any more."""
+        return x509.load_pem_x509_certificate(self.certificate).not_valid_after_utc
+
+    def due(self, now: datetime) -> bool:
+        """Whether it is time for another one."""
+        found = x509.load_pem_x509_certificate(self.certificate)
+        life = found.not_valid_after_utc - found.not_valid_before_utc
+        return now >= found.not_valid_before_utc + life * RENEW_AFTER
+
+    def names(self) -> set[str]:
+        """The DNS names that it is for."""
+        found = x509.load_pem_x509_certificate(self.certificate)
+        try:
+            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return set()
+        return set(names.get_values_for_type(x509.DNSName))
+
+    def secret(self) -> dict[str, str]:
+        """The ``data`` of a Secret that holds it."""
+        held = {CERTIFICATE: self.certificate, KEY: self.key, CA: self.ca}
+        return {name: base64.b64encode(text).decode() for name, text in held.items()}
+
+
+def service_names(namespace: str, name: str) -> list[str]:
+    """The names under which an API server may call a Service."""
+    return [
+        f"{name}.{namespace}.svc",
+        f"{name}.{namespace}",
+        f"{name}.{namespace}.svc.cluster.local",
+    ]
+
+
+def make(names: Iterable[str], now: datetime, before: bytes = b"", life: timedelta = LIFE) -> Pair:
+    """A new certificate for DNS names, with a new CA.
+
+    ``before`` are the CAs until now: those that are valid stay trusted for the time in which the
+    certificate before is still served.
+    """
+    authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
+    # A name of its own: of two CAs that are called the same, some clients try only the first.
+    authority = _name(f"rosproxy webhook {secrets.token_hex(8)}")
+    ca = (
+        _builder(authority, authority_key, now, life)
+        .subject_name(authority)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs=True), critical=True)
+        .sign(authority_key, hashes.SHA256())
+    )
+    certificate = (
+        _builder(authority, key, now, life)
+        .subject_name(_name("rosproxy webhook"))
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([x509.DNSName(name) for name in names]), critical=False
+        )
+        .sign(authority_key, hashes.SHA256())
+    )
+    private = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    return Pair(_pem(certificate), private, _pem(ca) + still_valid(before, now))
+
+
+def read(data: Mapping[str, object]) -> Pair:
+    """A pair from the ``data`` of a Secret. Raises Unfit."""
+    try:
+        found = [
+            base64.b64decode(str(data[name]), validate=True) for name in (CERTIFICATE, KEY, CA)
+        ]
+    except KeyError as error:
+        raise Unfit(f"it has no {error.args[0]}") from None
+    except ValueError:
+        raise Unfit("it is no base64") from None
+    return checked(Pair(*found))
+
+
+def checked(pair: Pair) -> Pair:
+    """The same pair, if it is one that can be served. Raises Unfit."""
+    try:
+        load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), pair)
+        x509.load_pem_x509_certificate(pair.certificate)
+        x509.load_pem_x509_certificates(pair.ca) if pair.ca else None
+    except (ssl.SSLError, ValueError) as error:
+        raise Unfit(f"certificate and key can't be used: {error}") from None
+    return pair
+
+
+def load(context: ssl.SSLContext, pair: Pair) -> None:
+    """Let a context serve a pair from its next connection on. Raises ssl.SSLError.
+
+    Python's ssl reads keys from files alone; this one is only in memory.
+    """
+    file = os.memfd_create("rosproxy-webhook")
+    try:
+        os.write(file, pair.certificate.rstrip() + b"\n" + pair.key)
+        context.load_cert_chain(f"/proc/self/fd/{file}")
+    finally:
+        os.close(file)
+
+
+def still_valid(authorities: bytes, now: datetime) -> bytes:
+    """Those of some certificates that are valid; nothing if they can't be read."""
+    try:
+        found = x509.load_pem_x509_certificates(authorities)
+    except ValueError:
+        return b""
+    return b"".join(_pem(one) for one in found if one.not_valid_after_utc > now)
+
+
+def now() -> datetime:
+    """The time of day, in whole seconds as certificates have it."""
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+def _name(text: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def _builder(
+    issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime, life: timedelta
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BACKDATED)
+        .not_valid_after(now + life)
+    )
+
+
+def _usage(signs: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs,
+        key_cert_sign=signs,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        crl_sign=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _pem(certificate: x509.Certificate) -> bytes:
+    return certificate.public_bytes(serialization.Encoding.PEM)

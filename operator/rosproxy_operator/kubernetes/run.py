@@ -1,0 +1,69 @@
+"""Running the Kubernetes controller."""
+
+import asyncio
+import logging
+import signal
+
+from rosproxy import __version__
+from rosproxy_operator.health import Health
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.controller import Controller
+from rosproxy_operator.kubernetes.keeper import Keeper, source
+from rosproxy_operator.kubernetes.watch import Watch
+from rosproxy_operator.kubernetes.webhook import WebhookServer
+from rosproxy_operator.kubernetes.wire import Wirer
+from rosproxy_operator.metrics import ClusterMetrics
+from rosproxy_operator.settings import KubernetesSettings
+
+log = logging.getLogger(__name__)
+
+
+def run(settings: KubernetesSettings) -> None:
+    """Run the controller until a signal ends it; its proxies go on.
+
+    Raises SettingError if it can't listen where it is told to, ApiError if no cluster is known.
+    """
+    asyncio.run(_run(settings, Api(settings.namespaces)))
+
+
+async def _run(settings: KubernetesSettings, api: Api) -> None:
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    metrics = ClusterMetrics()
+    controller = Controller(settings, api, metrics)
+    health = Health(metrics.registry, controller.dead, controller.unready)
+    await health.start(settings.admin)
+    log.info(
+        "rosproxy-controller %s: looking after %s at %s; health and metrics at http://%s",
+        __version__,
+        ", ".join(settings.namespaces) or "all namespaces",
+        api.server,
+        settings.admin,
+    )
+    keeper = Keeper(source(api, settings.webhook), metrics) if settings.webhook else None
+    watch = _watch(settings, controller, api, keeper, metrics)
+    controller.appeared = watch.restart
+    running = [controller.run(), stopped.wait(), *([keeper.run()] if keeper else [])]
+    tasks = [asyncio.ensure_future(work) for work in running]
+    watch.start()
+    done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, health.stop(), return_exceptions=True)
+    watch.stop()
+    for task in done:
+        task.result()  # raises what it died of
+
+
+def _watch(
+    settings: KubernetesSettings,
+    controller: Controller,
+    api: Api,
+    keeper: Keeper | None,
+    metrics: ClusterMetrics,
+) -> Watch:
+    if settings.webhook is None or keeper is None:
+        return Watch(settings, controller, None, None, metrics)
+    server = WebhookServer(settings.webhook.bind, keeper)
+    return Watch(settings, controller, Wirer(api, metrics), server, metrics)
