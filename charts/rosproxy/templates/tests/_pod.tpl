@@ -1,0 +1,96 @@
+{{/* The name of what the test makes. */}}
+{{- define "rosproxy.test.name" -}}
+{{ include "rosproxy.fullname" . }}-test
+{{- end -}}
+
+{{- define "rosproxy.test.namespace" -}}
+{{- .Values.tests.namespace | default (first .Values.namespaces) | default .Release.Namespace -}}
+{{- end -}}
+
+{{/* Everything that the test makes is gone after it, passed or not. */}}
+{{- define "rosproxy.test.hook" -}}
+helm.sh/hook: test
+helm.sh/hook-delete-policy: before-hook-creation,hook-succeeded,hook-failed
+{{- end -}}
+
+{{/* The labels of the test's objects, from a dict: root, component. */}}
+{{- define "rosproxy.test.labels" -}}
+app.kubernetes.io/name: {{ default .root.Chart.Name .root.Values.nameOverride | trunc 63 | trimSuffix "-" }}-test
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .component }}
+{{- end -}}
+
+{{/* A pod's spec, from a dict: root, args, env, restart. It meets the standard "restricted". */}}
+{{- define "rosproxy.test.pod" -}}
+automountServiceAccountToken: false
+restartPolicy: {{ .restart }}
+terminationGracePeriodSeconds: 1
+{{- with .root.Values.tests.imagePullSecrets }}
+imagePullSecrets:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+securityContext:
+  runAsNonRoot: true
+  runAsUser: 10001
+  runAsGroup: 10001
+  fsGroup: 10001
+  seccompProfile:
+    type: RuntimeDefault
+containers:
+  - name: ros
+    image: {{ .root.Values.tests.image | quote }}
+    {{- with .root.Values.tests.imagePullPolicy }}
+    imagePullPolicy: {{ . }}
+    {{- end }}
+    # Not as command: the entry point of ROS's images sets the environment up.
+    args:
+      {{- toYaml .args | nindent 6 }}
+    env:
+      - name: HOME
+        value: /tmp
+      - name: ROS_HOME
+        value: /tmp/ros
+      - name: ROS_LOG_DIR
+        value: /tmp/ros
+      - name: NODE_NAME
+        value: {{ include "rosproxy.test.name" .root | replace "-" "_" }}_echo
+      {{- range $name, $value := .env }}
+      - name: {{ $name }}
+        {{- if kindIs "string" $value }}
+        value: {{ $value | quote }}
+        {{- else }}
+        {{- toYaml $value | nindent 8 }}
+        {{- end }}
+      {{- end }}
+    resources:
+      requests:
+        cpu: 50m
+        memory: 64Mi
+      limits:
+        memory: 512Mi
+    securityContext:
+      allowPrivilegeEscalation: false
+      readOnlyRootFilesystem: true
+      capabilities:
+        drop: [ALL]
+    volumeMounts:
+      - name: scripts
+        mountPath: /test
+        readOnly: true
+      - name: tmp
+        mountPath: /tmp
+volumes:
+  - name: scripts
+    configMap:
+      name: {{ include "rosproxy.test.name" .root }}
+  - name: tmp
+    emptyDir: {}
+{{- with .root.Values.tests.nodeSelector }}
+nodeSelector:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- with .root.Values.tests.tolerations }}
+tolerations:
+  {{- toYaml . | nindent 2 }}
+{{- end }}
+{{- end -}}

@@ -1,0 +1,171 @@
+"""The Helm chart, rendered without a cluster."""
+
+import itertools
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+ROOT = Path(__file__).resolve().parents[2]
+CHART = ROOT / "charts/rosproxy"
+NAMESPACE = "rosproxy-system"
+KUBERNETES = "1.30.0"
+"""A helm that was not built by its own makefile takes each cluster for an ancient one."""
+
+Json = dict[str, Any]
+Values = Mapping[str, Any]
+
+OPTIONS: dict[str, dict[str, Values]] = {
+    "webhook": {
+        "self-signed": {},
+        "off": {"webhook": {"enabled": False}},
+        "cert-manager": {"webhook": {"certificate": {"source": "cert-manager"}}},
+        "own-issuer": {
+            "webhook": {
+                "certificate": {
+                    "source": "cert-manager",
+                    "certManager": {"issuerRef": {"name": "ca", "kind": "ClusterIssuer"}},
+                }
+            }
+        },
+    },
+    "namespaces": {"all": {}, "two": {"namespaces": ["robots", "arms"]}},
+    "crds": {
+        "installed": {},
+        "kept": {"crds": {"keep": True}},
+        "elsewhere": {"crds": {"install": False}},
+    },
+    "rbac": {
+        "made": {},
+        "aggregated": {"rbac": {"aggregate": True}},
+        "elsewhere": {
+            "rbac": {"create": False},
+            "serviceAccount": {"create": False, "name": "mine"},
+        },
+    },
+    "extras": {
+        "none": {},
+        "all": {
+            "serviceMonitor": {"enabled": True, "labels": {"release": "p"}, "interval": "15s"},
+            "podDisruptionBudget": {"enabled": True},
+            "networkPolicy": {
+                "enabled": True,
+                "metricsFrom": [{"podSelector": {"matchLabels": {"app": "prometheus"}}}],
+            },
+        },
+    },
+    "pod": {
+        "plain": {},
+        "dressed": {
+            "nameOverride": "proxies",
+            "commonLabels": {"team": "arms"},
+            "image": {"repository": "mine/operator", "digest": f"sha256:{'0' * 64}"},
+            "proxy": {"image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"}},
+            "imagePullSecrets": [{"name": "registry"}],
+            "serviceAccount": {"annotations": {"a.example/role": "x"}},
+            "podAnnotations": {"a": "b"},
+            "podLabels": {"c": "d"},
+            "nodeSelector": {"e": "f"},
+            "tolerations": [{"operator": "Exists"}],
+            "affinity": {"nodeAffinity": {}},
+            "priorityClassName": "high",
+            "extraEnv": [{"name": "HTTPS_PROXY", "value": "http://proxy:3128"}],
+            "extraArgs": ["--resync=10"],
+            "log": {"level": "debug", "format": "json"},
+            "tests": {
+                "namespace": "arms",
+                "imagePullPolicy": "Never",
+                "imagePullSecrets": [{"name": "registry"}],
+                "nodeSelector": {"e": "f"},
+                "tolerations": [{"operator": "Exists"}],
+            },
+        },
+    },
+}
+"""The choices that the chart offers, with values that make each."""
+
+
+def helm(*arguments: str | Path, values: Values | None = None) -> subprocess.CompletedProcess[str]:
+    """Run helm, with these values if there are any."""
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        json.dump(values or {}, file)
+        file.flush()
+        given = ["--values", file.name] if values else []
+        command = [str(program()), *map(str, arguments), *given]
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+
+
+def program() -> Path:
+    """Where helm is: `scripts/install-kubernetes.sh` puts it there."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(os.environ.get("CLUSTER_BIN") or Path(cache) / "rosproxy/cluster") / "helm"
+
+
+def render(
+    values: Values | None = None, *options: str, release: str = "rosproxy", chart: Path = CHART
+) -> str:
+    """What the chart makes of values, as YAML."""
+    words = ("template", release, chart, "--namespace", NAMESPACE, "--kube-version", KUBERNETES)
+    done = helm(*words, *options, values=values)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def objects(values: Values | None = None, *options: str, **more: Any) -> list[Json]:
+    """The objects that the chart makes; more are those of `render`."""
+    return parse(render(values, *options, **more))
+
+
+def parse(text: str) -> list[Json]:
+    return [one for one in yaml.load_all(text, Loader=Strict) if one]
+
+
+def of_kind(found: list[Json], kind: str) -> list[Json]:
+    return [one for one in found if one["kind"] == kind]
+
+
+def combinations() -> Iterator[tuple[str, Values]]:
+    """Combinations in which any two choices meet: their names, and the values."""
+    for names in pairwise():
+        chosen = [choices[name] for choices, name in zip(OPTIONS.values(), names, strict=True)]
+        yield " ".join(names), merged(*chosen)
+
+
+def pairwise() -> Iterator[tuple[str, ...]]:
+    """Of all combinations always the one next in which most pairs are new, while there are any."""
+    every = list(itertools.product(*OPTIONS.values()))
+    left = set().union(*map(pairs, every))
+    while left:
+        best = max(every, key=lambda names: len(pairs(names) & left))
+        left -= pairs(best)
+        yield best
+
+
+def pairs(names: tuple[str, ...]) -> set[tuple[tuple[int, str], ...]]:
+    """Any two choices of a combination, with their places."""
+    return set(itertools.combinations(enumerate(names), 2))
+
+
+def merged(*parts: Values) -> Values:
+    """Values on top of each other, as helm lays them."""
+    whole: Json = {}
+    for part in parts:
+        for key, value in part.items():
+            both = isinstance(value, Mapping) and isinstance(whole.get(key), Mapping)
+            whole[key] = merged(whole[key], value) if both else value
+    return whole
+
+
+class Strict(yaml.SafeLoader):  # type: ignore[misc]
+    """YAML in which no key stands twice in a map, which the API server would refuse."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys = [key.value for key, _ in node.value]
+        doubled = {key for key in keys if keys.count(key) > 1}
+        assert not doubled, f"{doubled} stand twice:{node.start_mark}"
+        return super().construct_mapping(node, deep)

@@ -1,0 +1,144 @@
+"""The custom resource definition, compared with what the controller reads and writes."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from scripts.chart_docs import custom_resource
+
+from rosproxy.core.ports import PortRange
+from rosproxy_operator.core.kubernetes import names
+from rosproxy_operator.core.kubernetes.model import Answer, Name, NodeState, Pod, ProxyPod, Service
+from rosproxy_operator.core.kubernetes.parse_rosproxy import MOST_NAME, MOST_PORTS, rosproxy
+from rosproxy_operator.core.kubernetes.statuses import status_of
+from tests.chart.chart import Json
+
+DEFINITION = custom_resource()
+VERSION = DEFINITION["spec"]["versions"][0]
+SCHEMA = VERSION["schema"]["openAPIV3Schema"]
+BOUNDS = {"string": ("maxLength", "enum"), "array": ("maxItems",), "object": ("properties",
+          "maxProperties"), "integer": ("format", "maximum")}  # fmt: skip
+
+
+def fields(schema: Json, path: str = "") -> Iterator[tuple[str, Json]]:
+    """Every field below a schema, items of lists and values of maps too."""
+    for name, field in schema.get("properties", {}).items():
+        yield f"{path}.{name}", field
+        yield from fields(field, f"{path}.{name}")
+    for part in ("items", "additionalProperties"):
+        if part in schema:
+            yield f"{path}[]", schema[part]
+            yield from fields(schema[part], f"{path}[]")
+
+
+SPEC = dict(fields(SCHEMA["properties"]["spec"], "spec"))
+STATUS = dict(fields(SCHEMA["properties"]["status"], "status"))
+
+
+def test_names_are_the_controllers() -> None:
+    spec = DEFINITION["spec"]
+    assert f"{spec['group']}/{VERSION['name']}" == names.API_VERSION
+    assert spec["names"]["plural"] == names.PLURAL
+    assert spec["names"]["kind"] == names.KIND
+    assert spec["names"]["shortNames"] == ["rp"]
+    assert VERSION["subresources"] == {"status": {}}
+
+
+@pytest.mark.parametrize("path", [*SPEC, *STATUS])
+def test_described(path: str) -> None:
+    field = {**SPEC, **STATUS}[path]
+    simple = path.endswith("[]") and field.get("type") != "object"
+    assert simple or field["description"].endswith((".", "`"))
+
+
+@pytest.mark.parametrize("path", SPEC)
+def test_bounded(path: str) -> None:
+    """The cost of a validation rule is estimated from the largest value that a field can have."""
+    field = SPEC[path]
+    if "x-kubernetes-int-or-string" in field:
+        return
+    bounds = BOUNDS.get(field["type"], ())
+    assert any(bound in field for bound in bounds), f"{path} needs one of {bounds}"
+
+
+def test_columns_show_fields() -> None:
+    for column in VERSION["additionalPrinterColumns"]:
+        path = column["jsonPath"].partition("[")[0]
+        assert path.startswith(".metadata.") or path[1:] in STATUS, path
+    always = [one["name"] for one in VERSION["additionalPrinterColumns"] if not one.get("priority")]
+    assert always == ["Master", "Nodes", "Proxies", "Ready", "Age"]
+
+
+def with_defaults(value: Any, schema: Json) -> Any:
+    """An object as the API server completes it."""
+    if not isinstance(value, dict):
+        return value
+    value = dict(value)
+    for name, field in schema.get("properties", {}).items():
+        if name not in value and "default" in field:
+            value[name] = field["default"]
+        if name in value:
+            value[name] = with_defaults(value[name], field)
+    return value
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        {"master": {"uri": "http://robot:11311"}},
+        {"master": {"service": {"name": "master"}}},
+        {"master": {"uri": "http://robot:11311"}, "portWindow": {"first": 20000}},
+        {"master": {"uri": "http://robot:11311"}, "policy": {}, "resources": {}},
+    ],
+)
+def test_defaults_are_the_controllers(spec: Json) -> None:
+    """The controller reads an object the same, whether or not the API server has completed it."""
+    bare = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1}, "spec": spec}
+    completed = with_defaults(bare, SCHEMA)
+    assert completed != bare
+    assert rosproxy(completed) == rosproxy(bare)
+
+
+def test_limits_are_the_controllers() -> None:
+    assert SPEC["spec.ports"]["maximum"] == MOST_PORTS
+    assert f"size() <= {MOST_NAME}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
+
+
+def test_rules_have_messages() -> None:
+    found = [rule for schema in (SCHEMA, *SPEC.values(), SCHEMA["properties"]["spec"])
+             for rule in schema.get("x-kubernetes-validations", [])]  # fmt: skip
+    assert len(found) > 12
+    assert all(len(rule["message"].split()) >= 5 for rule in found)
+
+
+def test_status_is_in_the_definition() -> None:
+    """The API server drops fields that the definition does not have, without a word."""
+    body = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1},
+            "spec": {"master": {"uri": "http://robot:11311"}}}  # fmt: skip
+    own, id = rosproxy(body), Name("b", "rosproxy-a-n-012345")
+    ports = PortRange(11400, 11431)
+    proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", ports, "f", "rosproxy:1", ready=True)
+    pod = Pod(Name("b", "talker"), "v", node="n", ip="192.0.2.3")
+    answer = Answer(True, True, nodes={"192.0.2.3": ("/talker",)}, topics=frozenset({"/chatter"}))
+    states = (
+        NodeState("n", "192.0.2.1", ports, proxy, (pod,), answer),
+        NodeState("m", "192.0.2.2", None, None, (pod,), None, "no ports", "PortsExhausted"),
+    )
+    service = Service(own.id, "c", "w", "192.0.2.9", "f")
+    status = status_of(own, states, (), service, "http://robot:11311", "2026-01-01T00:00:00Z")
+    written = set(paths(status, "status"))
+    assert written <= set(STATUS)
+    unused = {"status.perNode[].message", "status.conditions[].observedGeneration"}
+    assert set(STATUS) - written <= unused
+
+
+def paths(value: Any, path: str) -> Iterator[str]:
+    """The fields of an object, in the words of `fields`."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield f"{path}.{name}"
+            yield from paths(inner, f"{path}.{name}")
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield f"{path}[]"
+            yield from paths(inner, f"{path}[]")

@@ -1,0 +1,119 @@
+"""What is made from the chart is as the chart would make it now."""
+
+import itertools
+import subprocess
+from pathlib import Path
+
+import pytest
+from scripts import chart_docs
+
+from rosproxy import __version__
+from rosproxy_operator.core.kubernetes import names
+from tests.chart.chart import CHART, ROOT, Json, objects, of_kind, parse
+
+INSTALL = ROOT / "manifests/install.yaml"
+EXAMPLE = ROOT / "manifests/example.yaml"
+
+
+def test_install_is_the_chart(tmp_path: Path) -> None:
+    subprocess.run([ROOT / "scripts/manifests.sh", tmp_path], check=True, timeout=60)
+    made = (tmp_path / "install.yaml").read_text()
+    assert INSTALL.read_text() == made, "run: make manifests"
+
+
+def test_tables_are_the_chart() -> None:
+    page = chart_docs.PAGE.read_text()
+    assert page == chart_docs.page(page), "run: make manifests"
+
+
+def test_install_has_no_trace_of_helm() -> None:
+    for one in parse(INSTALL.read_text()):
+        assert not [key for key in one["metadata"].get("annotations", {}) if "helm" in key]
+        assert one["metadata"].get("labels", {}).get("app.kubernetes.io/managed-by") != "Helm"
+        assert not one["metadata"]["name"].endswith("-test")
+
+
+def test_install_makes_its_namespace_first() -> None:
+    first, *others = parse(INSTALL.read_text())
+    assert first["kind"] == "Namespace"
+    namespaces = {one["metadata"].get("namespace") for one in others}
+    assert namespaces == {None, first["metadata"]["name"]}
+
+
+def test_version_is_the_projects() -> None:
+    about = (CHART / "Chart.yaml").read_text()
+    assert f"\nversion: {__version__}\n" in about
+    assert f"\nappVersion: {__version__}\n" in about
+    assert f"IMAGE=$REGISTRY/rosproxy:{__version__} " in chart_docs.PAGE.read_text()
+
+
+def test_every_value_has_a_comment() -> None:
+    rows = list(chart_docs.values(chart_docs.VALUES.read_text()))
+    assert len(rows) > 40
+    assert [path for path, _, comment in rows if not comment] == []
+
+
+def test_example_labels_its_pods() -> None:
+    example = parse(EXAMPLE.read_text())
+    labelled = [one["metadata"]["name"] for one in of_kind(example, "Deployment")
+                if names.INJECT in one["spec"]["template"]["metadata"]["labels"]]  # fmt: skip
+    assert labelled == ["talker", "listener"]
+    assert {one["metadata"].get("namespace", "ros-example") for one in example} == {"ros-example"}
+    (rosproxy,) = of_kind(example, "RosProxy")
+    services = [one["metadata"]["name"] for one in of_kind(example, "Service")]
+    assert rosproxy["spec"]["master"]["service"]["name"] in services
+
+
+@pytest.mark.parametrize("values", [{}, {"namespaces": ["a"]}])
+def test_page_lists_the_rights(values: Json) -> None:
+    """The table in docs/kubernetes.md has the rules of the roles, each of them and no other."""
+    found = objects(values)
+    roles = [*of_kind(found, "ClusterRole"), *of_kind(found, "Role")]
+    granted = {
+        (group, resource, tuple(sorted(rule["verbs"])))
+        for role in roles
+        for rule in role["rules"]
+        for group in rule["apiGroups"]
+        for resource in rule["resources"]
+    }
+    assert granted == documented_rights()
+
+
+def documented_rights() -> set[tuple[str, str, tuple[str, ...]]]:
+    section = chart_docs.PAGE.read_text().partition("| group | resources |")[2]
+    rows = section.partition("\n\n")[0].splitlines()[2:]
+    cells = [[cell.strip(" `") for cell in row.strip("|").split("|")] for row in rows]
+    return {(row[0], row[1], tuple(sorted(row[2].split(", ")))) for row in cells}
+
+
+def test_named_secrets_only() -> None:
+    """What could be read or changed for harm is granted by name."""
+    rules = [rule for role in [*of_kind(objects(), "ClusterRole"), *of_kind(objects(), "Role")]
+             for rule in role["rules"]]  # fmt: skip
+    for rule in rules:
+        assert "*" not in str(rule)
+        named = {"secrets", "mutatingwebhookconfigurations"} & set(rule["resources"])
+        assert bool(rule.get("resourceNames")) == bool(named)
+
+
+def test_writes_in_named_namespaces_only() -> None:
+    found = objects({"namespaces": ["a", "b"]})
+    verbs = {verb for role in of_kind(found, "ClusterRole") for rule in role["rules"]
+             if "resourceNames" not in rule for verb in rule["verbs"]}  # fmt: skip
+    assert verbs == {"get", "list", "watch"}
+    writing = {role["metadata"]["namespace"] for role in of_kind(found, "Role")
+               if any("create" in rule["verbs"] for rule in role["rules"])}  # fmt: skip
+    assert writing == {"a", "b"}
+
+
+def test_every_rule_has_a_comment() -> None:
+    templates = [CHART / "templates/rbac.yaml", CHART / "templates/_rules.tpl"]
+    rules = 0
+    for path in templates:
+        lines = path.read_text().splitlines()
+        for before, line in itertools.pairwise(lines):
+            if line.strip().startswith("- apiGroups:"):
+                rules += 1
+                # The view of users is explained with their edit.
+                assert before.strip().startswith("#") or "rules:" in before, (path.name, line)
+    assert rules == 12

@@ -1,0 +1,78 @@
+"""Values that can't be meant are refused, with a message that names them."""
+
+import json
+from typing import Any
+
+import pytest
+import yaml  # type: ignore[import-untyped]
+
+from tests.chart.chart import CHART, Json, helm
+
+BAD: list[tuple[Json, str]] = [
+    ({"imag": {}}, "imag"),
+    ({"image": {"repo": "x"}}, "repo"),
+    ({"image": {"repository": ""}}, "image/repository"),
+    ({"image": {"tag": "a b"}}, "image/tag"),
+    ({"image": {"tag": 1.2}}, "image/tag"),
+    ({"image": {"digest": "sha256:12"}}, "image/digest"),
+    ({"image": {"pullPolicy": "Sometimes"}}, "image/pullPolicy"),
+    ({"proxy": {"image": {"pullPolicy": "never"}}}, "proxy/image/pullPolicy"),
+    ({"imagePullSecrets": ["registry"]}, "imagePullSecrets/0"),
+    ({"namespaces": "robots"}, "namespaces"),
+    ({"namespaces": ["Robots"]}, "namespaces/0"),
+    ({"namespaces": ["a", "a"]}, "namespaces"),
+    ({"namespaces": ["kube-system"]}, "namespaces/0"),
+    ({"crds": {"install": "yes"}}, "crds/install"),
+    ({"ports": {"nodePortRange": "30000"}}, "ports/nodePortRange"),
+    ({"ports": {"ephemeralRange": "32768 60999"}}, "ports/ephemeralRange"),
+    ({"webhook": {"timeoutSeconds": 31}}, "webhook/timeoutSeconds"),
+    ({"webhook": {"failurePolicy": "Fail"}}, "failurePolicy"),
+    ({"webhook": {"certificate": {"source": "self"}}}, "webhook/certificate/source"),
+    (
+        {"webhook": {"certificate": {"certManager": {"issuerRef": {"kind": "Issuer"}}}}},
+        "webhook/certificate/certManager/issuerRef",
+    ),
+    ({"webhook": {"certificate": {"certManager": {"duration": "90d"}}}}, "certManager/duration"),
+    ({"serviceAccount": {"name": "A b"}}, "serviceAccount/name"),
+    ({"rbac": {"agregate": True}}, "agregate"),
+    ({"log": {"level": "loud"}}, "log/level"),
+    ({"log": {"format": "xml"}}, "log/format"),
+    ({"resources": {"memory": "1Gi"}}, "memory"),
+    ({"commonLabels": {"app.kubernetes.io/name": "x"}}, "commonLabels"),
+    ({"podLabels": {"a": 1}}, "podLabels/a"),
+    ({"extraArgs": "--resync=1"}, "extraArgs"),
+    ({"extraEnv": [{"value": "x"}]}, "extraEnv/0"),
+    ({"replicas": 2}, "replicas"),
+    ({"podDisruptionBudget": {"minAvailable": 2}}, "podDisruptionBudget/minAvailable"),
+    ({"networkPolicy": {"metricsFrom": [{}]}}, "networkPolicy/metricsFrom/0"),
+    ({"serviceMonitor": {"interval": "often"}}, "serviceMonitor/interval"),
+    ({"tests": {"timeoutSeconds": 0}}, "tests/timeoutSeconds"),
+    ({"fullnameOverride": "Rosproxy"}, "fullnameOverride"),
+]
+
+
+@pytest.mark.parametrize(("values", "named"), BAD)
+def test_refused(values: Json, named: str) -> None:
+    done = helm("template", "x", CHART, "--kube-version", "1.30.0", values=values)
+    assert done.returncode != 0
+    assert named.rpartition("/")[2] in done.stderr
+    assert "values don't meet the specifications of the schema" in done.stderr
+
+
+def test_every_value_is_in_the_schema() -> None:
+    """And each group refuses what it does not list."""
+    schema = json.loads((CHART / "values.schema.json").read_text())
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    assert missing(values, schema) == []
+
+
+def missing(values: Any, schema: Json, path: str = "") -> list[str]:
+    """The values that the schema does not name, and the groups that take anything."""
+    properties = schema.get("properties")
+    if not isinstance(values, dict) or not values or properties is None:
+        return []
+    found = [] if schema.get("additionalProperties") is False else [path]
+    for name, value in values.items():
+        where = f"{path}.{name}"
+        found += missing(value, properties[name], where) if name in properties else [where]
+    return found

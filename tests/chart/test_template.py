@@ -1,0 +1,306 @@
+"""What the chart makes of its values, alone and in combination."""
+
+import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosproxy import __version__
+from rosproxy_operator.cli import main
+from rosproxy_operator.settings import WebhookSettings, parse_kubernetes_settings
+from tests.chart.chart import (
+    CHART,
+    NAMESPACE,
+    OPTIONS,
+    Json,
+    combinations,
+    helm,
+    merged,
+    objects,
+    of_kind,
+    parse,
+    render,
+)
+
+CLUSTER_SCOPED = {
+    "ClusterRole", "ClusterRoleBinding", "CustomResourceDefinition",
+    "MutatingWebhookConfiguration",
+}  # fmt: skip
+ALL = dict(combinations())
+CHOICES = [(option, name) for option, choices in OPTIONS.items() for name in choices]
+
+
+@cache
+def rendered(combination: str) -> tuple[Json, ...]:
+    return tuple(parse(render(ALL[combination])))
+
+
+@pytest.mark.parametrize(("option", "choice"), CHOICES)
+def test_lint(option: str, choice: str) -> None:
+    done = helm("lint", CHART, "--strict", "--kube-version", "1.30.0",
+                values=OPTIONS[option][choice])  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert "[WARNING]" not in done.stdout
+
+
+@pytest.mark.parametrize("combination", ALL)
+def test_objects(combination: str) -> None:
+    """Each combination makes objects that are whole, and none of them twice."""
+    found = rendered(combination)
+    ids = [(one["kind"], one["metadata"].get("namespace"), one["metadata"]["name"])
+           for one in found]  # fmt: skip
+    assert len(set(ids)) == len(ids)
+    for one in found:
+        labels = one["metadata"]["labels"]
+        assert labels["app.kubernetes.io/instance"] == "rosproxy"
+        assert ("namespace" in one["metadata"]) == (one["kind"] not in CLUSTER_SCOPED)
+        assert "status" not in one
+    check_references(list(found), ALL[combination])
+
+
+def check_references(found: list[Json], values: Any) -> None:
+    """What names another object names one that is there."""
+    (deployment,) = [one for one in of_kind(found, "Deployment") if "helm.sh/hook" not in str(one)]
+    pod = deployment["spec"]["template"]
+    (service,) = [one for one in of_kind(found, "Service") if "helm.sh/hook" not in str(one)]
+    for selecting in (service["spec"]["selector"], deployment["spec"]["selector"]["matchLabels"]):
+        assert selecting.items() <= pod["metadata"]["labels"].items()
+    ports = {port["name"] for port in pod["spec"]["containers"][0]["ports"]}
+    assert {port["targetPort"] for port in service["spec"]["ports"]} <= ports
+    roles = {(one["kind"], one["metadata"].get("namespace"), one["metadata"]["name"])
+             for one in found if one["kind"] in ("Role", "ClusterRole")}  # fmt: skip
+    for binding in [*of_kind(found, "RoleBinding"), *of_kind(found, "ClusterRoleBinding")]:
+        role = binding["roleRef"]
+        assert (role["kind"], binding["metadata"].get("namespace"), role["name"]) in roles
+        (subject,) = binding["subjects"]
+        assert subject["name"] == pod["spec"]["serviceAccountName"]
+    for webhook in of_kind(found, "MutatingWebhookConfiguration"):
+        client = webhook["webhooks"][0]["clientConfig"]["service"]
+        assert client["name"] == service["metadata"]["name"]
+        assert client["port"] in [port["port"] for port in service["spec"]["ports"]]
+
+
+@pytest.mark.parametrize("combination", ALL)
+def test_arguments(combination: str) -> None:
+    """The controller can use its arguments, and they mean what the values say."""
+    (pod,) = controller(rendered(combination))
+    command, *words = pod["containers"][0]["args"]
+    context = main.commands[command].make_context(command, words)
+    settings = parse_kubernetes_settings(context.params)
+    values: Json = dict(ALL[combination])
+    assert settings.namespaces == tuple(values.get("namespaces", ()))
+    image = values.get("proxy", {}).get("image", {"repository": "rosproxy", "tag": __version__})
+    assert settings.plan.image == f"{image['repository']}:{image['tag']}"
+    ports = {port["name"]: port["containerPort"] for port in pod["containers"][0]["ports"]}
+    assert settings.admin.port == ports["metrics"]
+    assert settings.liveness.port == ports["liveness"]
+    assert settings.resync == (10 if "extraArgs" in values else 30)
+    check_webhook(settings.webhook, ports, list(rendered(combination)))
+
+
+def check_webhook(webhook: WebhookSettings | None, ports: Any, found: list[Json]) -> None:
+    configurations = of_kind(found, "MutatingWebhookConfiguration")
+    assert bool(webhook) == ("webhook" in ports) == bool(configurations)
+    secrets = [one["metadata"]["name"] for one in of_kind(found, "Secret")]
+    if webhook is None:
+        assert secrets == []
+    elif webhook.directory:
+        assert secrets == []
+        assert of_kind(found, "Certificate")
+    else:
+        assert webhook.bind.port == ports["webhook"]
+        assert [webhook.secret.name if webhook.secret else ""] == secrets
+        assert webhook.configuration == configurations[0]["metadata"]["name"]
+
+
+def controller(found: Any) -> list[Json]:
+    return [
+        one["spec"]["template"]["spec"]
+        for one in of_kind(list(found), "Deployment")
+        if one["metadata"]["labels"]["app.kubernetes.io/component"] == "controller"
+    ]
+
+
+@pytest.mark.parametrize("combination", ALL)
+def test_pods_are_restricted(combination: str) -> None:
+    """The Pod Security Standard "restricted", for the controller and for the test's pods."""
+    found = list(rendered(combination))
+    pods = [one["spec"]["template"]["spec"] for one in of_kind(found, "Deployment")]
+    pods += [one["spec"] for one in of_kind(found, "Pod")]
+    assert len(pods) == 4
+    for pod in pods:
+        assert pod["securityContext"]["runAsNonRoot"] is True
+        assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+        assert not pod.keys() & {"hostNetwork", "hostPID", "hostIPC"}
+        assert {kind for volume in pod.get("volumes", []) for kind in volume} <= {
+            "name", "configMap", "emptyDir", "secret",
+        }  # fmt: skip
+        for container in pod["containers"]:
+            assert container["securityContext"] == {
+                "allowPrivilegeEscalation": False,
+                "readOnlyRootFilesystem": True,
+                "capabilities": {"drop": ["ALL"]},
+            }
+            assert not [port for port in container.get("ports", []) if "hostPort" in port]
+
+
+def test_one_controller() -> None:
+    (deployment,) = [one for one in of_kind(objects(), "Deployment")
+                     if one["metadata"]["name"] == "rosproxy"]  # fmt: skip
+    assert deployment["spec"]["replicas"] == 1
+    assert deployment["spec"]["strategy"] == {"type": "Recreate"}
+    container = deployment["spec"]["template"]["spec"]["containers"][0]
+    assert container["livenessProbe"]["httpGet"] == {"path": "/healthz", "port": "liveness"}
+    assert container["readinessProbe"]["httpGet"] == {"path": "/readyz", "port": "metrics"}
+    assert container["image"] == f"rosproxy-operator:{__version__}"
+    assert f"--proxy-image=rosproxy:{__version__}" in container["args"]
+
+
+def test_webhook() -> None:
+    (configuration,) = of_kind(objects(), "MutatingWebhookConfiguration")
+    (webhook,) = configuration["webhooks"]
+    assert webhook["failurePolicy"] == "Ignore"
+    assert webhook["timeoutSeconds"] == 5
+    assert webhook["clientConfig"] == {
+        "service": {"name": "rosproxy", "namespace": NAMESPACE, "path": "/wire", "port": 443}
+    }
+    assert webhook["objectSelector"]["matchExpressions"] == [
+        {"key": "rosproxy.io/inject", "operator": "Exists"},
+        {"key": "rosproxy.io/inject", "operator": "NotIn", "values": ["false", ""]},
+    ]
+    assert webhook["namespaceSelector"]["matchExpressions"] == [
+        {"key": "kubernetes.io/metadata.name", "operator": "NotIn", "values": ["kube-system"]}
+    ]
+
+
+def test_webhook_of_some_namespaces() -> None:
+    (configuration,) = of_kind(objects({"namespaces": ["a", "b"]}), "MutatingWebhookConfiguration")
+    selector = configuration["webhooks"][0]["namespaceSelector"]["matchExpressions"]
+    assert selector[1:] == [
+        {"key": "kubernetes.io/metadata.name", "operator": "In", "values": ["a", "b"]}
+    ]
+
+
+def test_secret_is_empty() -> None:
+    """Helm leaves alone what it has never set: upgrades keep the certificate."""
+    (secret,) = of_kind(objects(), "Secret")
+    assert "data" not in secret
+    assert "stringData" not in secret
+    (configuration,) = of_kind(objects(), "MutatingWebhookConfiguration")
+    assert "caBundle" not in configuration["webhooks"][0]["clientConfig"]
+
+
+def test_cert_manager() -> None:
+    found = objects(OPTIONS["webhook"]["cert-manager"])
+    (certificate,) = of_kind(found, "Certificate")
+    (issuer,) = of_kind(found, "Issuer")
+    assert certificate["spec"]["dnsNames"] == [f"rosproxy.{NAMESPACE}.svc"]
+    assert certificate["spec"]["issuerRef"] == {
+        "kind": "Issuer", "name": issuer["metadata"]["name"],
+    }  # fmt: skip
+    (configuration,) = of_kind(found, "MutatingWebhookConfiguration")
+    assert configuration["metadata"]["annotations"] == {
+        "cert-manager.io/inject-ca-from": f"{NAMESPACE}/{certificate['metadata']['name']}"
+    }
+    (pod,) = controller(found)
+    (volume,) = pod["volumes"]
+    assert volume["secret"]["secretName"] == certificate["spec"]["secretName"]
+    (mount,) = pod["containers"][0]["volumeMounts"]
+    assert f"--webhook-cert-dir={mount['mountPath']}" in pod["containers"][0]["args"]
+
+
+def test_own_issuer() -> None:
+    found = objects(OPTIONS["webhook"]["own-issuer"])
+    (certificate,) = of_kind(found, "Certificate")
+    assert certificate["spec"]["issuerRef"] == {"name": "ca", "kind": "ClusterIssuer"}
+    assert not of_kind(found, "Issuer")
+
+
+def test_definition_is_kept() -> None:
+    annotation = {"helm.sh/resource-policy": "keep"}
+    (kept,) = of_kind(objects({"crds": {"keep": True}}), "CustomResourceDefinition")
+    (ordinary,) = of_kind(objects(), "CustomResourceDefinition")
+    assert kept["metadata"]["annotations"] == annotation
+    assert "annotations" not in ordinary["metadata"]
+
+
+@pytest.mark.parametrize(
+    ("release", "values", "name"),
+    [
+        ("rosproxy", {}, "rosproxy"),
+        ("my", {}, "my-rosproxy"),
+        ("my-rosproxy", {}, "my-rosproxy"),
+        ("my", {"nameOverride": "proxies"}, "my-proxies"),
+        ("my", {"fullnameOverride": "other"}, "other"),
+        ("r" * 53, {}, f"{'r' * 40}"),
+    ],
+)
+def test_names(release: str, values: Json, name: str) -> None:
+    found = objects(values, release=release)
+    names = {one["metadata"]["name"] for one in found if one["kind"] != "CustomResourceDefinition"}
+    assert name in names
+    assert all(each.startswith(name) for each in names)
+    (rosproxy,) = of_kind(found, "RosProxy")
+    assert len(rosproxy["metadata"]["name"]) <= 46
+
+
+def test_everything_of_the_test_is_removed() -> None:
+    hooks = [one for one in objects() if "helm.sh/hook" in one["metadata"].get("annotations", {})]
+    assert sorted(one["kind"] for one in hooks) == [
+        "ConfigMap", "Deployment", "Deployment", "Pod", "RosProxy", "Service",
+    ]  # fmt: skip
+    for hook in hooks:
+        assert hook["metadata"]["annotations"]["helm.sh/hook"] == "test"
+        assert hook["metadata"]["annotations"]["helm.sh/hook-delete-policy"] == (
+            "before-hook-creation,hook-succeeded,hook-failed"
+        )
+
+
+@pytest.mark.parametrize(
+    ("values", "namespace"),
+    [
+        ({}, NAMESPACE),
+        ({"namespaces": ["a", "b"]}, "a"),
+        ({"namespaces": ["a", "b"], "tests": {"namespace": "b"}}, "b"),
+    ],
+)
+def test_the_test_runs_where_the_controller_may(values: Json, namespace: str) -> None:
+    hooks = [one for one in objects(values) if "helm.sh/hook" in str(one["metadata"])]
+    assert {one["metadata"]["namespace"] for one in hooks} == {namespace}
+
+
+def test_the_test_without_a_webhook() -> None:
+    """Nobody wires its pod then, so it is wired in its template."""
+    found = objects(merged(OPTIONS["webhook"]["off"]))
+    (echo,) = [one for one in of_kind(found, "Deployment")
+               if one["metadata"]["name"] == "rosproxy-test-echo"]  # fmt: skip
+    env = {one["name"]: one for one in echo["spec"]["template"]["spec"]["containers"][0]["env"]}
+    assert env["ROS_MASTER_URI"]["value"] == "http://rosproxy-rosproxy-test:11311"
+
+
+@pytest.fixture(scope="session")
+def chart_with_notes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The chart with its notes as an object, since helm shows notes only where a cluster is."""
+    copy = tmp_path_factory.mktemp("charts") / "rosproxy"
+    shutil.copytree(CHART, copy)
+    (copy / "templates/NOTES.txt").rename(copy / "notes.txt")
+    (copy / "templates/notes.yaml").write_text(
+        'notes: {{ tpl (.Files.Get "notes.txt") . | quote }}'
+    )
+    return copy
+
+
+@pytest.mark.parametrize(("option", "choice"), CHOICES)
+def test_notes(option: str, choice: str, chart_with_notes: Path) -> None:
+    """The notes tell the next commands, and what the values make different."""
+    values = OPTIONS[option][choice]
+    (notes,) = objects(values, "--show-only", "templates/notes.yaml", chart=chart_with_notes)
+    text = notes["notes"]
+    assert f"helm -n {NAMESPACE} test rosproxy" in text
+    assert f"kubectl -n {NAMESPACE} rollout status deployment/" in text
+    assert "rosproxy.io/inject" in text
+    assert ("webhook.enabled" in text) == (choice == "off")
+    assert ("crds.install" in text) == (option == "crds" and choice == "elsewhere")
+    assert ("-n robots apply" in text) == (choice == "two")
