@@ -22,14 +22,14 @@ $(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh
 
 .PHONY: help
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
 	@$(BIN)/python -m rosproxy.demo
 
 .PHONY: test
-test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS and Docker on Debian and Ubuntu as root
+test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS, Docker and a Kubernetes cluster's programs on Debian and Ubuntu as root
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
 .PHONY: bench
@@ -56,6 +56,10 @@ venv: $(VENV)/.dev ## make .venv with the development tools
 .PHONY: lock
 lock: ## pin what is installed anew, into constraints.txt
 	@scripts/lock.sh constraints.txt
+
+.PHONY: manifests
+manifests: $(VENV)/.dev ## write manifests/install.yaml and the tables of docs/kubernetes.md from the chart
+	@PYTHON=$(BIN)/python scripts/manifests.sh
 
 .PHONY: image
 image: ## build the container images of the proxy and of the controllers (IMAGE, OPERATOR_IMAGE)

@@ -40,7 +40,8 @@ build() {
   (cd "$tools/$1" && CGO_ENABLED=0 go build -trimpath -ldflags="-s -w ${4:-}" -o "$bin/$2" "$3")
 }
 
-version=$(sed -nE 's|^require k8s.io/kubernetes (v.*)|\1|p' "$tools/kubernetes/go.mod")
+# Without its version in it, no program of Kubernetes starts.
+version=$(cd "$tools/kubernetes" && go list -m -f '{{.Version}}' k8s.io/kubernetes)
 IFS=. read -r major minor _ <<<"${version#v}"
 about=k8s.io/component-base/version
 flags="-X $about.gitVersion=$version -X $about.gitMajor=$major -X $about.gitMinor=$minor"

@@ -1,10 +1,13 @@
-"""Run the test layers one after another and say at the end which of them ran.
+"""Run the test layers and say at the end which of them ran.
 
-    python scripts/test_layers.py [unit] [integration] [ros] [docker]
+    python scripts/test_layers.py [unit] [integration] [ros] [docker] [chart] [kubernetes]
 
-A layer that this machine cannot run is named together with the reason; with CI=true
-in the environment that counts as a failure, so a pipeline never turns green by
-leaving a layer out.
+First what they need is installed. Then the layers of a lane run one after another, and lanes
+side by side: real nodes and containers mostly wait for something. With several lanes each layer's
+output is shown when it ends.
+
+A layer that this machine cannot run is named together with the reason; with CI=true in the
+environment that counts as a failure, so a pipeline never turns green by leaving a layer out.
 """
 
 import os
@@ -12,8 +15,10 @@ import platform
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -25,9 +30,10 @@ CAP_SYS_ADMIN = 1 << 21
 
 @dataclass(frozen=True)
 class Layer:
-    """A directory of tests, what it needs, and why it may not run here."""
+    """A directory of tests, the lane it runs in, what it needs, and why it may not run here."""
 
     name: str
+    lane: int = 0
     setup: tuple[str, ...] = ()
     obstacle: Callable[[], str | None] = lambda: None
 
@@ -75,28 +81,61 @@ def effective_capabilities() -> int:
 LAYERS = (
     Layer("unit"),
     Layer("integration"),
-    Layer("ros", ("scripts/install-ros.sh",), debian_root_obstacle),
-    Layer("docker", ("scripts/install-docker.sh",), debian_root_obstacle),
+    Layer("ros", 1, ("scripts/install-ros.sh",), debian_root_obstacle),
+    Layer("docker", 2, ("scripts/install-docker.sh",), debian_root_obstacle),
+    Layer("chart", 2, ("scripts/install-kubernetes.sh",), debian_root_obstacle),
+    Layer(
+        "kubernetes",
+        2,
+        ("scripts/install-ros.sh", "scripts/install-docker.sh", "scripts/install-kubernetes.sh"),
+        debian_root_obstacle,
+    ),
 )
 
 
-def run(layer: Layer) -> Outcome:
+def run_all(layers: list[Layer]) -> list[Outcome]:
+    """Run lane 0 first, which minds a busy machine, and then the others side by side."""
+    failed = install(layers)
+    outcomes = [run(layer, failed, None) for layer in layers if layer.lane == 0]
+    numbers = sorted({layer.lane for layer in layers if layer.lane})
+    lanes = [[layer for layer in layers if layer.lane == number] for number in numbers]
+    quiet = threading.Lock() if len(lanes) > 1 else None
+    with ThreadPoolExecutor() as pool:
+        for ran in pool.map(lambda lane: [run(layer, failed, quiet) for layer in lane], lanes):
+            outcomes += ran
+    return outcomes
+
+
+def install(layers: list[Layer]) -> set[str]:
+    """Run the scripts that the layers need, each once; those that failed."""
+    needed = [layer for layer in layers if layer.obstacle() is None]
+    scripts = dict.fromkeys(script for layer in needed for script in layer.setup)
+    return {s for s in scripts if subprocess.run([ROOT / s], cwd=ROOT, check=False).returncode}
+
+
+def run(layer: Layer, failed: set[str], quiet: "threading.Lock | None") -> Outcome:
     obstacle = layer.obstacle()
     if obstacle is not None:
         return Outcome(layer, False, os.environ.get("CI") != "true", f"did not run: {obstacle}")
-    print(f"\n=== {layer.name} ===", flush=True)
-    for script in layer.setup:
-        if subprocess.run([ROOT / script], cwd=ROOT, check=False).returncode != 0:
-            return Outcome(layer, False, False, f"did not run: {script} failed")
-    return run_pytest(layer)
+    missing = [script for script in layer.setup if script in failed]
+    if missing:
+        return Outcome(layer, False, False, f"did not run: {missing[0]} failed")
+    return run_pytest(layer, quiet)
 
 
-def run_pytest(layer: Layer) -> Outcome:
+def run_pytest(layer: Layer, quiet: "threading.Lock | None") -> Outcome:
+    """Run a layer; with ``quiet`` its output is kept until it has ended, and is shown whole."""
     started = time.monotonic()
+    print(f"\n=== {layer.name} ===", flush=True)
     with tempfile.TemporaryDirectory() as directory:
-        report = Path(directory) / "report.xml"
+        report, kept = Path(directory) / "report.xml", Path(directory) / "output"
         command = [sys.executable, "-m", "pytest", str(layer.path), f"--junitxml={report}"]
-        code = subprocess.run(command, cwd=ROOT, check=False).returncode
+        with kept.open("w") as file:
+            output = file if quiet else None
+            code = subprocess.run(command, cwd=ROOT, check=False, stdout=output).returncode
+        if quiet:
+            with quiet:
+                print(f"\n=== {layer.name} ended ===\n{kept.read_text()}", flush=True)
         counts = count(report) if report.exists() else "no report"
     seconds = time.monotonic() - started
     return Outcome(layer, True, code == 0, f"{counts} in {seconds:.0f} s")
@@ -131,7 +170,7 @@ def chosen(names: list[str]) -> list[Layer]:
 
 
 def main() -> int:
-    outcomes = [run(layer) for layer in chosen(sys.argv[1:])]
+    outcomes = run_all(chosen(sys.argv[1:]))
     print(summary(outcomes))
     return 0 if all(outcome.good for outcome in outcomes) else 1
 

@@ -1,0 +1,73 @@
+"""The whole cluster, up and down."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+from tests.docker.engine import answers, run, wait_until
+from tests.kubernetes.cluster import mounts
+from tests.kubernetes.cluster.certificates import make_certificates
+from tests.kubernetes.cluster.control_plane import (
+    kubectl,
+    start_control_plane,
+    stop_control_plane,
+)
+from tests.kubernetes.cluster.images import IMAGES, build_image, load_images
+from tests.kubernetes.cluster.layout import NODES, STATE, Node
+from tests.kubernetes.cluster.network import make_bridge, remove_bridge
+from tests.kubernetes.cluster.node import (
+    PAUSE_IMAGE,
+    join,
+    remove_node,
+    start_containerd,
+    wait_until_ready,
+)
+from tests.kubernetes.cluster.robot import start_robot, stop_robot
+
+
+def up() -> None:
+    """Bring up whatever of the cluster is not: control plane, nodes, images, robot."""
+    assert answers(), "Docker does not answer: it builds the images and runs the robot"
+    STATE.mkdir(parents=True, exist_ok=True)
+    make_certificates()
+    make_bridge()
+    with ThreadPoolExecutor() as threads:
+        plane = threads.submit(start_control_plane)
+        for node in NODES:
+            start_containerd(node)
+        images = threads.submit(_images)
+        plane.result()
+        list(threads.map(join, NODES))
+        for node in NODES:
+            wait_until_ready(node)
+        images.result()
+    start_robot()
+    wait_until(_takes_pods, 30, "namespace default has a service account")
+
+
+def down() -> None:
+    """Stop all of it and leave nothing behind."""
+    for node in NODES:
+        remove_node(node)
+    stop_control_plane()
+    if answers():
+        stop_robot()
+    remove_bridge()
+    mounts.unmount_below(STATE)
+    run("rm", "-rf", STATE)
+
+
+def start_node(node: Node) -> None:
+    """Switch a node on again."""
+    start_containerd(node)
+    join(node)
+    wait_until_ready(node)
+
+
+def _images() -> None:
+    for image in IMAGES:
+        build_image(image)
+    load_images(PAUSE_IMAGE, *IMAGES)
+
+
+def _takes_pods() -> bool:
+    found = kubectl("get", "serviceaccount", "default", "--ignore-not-found", "--output=name")
+    return found != ""

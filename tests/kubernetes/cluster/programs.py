@@ -1,0 +1,118 @@
+"""Programs that go on running after the command that started them."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.docker.engine import wait_until
+from tests.kubernetes.cluster.layout import LOGS, STATE
+
+_RUN = STATE / "run"
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program with a log and a file that holds its process id.
+
+    ``namespace`` is the network namespace it runs in, by its name below /run/netns.
+    """
+
+    name: str
+    command: tuple[str | Path, ...]
+    namespace: str = ""
+
+    @property
+    def log(self) -> Path:
+        return LOGS / f"{self.name}.log"
+
+    @property
+    def _pid_file(self) -> Path:
+        return _RUN / self.name
+
+    @property
+    def pid(self) -> int | None:
+        """Its process, if that still is one of this program."""
+        try:
+            pid = int(self._pid_file.read_text())
+        except (OSError, ValueError):
+            return None
+        own = b"\0".join(os.fsencode(str(word)) for word in self.command)
+        return pid if own in command_line(pid) else None
+
+    def start(self) -> None:
+        """Start it unless it runs."""
+        if self.pid is not None:
+            return
+        for directory in (_RUN, LOGS):
+            directory.mkdir(parents=True, exist_ok=True)
+        # Not `ip netns exec`: it mounts /sys anew, where a kubelet then finds no cgroups.
+        enter = ("nsenter", f"--net=/run/netns/{self.namespace}") if self.namespace else ()
+        with self.log.open("ab") as output:
+            process = subprocess.Popen(
+                [*enter, *self.command],
+                stdin=subprocess.DEVNULL, stdout=output, stderr=output,
+                start_new_session=True, cwd="/",
+            )  # fmt: skip
+        self._pid_file.write_text(str(process.pid))
+        # For a moment a process that has just become a program has no command line.
+        wait_until(lambda: self.pid is not None or process.poll() is not None, 10, self.name)
+
+    def kill(self) -> None:
+        """Kill it, as power loss would."""
+        if self.pid is not None:
+            kill([self.pid])
+        self._pid_file.unlink(missing_ok=True)
+
+    def last_words(self) -> str:
+        return "".join(self.log.read_text(errors="replace").splitlines(keepends=True)[-30:])
+
+
+@contextmanager
+def paused(program: Program) -> Iterator[None]:
+    """Let a program do nothing meanwhile."""
+    pid = program.pid
+    assert pid is not None, f"{program.name} does not run"
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def processes() -> list[int]:
+    return [int(entry) for entry in os.listdir("/proc") if entry.isdigit()]
+
+
+def command_line(pid: int) -> bytes:
+    """The words of a process, each ended by a zero byte; empty if it is gone or dead."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+def kill(pids: list[int], seconds: float = 20) -> None:
+    """Kill processes and wait until they are gone."""
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    end = time.monotonic() + seconds
+    while left := [pid for pid in pids if _alive(pid)]:
+        if time.monotonic() > end:
+            raise AssertionError(f"processes {left} can't be killed")
+        time.sleep(0.02)
+
+
+def _alive(pid: int) -> bool:
+    """Whether it still does something; a zombie holds nothing but its number."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return False
+    return text.rpartition(")")[2].split()[0] not in "ZX"

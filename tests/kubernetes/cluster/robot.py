@@ -1,0 +1,35 @@
+"""The robot: a machine outside the cluster, on the nodes' network and no other."""
+
+import os
+import subprocess
+
+from tests.docker.engine import docker, inspect
+from tests.kubernetes.cluster.images import ROS_IMAGE
+from tests.kubernetes.cluster.layout import ROBOT, ROBOT_ADDRESS
+from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
+
+
+def start_robot() -> None:
+    """Start it, unless it runs the image that there is now."""
+    found = inspect(ROBOT, check=False)
+    wanted = docker("image", "inspect", "--format", "{{.Id}}", ROS_IMAGE)
+    if found and found["State"]["Running"] and found["Image"] == wanted:
+        return
+    docker("rm", "--force", ROBOT, check=False)
+    docker(
+        "run", "--detach", "--init", "--network", "none", "--name", ROBOT,
+        "--env", f"ROS_MASTER_URI=http://{ROBOT_ADDRESS}:11311", "--env", f"ROS_IP={ROBOT_ADDRESS}",
+        ROS_IMAGE, "sleep", "infinity",
+    )  # fmt: skip
+    plug_in_robot(str(inspect(ROBOT)["State"]["Pid"]))
+
+
+def stop_robot() -> None:
+    docker("rm", "--force", ROBOT, check=False)
+    unplug_robot()
+
+
+def exec_on_robot(command: tuple[str, ...]) -> int:
+    """Run a command there, with this terminal; return its exit code."""
+    terminal = ("--interactive", "--tty") if os.isatty(0) and os.isatty(1) else ("--interactive",)
+    return subprocess.run(["docker", "exec", *terminal, ROBOT, *command], check=False).returncode

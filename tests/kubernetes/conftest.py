@@ -1,0 +1,103 @@
+"""The cluster, the chart and the robot, made once for all tests."""
+
+import fcntl
+import subprocess
+import sys
+from collections.abc import Generator, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.docker.engine import ROOT, running_engine
+from tests.kubernetes import api, release
+from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.cluster.layout import KUBECONFIG
+from tests.kubernetes.cluster.robot import start_robot, stop_robot
+from tests.kubernetes.measured import NUMBERS
+from tests.kubernetes.pods import Namespace, namespace
+from tests.kubernetes.robot import Robot, robot_with_master
+
+_LOCK = Path("/run/lock/rosproxy-cluster")
+LAST = ("test_chart", "test_operator_killed", "test_api_server", "test_node_lost", "test_upgrade",
+        "test_uninstall")  # fmt: skip
+"""The modules whose tests disturb the whole cluster, in their order."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def place(item: pytest.Item) -> int:
+        module = item.path.stem
+        return LAST.index(module) if module in LAST else -1
+
+    items.sort(key=place)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show with a failure what the controller has logged and what there is in the cluster."""
+    report = yield
+    if report.failed and report.when in ("setup", "call") and KUBECONFIG.exists():
+        for body in api.objects("pods", release.NAMESPACE, release.CONTROLLERS):
+            name = body["metadata"]["name"]
+            report.sections.append((name, api.logs(release.NAMESPACE, name)[-8000:]))
+        seen = kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
+        report.sections.append(("the cluster", seen))
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if NUMBERS:
+        terminalreporter.section("measured")
+        for line in NUMBERS:
+            terminalreporter.write_line(line)
+
+
+@pytest.fixture(scope="session")
+def _cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The cluster that is up; else it is brought up, and down again afterwards."""
+    log = tmp_path_factory.mktemp("engine") / "dockerd.log"
+    with _LOCK.open("w") as lock, running_engine(log):
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one cluster, one session of tests at a time
+        was_up = KUBECONFIG.exists()
+        cluster("up")
+        stop_robot()
+        start_robot()
+        try:
+            yield
+        finally:
+            if not was_up:
+                cluster("down")
+
+
+def cluster(*command: str) -> None:
+    """Use the cluster's tool. A process of its own: what it starts must not be a test's child."""
+    words = [sys.executable, "-m", "tests.kubernetes.cluster", *command]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _release(_cluster: None) -> Iterator[None]:
+    """The chart, installed."""
+    release.remove()
+    others = api.objects("pods", "", release.CONTROLLERS)
+    assert not others, f"another controller is at work in this cluster: {others[0]['metadata']}"
+    release.install()
+    release.wait_controller()
+    yield
+    release.remove()
+
+
+@pytest.fixture(scope="module")
+def robot(_cluster: None) -> Iterator[Robot]:
+    """The robot with a master for the tests of one module."""
+    with robot_with_master() as found:
+        yield found
+
+
+@pytest.fixture
+def net(_release: None) -> Iterator[Namespace]:
+    """A namespace for one test."""
+    with namespace() as made:
+        yield made

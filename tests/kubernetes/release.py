@@ -1,0 +1,110 @@
+"""The chart, installed with Helm as a user would."""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tests.docker.engine import ROOT, run, wait_until
+from tests.kubernetes import api
+from tests.kubernetes.api import Json
+from tests.kubernetes.cluster.layout import BIN, KUBECONFIG
+from tests.kubernetes.pods import Namespace, Pod
+
+NAMESPACE = "rosproxy-system"
+NAME = "rosproxy"
+CONTROLLERS = "app.kubernetes.io/component=controller"
+_IMAGES: Json = {
+    "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
+    "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
+    "tests": {
+        "image": "rosproxy-test-ros:latest",
+        "imagePullPolicy": "Never",
+        "namespace": "default",
+    },
+}
+
+
+def helm(*arguments: str | Path, check: bool = True, seconds: float = 180) -> str:
+    command = (BIN / "helm", f"--kubeconfig={KUBECONFIG}", *arguments)
+    return run(*command, check=check, seconds=seconds)
+
+
+def install() -> None:
+    """Install the chart in a namespace that lets nothing run but what is *restricted*."""
+    restricted = {"pod-security.kubernetes.io/enforce": "restricted"}
+    api.create({"apiVersion": "v1", "kind": "Namespace",
+                "metadata": {"name": NAMESPACE, "labels": restricted}})  # fmt: skip
+    _apply("install")
+
+
+def upgrade(**values: Any) -> None:
+    """Upgrade it, with these values besides those of the tests."""
+    _apply("upgrade", **values)
+
+
+def uninstall() -> None:
+    helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait")
+
+
+def remove() -> None:
+    """Leave nothing of it, in whatever state it is."""
+    helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait", "--ignore-not-found")
+    api.delete("namespaces", "", NAMESPACE)
+    wait_until(lambda: not api.get("namespaces", "", NAMESPACE), 60, f"{NAMESPACE} is gone")
+
+
+def controller() -> Pod:
+    """The controller's pod, the newest if there are two."""
+    found = api.objects("pods", NAMESPACE, CONTROLLERS)
+    alive = [body for body in found if "deletionTimestamp" not in body["metadata"]]
+    assert alive, "no controller"
+    newest = max(alive, key=lambda body: str(body["metadata"]["creationTimestamp"]))
+    return Pod(NAMESPACE, newest["metadata"]["name"])
+
+
+def kill_controller() -> None:
+    """Kill the controller's process and delete its pod.
+
+    Without the latter the kubelet waits 10 seconds, 20, 40, … before it starts the next.
+    """
+    pod = controller()
+    pod.crash()
+    pod.remove(grace=0)
+
+
+def wait_controller(seconds: float = 60) -> None:
+    """Wait until a controller is ready, no other is there, and its webhook is reached.
+
+    For a second after that it is ready, kube-proxy still leads to the one before.
+    """
+
+    def there() -> bool:
+        found = api.objects("pods", NAMESPACE, CONTROLLERS)
+        return len(found) == 1 and controller().ready and _webhook_answers()
+
+    wait_until(there, seconds, lambda: str(api.objects("pods", NAMESPACE, CONTROLLERS)))
+
+
+def _webhook_answers() -> bool:
+    """Whether it warns of a labelled pod where there is no RosProxy, or whether there is none."""
+    if not api.get("mutatingwebhookconfigurations", "", NAME):
+        return True
+    body = Namespace("default").pod_body("unused", "true")
+    return api.dry_run(body)[1] != ""
+
+
+def _apply(verb: str, **values: Any) -> None:
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        json.dump(_merged(_IMAGES, values), file)
+        file.flush()
+        helm(verb, NAME, ROOT / "charts/rosproxy", "--namespace", NAMESPACE,
+             "--values", file.name, "--wait", "--timeout", "2m")  # fmt: skip
+
+
+def _merged(values: Json, more: Json) -> Json:
+    merged = dict(values)
+    for name, value in more.items():
+        both = isinstance(value, dict) and isinstance(merged.get(name), dict)
+        merged[name] = _merged(merged[name], value) if both else value
+    return merged

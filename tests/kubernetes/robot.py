@@ -1,0 +1,106 @@
+"""The robot outside the cluster: its roscore and its nodes."""
+
+import itertools
+import xmlrpc.client
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.nodes import Log, node_command
+from tests.kubernetes.cluster.layout import NODES, ROBOT, ROBOT_ADDRESS, node_named
+
+_ports = itertools.count(11311)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """The robot as one module of tests uses it: with a master of its own at ``port``."""
+
+    port: int
+    root: Path
+
+    @property
+    def master_uri(self) -> str:
+        return f"http://{ROBOT_ADDRESS}:{self.port}"
+
+    def run(self, *command: str, check: bool = True, seconds: float = 30) -> str:
+        """Run a program; one that hangs is stopped and fails the test."""
+        words = (ROBOT, "timeout", str(seconds), *command)
+        variable = ("--env", f"ROS_MASTER_URI={self.master_uri}")
+        return docker("exec", *variable, *words, check=check, seconds=seconds + 10)
+
+    def start_master(self) -> None:
+        self._start("roscore", f"roscore -p {self.port}", self.master_uri)
+        wait_until(lambda: "/rosout" in self.nodes(), 40, lambda: self._output("roscore"))
+
+    def node(self, name: str, library: str, role: str, *options: str, master_uri: str = "") -> Log:
+        """Start a test node; what it prints goes to a file."""
+        words = " ".join(node_command(library, role, *options, f"__name:={name}"))
+        self._start(name, words, master_uri or self.master_uri)
+        return Log(lambda: self._output(name))
+
+    def end(self, name: str, signal: str = "KILL") -> None:
+        """End the program of that name."""
+        file = f"/tmp/{self.port}/{name}.pid"
+        docker("exec", ROBOT, "sh", "-c", f"kill -{signal} $(cat {file})", check=False)
+
+    def end_all(self) -> None:
+        """End the master, which ends what it has started, and kill the rest."""
+        self.end("roscore", "INT")
+        script = f"rm /tmp/{self.port}/roscore.pid; kill -KILL $(cat /tmp/{self.port}/*.pid)"
+        docker("exec", ROBOT, "sh", "-c", script, check=False)
+
+    def nodes(self) -> dict[str, str]:
+        """Every node that the master knows, with its URI; none if it does not answer."""
+        return nodes_at(self.master_uri)
+
+    def uri(self, node: str) -> str:
+        """The URI that the master has of a node; empty if none."""
+        return self.nodes().get(f"/{node}", "")
+
+    def knows_proxied(self, node: str, on: str = "") -> bool:
+        """Whether the master knows a node by an address of a node of the cluster."""
+        hosts = [node_named(on)] if on else list(NODES)
+        return self.uri(node).startswith(tuple(f"http://{host.address}:" for host in hosts))
+
+    def _start(self, name: str, words: str, master_uri: str) -> None:
+        base = f"/tmp/{self.port}/{name}"
+        script = (
+            f"mkdir -p /tmp/{self.port}; echo $$ >{base}.pid; "
+            f"ROS_MASTER_URI={master_uri} exec {words} >{base}.log 2>&1"
+        )
+        docker("exec", "--detach", ROBOT, "setsid", "sh", "-c", script)
+
+    def _output(self, name: str) -> str:
+        """Read from the disk: a `docker exec` for each look would keep this machine busy."""
+        try:
+            return (self.root / f"tmp/{self.port}/{name}.log").read_text(errors="replace")
+        except OSError:
+            return ""
+
+
+def nodes_at(master_uri: str) -> dict[str, str]:
+    """Every node that a master knows, with its URI; none if it does not answer."""
+    master: Any = xmlrpc.client.ServerProxy(master_uri)
+    try:
+        with master:
+            state = master.getSystemState("/test")[2]
+            names = {name for kind in state for _, nodes in kind for name in nodes}
+            return {name: master.lookupNode("/test", name)[2] for name in names}
+    except (OSError, xmlrpc.client.Error):
+        return {}
+
+
+@contextmanager
+def robot_with_master() -> Iterator[Robot]:
+    """The robot with a roscore at a port that no other test uses."""
+    pid = inspect(ROBOT)["State"]["Pid"]
+    robot = Robot(next(_ports), Path(f"/proc/{pid}/root"))
+    try:
+        robot.start_master()
+        yield robot
+    finally:
+        robot.end_all()

@@ -1,0 +1,100 @@
+"""A RosProxy that is changed or deleted while its proxies serve."""
+
+from tests.docker.engine import wait_until
+from tests.kubernetes import api
+from tests.kubernetes.pods import INJECT, Namespace, unique
+from tests.kubernetes.robot import Robot, robot_with_master
+from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
+
+
+def talker(net: Namespace, topic: str, library: str = "rospy", **more: str) -> str:
+    """Start a node that publishes; its ROS name."""
+    pod = net.node(library, "pub", "--topic", topic, "--word", "inside", on="node1", **more)
+    return pod.node
+
+
+def test_another_master(net: Namespace, robot: Robot) -> None:
+    """Nodes that start from now on are at the new one, and none is left at the old one."""
+    topic = f"/{unique('moved').replace('-', '_')}"
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    old = talker(net, topic)
+    robot.node("ear_before", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=60)
+    before = made.the_proxy()
+    with robot_with_master() as other:
+        made.change(master={"uri": other.master_uri})
+        made.wait_status(lambda s: other.master_uri in s.get("master", ""), "the new master")
+        wait_until(lambda: made.the_proxy().uid_then != before.uid_then, 40, made.tell)
+        wait_until(lambda: not robot.uri(old), 20, lambda: str(robot.nodes()))
+        name = talker(net, topic, "roscpp")
+        ear = other.node("ear_after", "roscpp", "sub", "--topic", topic)
+        ear.wait_for("inside", seconds=60)
+        assert other.knows_proxied(name)
+
+
+def test_another_selector(net: Namespace) -> None:
+    """Pods that are not selected any more keep a proxy on their node for the grace period only."""
+    made = rosproxy(net.name, master=NOWHERE, ports=4, graceSeconds=2)
+    net.idle(on="node1")
+    net.idle(on="node2", labels={INJECT: "true", "app": "x"})
+    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 30, made.tell)
+    made.change(podSelector={"matchLabels": {"app": "x"}})
+    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 30, made.tell)
+    made.change(podSelector=None)
+    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 30, made.tell)
+
+
+def test_node_selector(net: Namespace) -> None:
+    labels = {"kubernetes.io/hostname": "node2"}
+    made = rosproxy(net.name, master=NOWHERE, ports=4, nodeSelector=labels)
+    net.idle(on="node1")
+    net.idle(on="node2")
+    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 30, made.tell)
+
+
+def test_advertised_host_of_a_node(net: Namespace, robot: Robot) -> None:
+    """An annotation of the node overrides its address."""
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
+    api.patch("nodes", "", "node2", {"metadata": {"annotations": {_ADVERTISE: "10.88.0.12"}}})
+    try:
+        net.idle(on="node2")
+        made.wait_status(lambda s: bool(made.on("node2")), "node2 is told")
+        assert made.on("node2")["advertiseHost"] == "10.88.0.12"
+        api.patch("nodes", "", "node2", {"metadata": {"annotations": {_ADVERTISE: "robot-2"}}})
+        made.wait_status(
+            lambda s: made.on("node2").get("advertiseHost") == "robot-2", "the annotation counts"
+        )
+    finally:
+        api.patch("nodes", "", "node2", {"metadata": {"annotations": {_ADVERTISE: None}}})
+
+
+def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robot) -> None:
+    topic = f"/{unique('left').replace('-', '_')}"
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    name = talker(net, topic)
+    robot.node("ear_left", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=60)
+    pods = {body["metadata"]["uid"] for body in net.pods(INJECT)}
+
+    made.remove()
+
+    wait_until(lambda: not made.body, 10, "it is gone: nothing holds it")
+    wait_until(lambda: not made.proxies and not made.service, 40, made.tell)
+    assert {body["metadata"]["uid"] for body in net.pods(INJECT)} == pods
+    wait_until(lambda: not robot.uri(name), 20, lambda: f"unregistered: {robot.nodes()}")
+
+
+def test_deleted_service_comes_back_at_its_address(net: Namespace) -> None:
+    """Running pods know it by nothing else."""
+    made = rosproxy(net.name, master=NOWHERE, ports=4)
+    wait_until(lambda: bool(made.service), 20, made.tell)
+    before = made.service
+    made.wait_status(lambda s: bool(s.get("masterURI")), "the address is kept")
+    api.delete("services", net.name, before["metadata"]["name"])
+    wait_until(lambda: _uid(made) not in ("", before["metadata"]["uid"]), 20, made.tell)
+    assert made.service["spec"]["clusterIP"] == before["spec"]["clusterIP"]
+
+
+def _uid(made: RosProxy) -> str:
+    return str(made.service.get("metadata", {}).get("uid", ""))
+
+
+_ADVERTISE = "rosproxy.io/advertise-host"

@@ -1,0 +1,109 @@
+"""Pods that come, end, are deleted, evicted and made anew."""
+
+import time
+
+import pytest
+
+from tests.docker.engine import wait_until
+from tests.docker.nodes import LIBRARIES
+from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.measured import note
+from tests.kubernetes.pods import Namespace, Pod, unique
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import RosProxy, rosproxy
+
+
+def new_topic() -> str:
+    return f"/{unique('topic').replace('-', '_')}"
+
+
+def talker(net: Namespace, library: str, topic: str, on: str = "node1", **more: str) -> Pod:
+    return net.node(library, "pub", "--topic", topic, "--word", "inside", on=on, **more)
+
+
+@pytest.fixture
+def made(net: Namespace, robot: Robot) -> RosProxy:
+    return rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+
+
+@pytest.mark.parametrize("there", [True, False], ids=["proxy there", "proxy not there"])
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_how_long_the_first_message_takes(
+    library: str, there: bool, made: RosProxy, net: Namespace, robot: Robot
+) -> None:
+    if there:
+        net.idle(on="node1")
+        made.the_proxy()
+    name = new_topic()
+    ear = robot.node(f"ear{name[1:]}", "roscpp", "sub", "--topic", name)
+    created = time.time()
+    pod = talker(net, library, name)
+    pod.wait_ready()
+    ready = time.time()
+    heard = ear.wait_for("inside", seconds=60)
+    proxy = "there" if there else "not there"
+    note(f"first message, {library}, proxy {proxy}: {heard - ready:.1f} s after the pod is Ready, "
+         f"{heard - created:.1f} s after it is created")  # fmt: skip
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_deleted_pod_is_unregistered_at_once_and_comes_back(
+    library: str, made: RosProxy, net: Namespace, robot: Robot
+) -> None:
+    """Deleted without grace: its node can't say good-bye."""
+    name = new_topic()
+    ear = robot.node(f"ear{name[1:]}", library, "sub", "--topic", name)
+    pod = talker(net, library, name)
+    ear.wait_for("inside", seconds=60)
+    uri = robot.uri(pod.node)
+
+    pod.remove(grace=0)
+    gone = wait_until(lambda: not robot.uri(pod.node), 15, lambda: str(robot.nodes()))
+    note(f"pod deleted, {library}: unregistered {gone:.1f} s after it is gone")
+
+    again = time.time()
+    new = talker(net, library, name, name=pod.name)
+    ear.wait_for("inside", since=again, seconds=60)
+    assert new.node == pod.node
+    assert robot.uri(new.node) != uri
+
+
+def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -> None:
+    """A Job's pod stays as Succeeded: it counts no longer, and its proxy goes."""
+    made.change(graceSeconds=1)
+    pod = net.pod("sh", "-c", "sleep 5", on="node1", restartPolicy="Never")
+    made.the_proxy()
+    wait_until(lambda: pod.body["status"].get("phase") == "Succeeded", 30, lambda: str(pod.body))
+    wait_until(lambda: not made.proxies, 30, made.tell)
+
+
+def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robot: Robot) -> None:
+    """The same address, another process: its node comes back by itself."""
+    name = new_topic()
+    ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
+    pod = talker(net, "roscpp", name)
+    ear.wait_for("inside", seconds=60)
+    killed = time.time()
+    pod.crash()
+    ear.wait_for("inside", since=killed + 0.5, seconds=60)
+    assert robot.knows_proxied(pod.node, "node1")
+
+
+def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot) -> None:
+    """Drain leaves the proxy until the last pod is gone, and does not wait for it for ever."""
+    name = new_topic()
+    made.change(graceSeconds=2)
+    ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
+    pod = talker(net, "rospy", name, on="node2")
+    ear.wait_for("inside", seconds=60)
+    try:
+        kubectl("cordon", "node2")
+        assert made.the_proxy("node2").ready
+        kubectl("drain", "node2", "--force", "--ignore-daemonsets", "--delete-emptydir-data",
+                "--timeout=60s", seconds=90)  # fmt: skip
+        wait_until(lambda: not robot.uri(pod.node), 15, lambda: str(robot.nodes()))
+        wait_until(lambda: not made.proxies, 40, made.tell)
+    finally:
+        kubectl("uncordon", "node2")
+    talker(net, "rospy", name, on="node2")
+    ear.wait_for("inside", since=time.time(), seconds=60)

@@ -1,0 +1,104 @@
+"""rospy and roscpp, topics and services, both ways: two nodes of the cluster and the robot."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+
+from tests.docker.nodes import LIBRARIES, Log
+from tests.kubernetes.pods import Namespace, Pod, namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import RosProxy, rosproxy
+
+NODES = ("node1", "node2")
+PLACES = [(library, on) for library in LIBRARIES for on in NODES]
+
+
+@dataclass
+class World:
+    """For each library and node a pod that publishes, one that serves, one that listens to all.
+
+    On the robot, for each library, one node for each of these.
+    """
+
+    rosproxy: RosProxy
+    talkers: dict[tuple[str, str], Pod] = field(default_factory=dict)
+    servers: dict[tuple[str, str], Pod] = field(default_factory=dict)
+    ears: dict[tuple[str, str], Pod] = field(default_factory=dict)
+    callers: dict[tuple[str, str], Pod] = field(default_factory=dict)
+    heard: dict[tuple[str, str], Log] = field(default_factory=dict)
+    replies: dict[tuple[str, str], Log] = field(default_factory=dict)
+
+
+@pytest.fixture(scope="module")
+def world(_release: None, robot: Robot) -> Iterator[World]:
+    """Everything at once, so that it is waited for once."""
+    with namespace() as net:
+        made = World(rosproxy(net.name, master={"uri": robot.master_uri}))
+        for library, on in PLACES:
+            _start(made, net, robot, library, on)
+        yield made
+
+
+def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> None:
+    place, mark = (library, on), f"{library}_{on}"
+    other = NODES[1 - NODES.index(on)]
+    made.talkers[place] = net.node(
+        library, "pub", "--topic", f"/from_{mark}", "--word", "inside", on=on
+    )
+    made.servers[place] = net.node(library, "serve", "--service", f"/serve_{mark}", on=on)
+    # What the pods of the other node publish, and the robot.
+    made.ears[place] = net.node(library, "sub", "--topic", f"/for_{mark}", on=on)
+    made.heard[place] = robot.node(f"ear_{mark}", library, "sub", "--topic", f"/from_{mark}")
+    robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/for_{mark}", "--word", "robot")
+    net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "far", on=other)
+    net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "near", on=on)
+    patience = ("--count", "5", "--patience", "60")
+    made.replies[place] = robot.node(
+        f"caller_{mark}", library, "call", "--service", f"/serve_{mark}", *patience
+    )
+    robot.node(f"server_{mark}", library, "serve", "--service", f"/robot_{mark}")
+    made.callers[place] = net.node(
+        library, "call", "--service", f"/robot_{mark}", *patience, on=on, restartPolicy="Never"
+    )
+
+
+@pytest.mark.parametrize(("library", "on"), PLACES)
+def test_robot_hears_a_pod(library: str, on: str, world: World) -> None:
+    world.heard[library, on].wait_for("inside", seconds=90)
+
+
+@pytest.mark.parametrize("word", ["robot", "far", "near"])
+@pytest.mark.parametrize(("library", "on"), PLACES)
+def test_pod_hears(word: str, library: str, on: str, world: World) -> None:
+    """The robot, a pod of the other node, a pod of its own node."""
+    world.ears[library, on].log.wait_for(word, seconds=60)
+
+
+@pytest.mark.parametrize(("library", "on"), PLACES)
+def test_robot_calls_a_pod(library: str, on: str, world: World) -> None:
+    world.replies[library, on].wait_for("ask", 5, seconds=60, verb="reply")
+
+
+@pytest.mark.parametrize(("library", "on"), PLACES)
+def test_pod_calls_the_robot(library: str, on: str, world: World) -> None:
+    world.callers[library, on].log.wait_for("ask", 5, seconds=60, verb="reply")
+
+
+def test_master_knows_pods_by_their_own_node(world: World, robot: Robot) -> None:
+    for (_, on), pod in world.talkers.items():
+        assert robot.knows_proxied(pod.node, on), robot.nodes()
+
+
+def test_each_node_has_one_proxy(world: World) -> None:
+    for on in NODES:
+        world.rosproxy.the_proxy(on)
+    assert len(world.rosproxy.proxies) == len(NODES)
+
+
+def test_rosnode_of_the_robot_sees_all(world: World, robot: Robot) -> None:
+    pod = world.talkers["roscpp", "node1"]
+    assert "xmlrpc reply from" in robot.run("rosnode", "ping", "-c", "1", f"/{pod.node}")
+    info = robot.run("rosnode", "info", f"/{pod.node}")
+    assert "/from_roscpp_node1 [std_msgs/String]" in info
+    assert "ear_roscpp_node1" in info

@@ -1,0 +1,39 @@
+"""helm uninstall leaves nothing behind."""
+
+from tests.docker.engine import wait_until
+from tests.kubernetes import api, release
+from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.pods import INJECT, Namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import all_proxies, rosproxy
+
+CLUSTER_WIDE = ("customresourcedefinitions", "clusterroles", "clusterrolebindings",
+                "mutatingwebhookconfigurations")  # fmt: skip
+NAMESPACED = ("pods", "services", "secrets", "serviceaccounts", "roles", "rolebindings",
+              "deployments", "poddisruptionbudgets", "networkpolicies")  # fmt: skip
+
+
+def left() -> list[str]:
+    """What there is of it in the cluster, as resource and name."""
+    found = []
+    for resource in CLUSTER_WIDE + NAMESPACED:
+        for body in api.objects(resource):
+            name = body["metadata"]["name"]
+            own = body["metadata"].get("labels", {}).get("app.kubernetes.io/name") == "rosproxy"
+            if own or ("rosproxy" in name and body["metadata"].get("namespace") != "default"):
+                found.append(f"{resource} {body['metadata'].get('namespace', '')}/{name}")
+    return found
+
+
+def test_nothing_is_left(net: Namespace, robot: Robot) -> None:
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
+    pod = net.node("rospy", "pub", "--topic", "/last", "--word", "inside", on="node1")
+    robot.node("ear_last", "rospy", "sub", "--topic", "/last").wait_for("inside", seconds=60)
+    assert made.proxies
+
+    release.uninstall()
+
+    wait_until(lambda: not left(), 60, lambda: f"left: {left()}")
+    assert not all_proxies()
+    assert [body["metadata"]["name"] for body in net.pods(INJECT)] == [pod.name]
+    assert "rosproxy.io" not in kubectl("api-resources", "-o", "name")

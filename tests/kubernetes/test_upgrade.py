@@ -1,0 +1,66 @@
+"""helm test, and helm upgrade with traffic running."""
+
+import time
+
+from tests.docker.engine import run, wait_until
+from tests.kubernetes import release
+from tests.kubernetes.cluster.images import PROXY_IMAGE, load_images
+from tests.kubernetes.measured import note
+from tests.kubernetes.pods import Namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import rosproxy
+from tests.kubernetes.traffic import flow
+
+OTHER = "rosproxy:other"
+
+
+def test_helm_test() -> None:
+    started = time.time()
+    release.helm("test", release.NAME, "--namespace", release.NAMESPACE, seconds=300)
+    note(f"helm test: {time.time() - started:.0f} s")
+
+
+def test_upgrade_of_the_controller_only(net: Namespace, robot: Robot) -> None:
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with flow(net, robot, "roscpp") as traffic:
+        before, started = made.the_proxy(), time.time()
+        release.upgrade(log={"level": "debug"})
+        release.wait_controller()
+        traffic.wait(since=time.time())
+        gaps = traffic.gaps(started)
+        assert max(gaps.outward, gaps.inward, gaps.service) < 1, gaps
+        assert made.the_proxy().uid_then == before.uid_then
+
+
+def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
+    """Their image is changed in place: the same pod, the same ports."""
+    run("docker", "build", "--tag", OTHER, "--label", "other=1", "-", input=f"FROM {PROXY_IMAGE}")
+    load_images(OTHER)
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    with flow(net, robot, "rospy") as traffic:
+        before, started = made.the_proxy(), time.time()
+        release.upgrade(proxy={"image": {"tag": "other"}})
+        wait_until(lambda: made.the_proxy().restarts == 1, 60, made.tell)
+        traffic.wait(since=time.time(), seconds=60)
+        after = made.the_proxy()
+        note(f"helm upgrade, other image of the proxy: {traffic.gaps(started)}")
+        assert (after.uid_then, after.ports) == (before.uid_then, before.ports)
+        assert after.body["spec"]["containers"][0]["image"] == OTHER
+    release.upgrade()
+
+
+def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
+    """Pods start all the same; they set their master themselves."""
+    release.upgrade(webhook={"enabled": False})
+    release.wait_controller()
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    wait_until(lambda: bool(made.service), 20, made.tell)
+    pod = net.idle(on="node1")
+    assert pod.environment == {}
+    uri = f"http://{made.service['spec']['clusterIP']}:11311"
+    talker = net.node("rospy", "pub", "--topic", "/by_hand", "--word", "inside", on="node1",
+                      env={"ROS_MASTER_URI": uri})  # fmt: skip
+    robot.node("ear_by_hand", "rospy", "sub", "--topic", "/by_hand").wait_for("inside", seconds=60)
+    assert robot.knows_proxied(talker.node, "node1")
+    release.upgrade()
+    release.wait_controller()

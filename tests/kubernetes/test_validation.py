@@ -1,0 +1,56 @@
+"""What the API server itself refuses, and with which words."""
+
+from typing import Any
+
+import pytest
+
+from tests.kubernetes import api
+from tests.kubernetes.pods import Namespace
+from tests.kubernetes.rosproxies import rosproxy, rosproxy_body
+
+GOOD = {"uri": "http://robot:11311"}
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "no master": ({}, "master"),
+    "empty master": ({"master": {}}, "exactly one of uri"),
+    "both": ({"master": {**GOOD, "service": {"name": "x"}}}, "exactly one of uri"),
+    "https": ({"master": {"uri": "https://robot:11311"}}, "http://host:11311"),
+    "localhost": ({"master": {"uri": "http://localhost:11311"}}, "the machine itself"),
+    "loopback": ({"master": {"uri": "http://127.0.0.1:11311"}}, "the machine itself"),
+    "address": ({"master": {**GOOD, "address": "robot"}}, "IP address"),
+    "no ports": ({"master": GOOD, "ports": 0}, "ports"),
+    "many ports": ({"master": GOOD, "ports": 501}, "ports"),
+    "small window": (
+        {"master": GOOD, "portWindow": {"first": 12000, "last": 12010}},
+        "fewer ports",
+    ),
+    "no window": ({"master": GOOD, "portWindow": {"first": 13000, "last": 12000}}, "above"),
+    "advertise": ({"master": GOOD, "advertise": "Fixed"}, "advertise"),
+    "selector": (
+        {"master": GOOD, "podSelector": {"matchExpressions": [{"key": "a", "operator": "In"}]}},
+        "need values",
+    ),
+    "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_spec_is_refused(case: str, net: Namespace) -> None:
+    spec, words = BAD[case]
+    with pytest.raises(api.Refused) as refused:
+        rosproxy(net.name, **spec)
+    assert refused.value.status == 422
+    assert words in refused.value.text
+
+
+@pytest.mark.parametrize("name", ["x" * 47, "true"])
+def test_bad_name_is_refused(name: str, net: Namespace) -> None:
+    with pytest.raises(api.Refused) as refused:
+        api.create(rosproxy_body(net.name, name, master=GOOD))
+    assert "metadata.name" in refused.value.text
+
+
+def test_defaults_are_filled_in(net: Namespace) -> None:
+    spec = rosproxy(net.name, master=GOOD).body["spec"]
+    assert spec["ports"] == 32
+    assert spec["portWindow"] == {"first": 11400, "last": 29999}
+    assert spec["advertise"] == "InternalIP"

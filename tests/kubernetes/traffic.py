@@ -1,0 +1,67 @@
+"""Topics and services across the boundary while something happens to the cluster."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from tests.docker.nodes import Log
+from tests.docker.traffic import Gaps
+from tests.kubernetes.pods import Namespace, Pod, unique
+from tests.kubernetes.robot import Robot
+
+
+@dataclass(frozen=True)
+class Flow:
+    """One pod that publishes, one that listens and one with a service; and theirs on the robot.
+
+    ``outward`` is what the robot hears, ``inward`` what is heard in the cluster, ``replies`` what
+    the robot has from the service.
+    """
+
+    talker: Pod
+    listener: Pod
+    server: Pod
+    outward: Log
+    replies: Log
+
+    @property
+    def inward(self) -> Log:
+        return self.listener.log
+
+    def wait(self, since: float = 0, seconds: float = 40) -> None:
+        """Wait until all of it flows."""
+        self.outward.wait_for("inside", since=since, seconds=seconds)
+        self.inward.wait_for("outside", since=since, seconds=seconds)
+        self.replies.wait_for("ask", since=since, seconds=seconds, verb="reply")
+
+    def gaps(self, since: float) -> Gaps:
+        """The longest pauses since then."""
+        now = time.time()
+        return Gaps(
+            self.outward.longest_gap("inside", since, now),
+            self.inward.longest_gap("outside", since, now),
+            self.replies.longest_gap("ask", since, now, verb="reply"),
+        )
+
+
+@contextmanager
+def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Iterator[Flow]:
+    """Twenty messages a second both ways, and as many calls."""
+    mark = unique("flow").replace("-", "_")
+    out, back, service = f"/out_{mark}", f"/in_{mark}", f"/serve_{mark}"
+    talker = net.node(library, "pub", "--topic", out, "--word", "inside", on=on)
+    listener = net.node(library, "sub", "--topic", back, on=on)
+    server = net.node(library, "serve", "--service", service, on=on)
+    names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
+    outward = robot.node(names[0], library, "sub", "--topic", out)
+    robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
+    call = ("call", "--service", service, "--count", "100000", "--patience", "60")
+    replies = robot.node(names[2], library, *call)
+    try:
+        found = Flow(talker, listener, server, outward, replies)
+        found.wait(seconds=60)
+        yield found
+    finally:
+        for name in names:
+            robot.end(name)
