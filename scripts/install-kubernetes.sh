@@ -2,7 +2,7 @@
 # Build the programs of a Kubernetes cluster, and install what its nodes need: the API
 # server, the kubelet and the rest are Go modules, pinned in tests/kubernetes/tools.
 # Kept in CLUSTER_BIN (default: a directory of the user's cache) until a pin changes:
-# eight minutes the first time on two cores, nothing after that. Needs root and Go 1.24+.
+# eight minutes the first time on two cores, nothing after that. Needs root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 tools=tests/kubernetes/tools
@@ -26,10 +26,7 @@ pins=$(cat "$tools"/*/go.mod "$0" | sha256sum)
 if [ "$(cat "$bin/pins" 2>/dev/null)" = "$pins" ]; then
   exit 0
 fi
-if ! command -v go >/dev/null; then
-  echo "the cluster's programs are built with Go 1.24 or newer: https://go.dev/doc/install" >&2
-  exit 1
-fi
+go=$(scripts/go.sh)
 mkdir -p "$bin"
 bin=$(realpath "$bin")
 rm -f "$bin/pins"
@@ -37,11 +34,11 @@ rm -f "$bin/pins"
 # build MODULE NAME PACKAGE [FLAGS OF THE LINKER]
 build() {
   echo "building $2" >&2
-  (cd "$tools/$1" && CGO_ENABLED=0 go build -trimpath -ldflags="-s -w ${4:-}" -o "$bin/$2" "$3")
+  (cd "$tools/$1" && CGO_ENABLED=0 "$go" build -trimpath -ldflags="-s -w ${4:-}" -o "$bin/$2" "$3")
 }
 
 # Without its version in it, no program of Kubernetes starts.
-version=$(cd "$tools/kubernetes" && go list -m -f '{{.Version}}' k8s.io/kubernetes)
+version=$(cd "$tools/kubernetes" && "$go" list -m -f '{{.Version}}' k8s.io/kubernetes)
 IFS=. read -r major minor _ <<<"${version#v}"
 about=k8s.io/component-base/version
 flags="-X $about.gitVersion=$version -X $about.gitMajor=$major -X $about.gitMinor=$minor"
