@@ -56,6 +56,8 @@ def plug_in_node(node: Node) -> None:
     for other in NODES:
         if other != node:
             inside(node, "ip", "route", "add", other.pod_network, "via", other.address)
+    # An address that no pod has any more is refused at once, as behind a CNI bridge.
+    inside(node, "ip", "route", "add", "unreachable", node.pod_network)
     # What leaves the cluster comes from the node; among pods, addresses are kept.
     inside(node, "iptables", "-w", "-t", "nat", "-A", "POSTROUTING", "-s", node.pod_network,
            "!", "-d", POD_NETWORK, "-j", "MASQUERADE")  # fmt: skip
