@@ -6,6 +6,7 @@ import pytest
 
 from tests.docker.engine import wait_until
 from tests.docker.nodes import LIBRARIES
+from tests.kubernetes import release
 from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace, Pod, unique
@@ -105,5 +106,6 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
         wait_until(lambda: not made.proxies, 40, made.tell)
     finally:
         kubectl("uncordon", "node2")
+    release.wait_controller()  # it may have been on that node
     talker(net, "rospy", name, on="node2")
     ear.wait_for("inside", since=time.time(), seconds=60)
