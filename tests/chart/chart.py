@@ -129,11 +129,19 @@ def of_kind(found: list[Json], kind: str) -> list[Json]:
     return [one for one in found if one["kind"] == kind]
 
 
+def every_combination() -> Iterator[tuple[str, Values]]:
+    """All combinations of all choices: their names, and the values."""
+    return map(_combined, itertools.product(*OPTIONS.values()))
+
+
 def combinations() -> Iterator[tuple[str, Values]]:
-    """Combinations in which any two choices meet: their names, and the values."""
-    for names in pairwise():
-        chosen = [choices[name] for choices, name in zip(OPTIONS.values(), names, strict=True)]
-        yield " ".join(names), merged(*chosen)
+    """As few of them as it takes for any two choices to meet."""
+    return map(_combined, pairwise())
+
+
+def _combined(names: tuple[str, ...]) -> tuple[str, Values]:
+    pairs = zip(OPTIONS.values(), names, strict=True)
+    return " ".join(names), merged(*(choices[name] for choices, name in pairs))
 
 
 def pairwise() -> Iterator[tuple[str, ...]]:
@@ -161,7 +169,7 @@ def merged(*parts: Values) -> Values:
     return whole
 
 
-class Strict(yaml.SafeLoader):  # type: ignore[misc]
+class Strict(yaml.CSafeLoader):  # type: ignore[misc]
     """YAML in which no key stands twice in a map, which the API server would refuse."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
