@@ -7,6 +7,7 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
+from urllib3.exceptions import HTTPError
 
 from tests.docker.engine import ROOT, running_engine
 from tests.kubernetes import api, release
@@ -38,12 +39,18 @@ def pytest_runtest_makereport(
     """Show with a failure what the controller has logged and what there is in the cluster."""
     report = yield
     if report.failed and report.when in ("setup", "call") and KUBECONFIG.exists():
-        for body in api.objects("pods", release.NAMESPACE, release.CONTROLLERS):
-            name = body["metadata"]["name"]
-            report.sections.append((name, api.logs(release.NAMESPACE, name)[-8000:]))
-        seen = kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
-        report.sections.append(("the cluster", seen))
+        try:
+            report.sections += _sections()
+        except (AssertionError, OSError, HTTPError) as error:
+            report.sections.append(("the cluster", f"can't be asked: {error}"))
     return report
+
+
+def _sections() -> Iterator[tuple[str, str]]:
+    for body in api.objects("pods", release.NAMESPACE, release.CONTROLLERS):
+        name = body["metadata"]["name"]
+        yield name, api.logs(release.NAMESPACE, name)[-8000:]
+    yield "the cluster", kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -110,9 +110,10 @@ def kill(pids: list[int], seconds: float = 20) -> None:
 
 
 def _alive(pid: int) -> bool:
-    """Whether it still does something; a zombie holds nothing but its number."""
+    """Whether it still holds anything; a zombie does while it has threads, its sockets for one."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
+        threads = len(os.listdir(f"/proc/{pid}/task"))
     except OSError:
         return False
-    return text.rpartition(")")[2].split()[0] not in "ZX"
+    return threads > 1 or text.rpartition(")")[2].split()[0] not in "ZX"
