@@ -5,10 +5,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from tests.docker.engine import wait_until
 from tests.docker.nodes import Log
 from tests.docker.traffic import Gaps
+from tests.kubernetes import api
+from tests.kubernetes.cluster.layout import NODES
+from tests.kubernetes.cluster.network import inside
 from tests.kubernetes.pods import Namespace, Pod, unique
 from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import PROXY_OF
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,7 @@ class Flow:
 @contextmanager
 def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Iterator[Flow]:
     """Twenty messages a second both ways, and as many calls."""
+    wait_until(lambda: _is_known(net.name), 60, f"kube-proxy knows the Service in {net.name}")
     mark = unique("flow").replace("-", "_")
     out, back, service = f"/out_{mark}", f"/in_{mark}", f"/serve_{mark}"
     talker = net.node(library, "pub", "--topic", out, "--word", "inside", on=on)
@@ -65,3 +71,16 @@ def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Itera
     finally:
         for name in names:
             robot.end(name)
+
+
+def _is_known(namespace: str) -> bool:
+    """Whether each node knows the Service of the RosProxy there: it translates it, or refuses.
+
+    A pod that connects before is silent for two minutes; on a busy machine the webhook's waiting
+    is not always enough.
+    """
+    services = api.objects("services", namespace, PROXY_OF)
+    rules = [inside(node, "iptables-save") for node in NODES]
+    return bool(services) and all(
+        one["spec"]["clusterIP"] in text for one in services for text in rules
+    )
