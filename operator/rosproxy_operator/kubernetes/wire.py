@@ -28,9 +28,10 @@ LONGEST = 4.0
 """Seconds until a pod is admitted as it is: less than the API server waits for the webhook."""
 AGAIN = 0.3
 """Seconds until an API server is asked again that did not answer."""
-YOUNG = 2.2
+YOUNG = 3.0
 """Seconds for which a Service may not be known on all nodes (kube-proxy gathers changes for 1 s).
 
+Its creationTimestamp has whole seconds, so up to one of these has passed already.
 A pod that connects before loses its packets for two minutes, even if the Service is known a moment
 later: the connection was tracked as one that is not translated. So its admission is held up.
 """
