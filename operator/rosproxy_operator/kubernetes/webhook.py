@@ -18,6 +18,7 @@ from rosproxy.core.uris import HostPort
 from rosproxy_operator.kubernetes import certificates
 from rosproxy_operator.kubernetes.certificates import Pair
 from rosproxy_operator.kubernetes.keeper import Keeper
+from rosproxy_operator.kubernetes.wire import NOT_WIRED
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +91,7 @@ def _application(fn: kopf.WebhookFn) -> web.Application:
 
 def _allowed(review: dict[str, Any], uid: str, reason: str) -> dict[str, Any]:
     """An answer that lets the pod pass as it is."""
-    warning = f"rosproxy: this pod was not wired to a proxy: the controller failed: {reason}"
+    warning = f"{NOT_WIRED}the controller failed: {reason}"
     return {
         "apiVersion": review.get("apiVersion", "admission.k8s.io/v1"),
         "kind": review.get("kind", "AdmissionReview"),

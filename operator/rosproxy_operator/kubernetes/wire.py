@@ -35,7 +35,8 @@ Its creationTimestamp has whole seconds, so up to one of these has passed alread
 A pod that connects before loses its packets for two minutes, even if the Service is known a moment
 later: the connection was tracked as one that is not translated. So its admission is held up.
 """
-_NOT_WIRED = "rosproxy: this pod was not wired to a proxy: "
+NOT_WIRED = "rosproxy: this pod was not wired to a proxy: "
+"""How each warning at admission begins."""
 
 
 class NotWired(Exception):
@@ -66,7 +67,7 @@ class Wirer:
             text = f"the controller failed: {error!r}"
         self._metrics.admissions.labels("failed").inc()
         log.warning("a pod at admission: %s", text)
-        return Wiring(warnings=(_NOT_WIRED + text,))
+        return Wiring(warnings=(NOT_WIRED + text,))
 
     async def _patiently(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         """What a pod needs, also from an API server that is just starting; and how long to wait."""
@@ -87,7 +88,7 @@ class Wirer:
             address, hold = self._address(choice.rosproxy, dry_run)
             return wire(body, master_uri(address), choice.rosproxy.spec.host_aliases), hold
         text = choice.finding.text if choice.finding else self._nobody(pod, rosproxies, unusable)
-        return Wiring(warnings=(_NOT_WIRED + text,) if text else ()), 0.0
+        return Wiring(warnings=(NOT_WIRED + text,) if text else ()), 0.0
 
     def _nobody(self, pod: Pod, rosproxies: list[RosProxy], unusable: list[str]) -> str:
         text = nobody(pod, rosproxies)

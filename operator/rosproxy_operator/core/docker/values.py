@@ -4,6 +4,7 @@ import re
 
 from rosproxy.core.uris import is_address, is_loopback
 from rosproxy_operator.core.docker.settings import MOST_PORTS
+from rosproxy_operator.core.text import bounded
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"
@@ -21,7 +22,7 @@ class Unusable(Exception):
 
 def quoted(value: str) -> str:
     """A value as it may be shown: not too long, and harmless."""
-    return repr(value if len(value) <= 80 else f"{value[:79]}…")
+    return repr(bounded(value, 80))
 
 
 def boolean(label: str, value: str) -> bool:

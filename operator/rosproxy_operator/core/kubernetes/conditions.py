@@ -10,6 +10,7 @@ from rosproxy_operator.core.kubernetes.names import INJECT
 from rosproxy_operator.core.kubernetes.parse_values import parts, word
 from rosproxy_operator.core.kubernetes.status_findings import CONFLICT, EXHAUSTED, NO_MASTER
 from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.core.text import bounded
 
 READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
 LONGEST = 1024
@@ -97,11 +98,6 @@ def told(problem: Problem) -> str:
 def reason_of(problem: Problem) -> str:
     """A problem's reason."""
     return problem.reason if isinstance(problem, Finding) else "Problem"
-
-
-def bounded(text: str, most: int) -> str:
-    """A text of at most so many characters."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def _since(former: Json, verdict: Verdict, stamp: str) -> str:

@@ -18,6 +18,7 @@ from rosproxy_operator.core.kubernetes.model import (
     Stuck,
 )
 from rosproxy_operator.core.kubernetes.names import ADMIN_PORT, KIND
+from rosproxy_operator.core.text import bounded
 
 NOT_ADMITTED = "ProxyNotAdmitted"
 CONFLICT = "PortConflict"
@@ -73,8 +74,7 @@ def invalid_finding(rosproxy: InvalidRosProxy) -> Finding:
 
 def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Finding:
     about = Reference(KIND, rosproxy.id, rosproxy.uid)
-    short = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
-    return Finding(subject, short, reason=reason, of=rosproxy.id, about=about)
+    return Finding(subject, bounded(text, _LONGEST), reason=reason, of=rosproxy.id, about=about)
 
 
 def _subject(proxy: ProxyPod) -> str:

@@ -8,7 +8,6 @@ from rosproxy_operator.core.kubernetes.conditions import (
     DEGRADED,
     READY,
     Verdict,
-    bounded,
     conditions,
     serving,
     told,
@@ -26,6 +25,7 @@ from rosproxy_operator.core.kubernetes.names import master_uri
 from rosproxy_operator.core.kubernetes.parse_values import number, parts, word
 from rosproxy_operator.core.kubernetes.status_findings import findings, invalid_finding, of_node
 from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.core.text import bounded
 
 __all__ = ["findings", "invalid_finding", "status_of", "status_of_invalid"]
 
