@@ -41,10 +41,21 @@ FROM base AS proxy
 LABEL org.opencontainers.image.title="rosproxy" \
       org.opencontainers.image.description="A transparent proxy between isolated networks for ROS 1" \
       org.opencontainers.image.licenses="Apache-2.0"
+# For --data-plane kernel. A container that is given NET_ADMIN does not thereby give it to a user
+# that is not root: these copies have it as a file capability, for the proxy's group alone. Without
+# NET_ADMIN, and with no-new-privileges, they may do nothing and the proxy forwards by itself.
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends nftables conntrack libcap2-bin \
+    && install -D --mode=0750 --group=10001 --target-directory=/usr/libexec/rosproxy \
+         /usr/sbin/nft /usr/sbin/conntrack \
+    && setcap cap_net_admin=ep /usr/libexec/rosproxy/nft \
+              cap_net_admin=ep /usr/libexec/rosproxy/conntrack \
+    && apt-get purge -y libcap2-bin \
+    && rm -rf /var/lib/apt/lists/* /var/cache/apt/*
 COPY --from=proxy-builder /opt/rosproxy /opt/rosproxy
 ENV PATH=/opt/rosproxy/bin:$PATH
-# A number, so that Kubernetes can check runAsNonRoot. The proxy writes no file at all:
-# it runs with --read-only, --cap-drop ALL and --security-opt no-new-privileges.
+# A number, so that Kubernetes can check runAsNonRoot. The proxy writes no file at all: it runs with
+# --read-only, --cap-drop ALL and, but for the kernel plane, --security-opt no-new-privileges.
 USER 10001:10001
 WORKDIR /
 # 11311: the master as nodes inside see it; needs no publishing.

@@ -67,6 +67,12 @@ def main() -> None:
     "--proxy-image", default="rosproxy:latest", metavar="IMAGE", help="The proxies' image."
 )
 @click.option(
+    "--data-plane",
+    type=click.Choice(["auto", "kernel", "splice", "copy"]),
+    default="auto",
+    help="How proxies forward topics. kernel: they get the capability NET_ADMIN for it.",
+)
+@click.option(
     "--expose-by-default",
     is_flag=True,
     help="Also serve containers without rosproxy.enable=true if they have ROS_MASTER_URI set.",

@@ -89,6 +89,7 @@ def parse_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
         expose_by_default=options["expose_by_default"],
         grace=parse_seconds("--grace", options["grace"], 0.0),
         uplink=_uplink(options["uplink"]),
+        data_plane=options.get("data_plane") or "auto",
     )
     if len(plan.window) < plan.ports:
         raise SettingError(

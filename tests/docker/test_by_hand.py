@@ -1,11 +1,15 @@
-"""The example examples/docker/by-hand, started as its README says, with real nodes.
+"""The examples with a proxy declared by hand, started as their READMEs say, with real nodes.
 
 The robot cannot reach any container: whatever crosses goes through the proxy's
 published ports.
 """
 
+import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,13 +17,15 @@ from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
 from tests.docker.robot import HOST_ADDRESS, MASTER_URI, Robot
 
 EXAMPLE = ROOT / "examples/docker/by-hand"
+KERNEL = ROOT / "examples/docker/kernel"
 PUBLISHED = range(11400, 11420)
 
 
 class Inside:
-    """The containers of the example."""
+    """The containers of an example."""
 
-    def __init__(self, proxy_image: str, ros_image: str) -> None:
+    def __init__(self, directory: Path, proxy_image: str, ros_image: str) -> None:
+        self._directory = directory
         self._variables = {
             "ROSPROXY_IMAGE": proxy_image,
             "ROS_IMAGE": ros_image,
@@ -28,7 +34,7 @@ class Inside:
         }
 
     def compose(self, *arguments: str) -> str:
-        return compose(EXAMPLE, *arguments, variables=self._variables)
+        return compose(self._directory, *arguments, variables=self._variables)
 
     def container(self, service: str) -> str:
         return self.compose("ps", "--quiet", service).splitlines()[-1]
@@ -42,15 +48,20 @@ class Inside:
         docker("exec", "--detach", self.container("talker"), *command)
 
 
-@pytest.fixture(scope="module")
-def inside(robot: Robot, proxy_image: str, ros_image: str) -> Iterator[Inside]:
-    inside = Inside(proxy_image, ros_image)
+@contextmanager
+def example(inside: Inside) -> Iterator[Inside]:
     try:
         inside.compose("up", "--detach", "--no-build")
         yield inside
     finally:
         print(inside.compose("logs", "rosproxy"))
         inside.compose("down", "--timeout", "5")
+
+
+@pytest.fixture(scope="module")
+def inside(robot: Robot, proxy_image: str, ros_image: str) -> Iterator[Inside]:
+    with example(Inside(EXAMPLE, proxy_image, ros_image)) as inside:
+        yield inside
 
 
 def nodes(robot: Robot) -> dict[str, str]:
@@ -117,3 +128,31 @@ def test_robot_is_heard_again_after_the_proxy_was_killed(robot: Robot, inside: I
 def test_stopping_the_example_leaves_no_entry_behind(robot: Robot, inside: Inside) -> None:
     inside.compose("stop", "--timeout", "10")
     wait_until(lambda: not inside_ports(robot), 10, lambda: str(nodes(robot)))
+
+
+def test_example_with_the_kernel(robot: Robot, proxy_image: str, ros_image: str) -> None:
+    """After all others: it has the same ports."""
+    with example(Inside(KERNEL, proxy_image, ros_image)) as inside:
+        assert robot.run("rostopic", "echo", "-n", "3", "/chatter").count("from inside") == 3
+        assert counted(inside) > 0
+
+        docker("restart", "--time", "0", inside.container("rosproxy"))
+
+        assert robot.run("rostopic", "echo", "-n", "3", "/chatter").count("from inside") == 3
+        assert counted(inside) > 0
+
+
+def counted(inside: Inside) -> int:
+    """The bytes that the kernel has forwarded, once there are any."""
+
+    def status() -> dict[str, Any]:
+        text = docker("exec", inside.container("rosproxy"), "rosproxy", "status", "--json")
+        found: dict[str, Any] = json.loads(text)
+        return found
+
+    def sent() -> int:
+        return sum(int(node["data_plane"]["sent"]) for node in status()["nodes"])
+
+    assert status()["data_plane"]["plane"] == "kernel", status()
+    wait_until(lambda: sent() > 0, 10, lambda: str(status()))
+    return sent()

@@ -3,6 +3,8 @@
 import re
 import time
 
+import pytest
+
 from tests.docker.engine import docker, inspect, wait_until
 
 HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges")
@@ -36,6 +38,29 @@ def test_becomes_healthy_without_any_privilege(proxy_image: str, container_name:
     assert status["Uid"].split() == ["10001"] * 4
     assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
     assert status["NoNewPrivs"] == "1"
+
+
+RULES = "add table inet test; add chain inet test c { type nat hook prerouting priority 0; }"
+KERNEL = {
+    "NET_ADMIN": (("--cap-add", "NET_ADMIN"), True),
+    "nothing": ((), False),
+    "no-new-privileges": (
+        ("--cap-add", "NET_ADMIN", "--security-opt", "no-new-privileges:true"), False),
+    "another user": (("--cap-add", "NET_ADMIN", "--user", "10002:10002"), False),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("given", KERNEL)
+def test_its_user_makes_rules_where_it_may(proxy_image: str, given: str) -> None:
+    options, may = KERNEL[given]
+    hardened = ("run", "--rm", "--read-only", "--cap-drop", "ALL", *options, "--entrypoint")
+    nft = (*hardened, "/usr/libexec/rosproxy/nft", proxy_image, RULES)
+    conntrack = (*hardened, "/usr/libexec/rosproxy/conntrack", proxy_image, "-L", "-p", "tcp")
+
+    for command in (nft, conntrack):
+        said = docker(*command, check=may)
+        refused = re.search("(?i)not permitted|permission denied|get CAP_NET_ADMIN", said)
+        assert bool(refused) != may, said
 
 
 def test_writes_no_file(proxy_image: str, container_name: str) -> None:

@@ -7,9 +7,10 @@ import pytest
 
 from tests.docker.controller import Controller, Proxy, managed, the_proxy
 from tests.docker.engine import docker, inspect, wait_until
-from tests.docker.inside import Inside
+from tests.docker.inside import ENABLE, Inside
 from tests.docker.nodes import LIBRARIES
 from tests.docker.robot import Robot
+from tests.docker.test_data_plane import wait_forwarded
 from tests.docker.traffic import traffic
 
 
@@ -86,3 +87,29 @@ def test_missing_image_is_told_with_what_to_do(
 
     assert "docker build" in controller.problems() or "docker pull" in controller.problems()
     assert not managed("proxy")
+
+
+def test_data_plane_of_the_controller_is_for_those_who_ask_for_none(
+    start_controller: Callable[..., Controller], net: Inside, named: Robot
+) -> None:
+    start_controller("--data-plane", "kernel", "--ports", "12")
+    network = net.network()
+    with traffic(net, named, network, "rospy") as flow:
+        wait_forwarded(flow)
+        former, ports = inspect(the_proxy().sandbox)["Id"], the_proxy().ports
+        changed = time.time()
+
+        net.idle(network, labels=(ENABLE, "rosproxy.data-plane=copy"))
+
+        copying = "ROSPROXY_DATA_PLANE=copy"
+        wait_until(lambda: copying in variables(the_proxy()), 30, lambda: docker("ps", "--all"))
+        flow.wait(since=time.time())
+        print(f"from kernel to copy: {flow.gaps(changed)}")
+        assert not inspect(the_proxy().name)["HostConfig"]["CapAdd"]
+        assert inspect(the_proxy().sandbox)["Id"] != former, "no rules are left behind"
+        assert the_proxy().ports == ports
+
+
+def variables(proxy: Proxy) -> list[str]:
+    found: list[str] = inspect(proxy.name, check=False).get("Config", {}).get("Env", [])
+    return found

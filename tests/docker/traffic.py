@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from tests.docker.engine import docker
-from tests.docker.inside import Container, Inside, unique
+from tests.docker.inside import ENABLE, Container, Inside, unique
 from tests.docker.nodes import Log
 from tests.docker.robot import Robot
 
@@ -59,13 +59,16 @@ class Gaps:
 
 
 @contextmanager
-def traffic(net: Inside, robot: Robot, network: str, library: str) -> Iterator[Traffic]:
+def traffic(
+    net: Inside, robot: Robot, network: str, library: str, labels: tuple[str, ...] = (ENABLE,)
+) -> Iterator[Traffic]:
     """Twenty messages a second both ways, and as many calls."""
     out, back, service = (f"/{unique(what).replace('-', '_')}" for what in ("out", "in", "serve"))
     mark = out.rsplit("_", 1)[1]
-    talker = net.node(network, library, "pub", "--topic", out, "--word", "inside")
-    listener = net.node(network, library, "sub", "--topic", back)
-    server = net.node(network, library, "serve", "--service", service)
+    talker = net.node(network, library, "pub", "--topic", out, "--word", "inside",
+                      labels=labels)  # fmt: skip
+    listener = net.node(network, library, "sub", "--topic", back, labels=labels)
+    server = net.node(network, library, "serve", "--service", service, labels=labels)
     names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
     outward = robot.node(names[0], library, "sub", "--topic", out)
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")

@@ -118,6 +118,7 @@ GOOD: list[Json] = [
     {"master": {"uri": "http://r"}, "resources": {}, "cleanupAfterSeconds": 0, "graceSeconds": 0},
     {"master": {"uri": "http://r"}, "hostAliases": [{"ip": "1.2.3.4", "hostnames": ["Robot"]}]},
     {"master": {"uri": "http://r"}, "policy": {"slaveControl": "Master"}},
+    {"master": {"uri": "http://r"}, "dataPlane": "Kernel"},
 ]
 BAD: list[tuple[Json, str]] = [
     ({"master": {"uri": "http://r:65536"}}, "must be of the form http://host:11311"),
@@ -131,6 +132,7 @@ BAD: list[tuple[Json, str]] = [
     ({"master": {"service": {"name": "m"}, "publish": 11400}}, "lies in portWindow"),
     ({"master": {"uri": "http://r", "publish": 11300}}, "is outside already"),
     ({"master": {"uri": "http://r"}, "portWindow": {"last": 70000}}, "portWindow.last"),
+    ({"master": {"uri": "http://r"}, "dataPlane": "kernel"}, "dataPlane"),
     ({"master": {"uri": "http://r"}, "tolerations": [{"key": "", "operator": "Exists"}]}, "key"),
     ({"master": {"uri": "http://r"}, "tolerations": [{"value": "a"}]}, "needs the operator Exists"),
     (

@@ -36,3 +36,18 @@ def test_baseline_forbids_host_ports_and_it_is_said_what_to_do(baseline: Namespa
 
     api.patch("namespaces", "", baseline.name, {"metadata": {"labels": {ENFORCE: "privileged"}}})
     wait_until(lambda: bool(made.proxies), 90, lambda: f"the remedy helps: {made.tell()}")
+
+
+def test_restricted_forbids_the_kernel_plane_and_it_is_said_what_to_do(net: Namespace) -> None:
+    """The pod, which is not so restricted itself, was there before."""
+    net.idle(on="node1")
+    api.patch("namespaces", "", net.name, {"metadata": {"labels": {ENFORCE: "restricted"}}})
+
+    made = rosproxy(net.name, master=NOWHERE, ports=4, dataPlane="Kernel")
+
+    event = made.wait_event("ProxyNotAdmitted")
+    for text in (event.message, made.wait_for("Ready", "False")["message"]):
+        assert "hostPort" in text, text
+        assert "NET_ADMIN for spec.dataPlane: Kernel" in text, text
+        assert f"kubectl label namespace {net.name} {ENFORCE}=privileged" in text, text
+    assert made.proxies == []

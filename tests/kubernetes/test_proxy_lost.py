@@ -14,12 +14,17 @@ from tests.kubernetes.traffic import flow
 LOSSES: dict[str, Callable[[Proxy], object]] = {
     "container killed": lambda proxy: proxy.crash(),
     "pod deleted": lambda proxy: proxy.remove(wait=False),
+    "pod deleted without grace": lambda proxy: proxy.remove(grace=0, wait=False),
 }
+SERVED = {"pod deleted without grace": 10.0}
+"""Seconds after which nothing comes by the old proxy any more, and who lost it may be silent."""
 CASES = [
     ("container killed", "rospy"),
     ("container killed", "roscpp"),
     ("pod deleted", "rospy"),
     ("pod deleted", "roscpp"),
+    ("pod deleted without grace", "rospy"),
+    ("pod deleted without grace", "roscpp"),
 ]
 
 
@@ -34,7 +39,7 @@ def test_lost_proxy_comes_back_on_its_ports(
 
         LOSSES[how](before)
 
-        traffic.wait(since=lost + 1.5, seconds=60)
+        traffic.wait(since=lost + SERVED.get(how, 1.5), seconds=60)
         after = made.the_proxy()
         traffic.wait(since=time.time())
         note(f"{how}, {library}: {traffic.gaps(lost)}")

@@ -100,10 +100,19 @@ class Applier:
             case Disconnect(name, network):
                 with _fine("is not connected"):
                     engine.disconnect(name, network)
-            case Remove(name):
-                with _fine("is already in progress"):
-                    self._leave_all(name)
-                    engine.remove(name)
+            case Remove():
+                self._remove(action)
+
+    def _remove(self, action: Remove) -> None:
+        name = action.name
+        try:
+            if action.stop:
+                self._engine.stop(name)
+        except EngineError as error:
+            log.debug("%s is killed, as it can't be stopped: %s", name, error)
+        with _fine("is already in progress"):
+            self._leave_all(name)
+            self._engine.remove(name)
 
     def _leave_all(self, name: str) -> None:
         """Take a container off all networks but the uplink.

@@ -15,6 +15,7 @@ version both sides know) before each path but the first::
     POST /containers/create
     POST /containers/[^/]+/start
     POST /containers/[^/]+/restart
+    POST /containers/[^/]+/stop
     POST /containers/[^/]+/unpause
     POST /containers/[^/]+/rename
     DELETE /containers/[^/]+
@@ -105,6 +106,10 @@ class Engine:
     def restart(self, name: str) -> None:
         """End a container's process and start it again, or only start it."""
         self._do("restart", name, timeout=STOP_TIMEOUT)
+
+    def stop(self, name: str) -> None:
+        """End a container's process; one that does not run is left alone."""
+        self._do("stop", name, timeout=STOP_TIMEOUT)
 
     def unpause(self, name: str) -> None:
         """Resume a container."""

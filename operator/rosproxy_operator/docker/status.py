@@ -115,6 +115,7 @@ def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
         "state": process.container.state if process else "absent",
         "reachable": bool(said),
         "networks": sorted(networks - {settings.uplink}),
+        "data_plane": (said.get("data_plane") or {}).get("plane"),
         "used": ports.get("used"),
         "free": ports.get("free"),
         "problems": [

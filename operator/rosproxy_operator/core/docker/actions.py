@@ -6,18 +6,23 @@ Containers are named, not numbered: a plan may start what it has yet to create.
 from dataclasses import dataclass
 
 from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import DataPlane
 from rosproxy_operator.core.docker.model import Key
 
 
 @dataclass(frozen=True, slots=True)
 class SandboxSpec:
-    """A sandbox to create: the container with a proxy's network namespace and published ports."""
+    """A sandbox to create: the container with a proxy's network namespace and published ports.
+
+    With ``forwards`` the kernel may forward packets in that namespace.
+    """
 
     name: str
     key: Key
     range: PortRange
     fingerprint: str
     uplink: str
+    forwards: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +38,7 @@ class ProxySpec:
     fingerprint: str
     sandbox: str
     replaces: str = ""
+    data_plane: DataPlane = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +112,15 @@ class Disconnect:
 class Remove:
     """Kill and remove a container.
 
-    With ``retire`` the proxy's nodes are unregistered at the master first: nobody takes over.
+    With ``retire`` the proxy's nodes are unregistered at the master first: nobody takes over. With
+    ``stop`` it is ended properly first: it goes together with its network, and what the kernel
+    forwards there would never be closed.
     """
 
     name: str
     why: str
     retire: bool = False
+    stop: bool = False
 
 
 Action = (

@@ -52,6 +52,12 @@ def removed(containers: tuple[Container, ...], why: str) -> Iterator[Remove]:
         yield Remove(container.name, why)
 
 
+def stopped(containers: tuple[Container, ...], why: str) -> Iterator[Remove]:
+    """Remove these containers, but end them properly first."""
+    for container in containers:
+        yield Remove(container.name, why, stop=True)
+
+
 def named(container: Container, name: str, taken: frozenset[str]) -> Iterator[Action]:
     """Give a container the name that it is to have, if nobody else has it."""
     if container.name != name and name not in taken:

@@ -1,7 +1,9 @@
 """From wishes to the proxies that there ought to be."""
 
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 
+from rosproxy.core.settings import DataPlane
 from rosproxy_operator.core.docker.membership import BUILT_IN
 from rosproxy_operator.core.docker.memory import Memory
 from rosproxy_operator.core.docker.model import (
@@ -11,6 +13,7 @@ from rosproxy_operator.core.docker.model import (
     Observed,
     Wish,
 )
+from rosproxy_operator.core.docker.planes import chosen, outvoted
 from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.core.problem import Problem
 
@@ -25,7 +28,8 @@ def desire(
     """One Desired for each key that is wished for or has a proxy, sorted by key.
 
     A wish for networks that are not there (any more) is dropped. Containers that have exited
-    keep networks joined that a proxy is on, for the settings' grace, but join none.
+    keep networks joined that a proxy is on, and its data plane, for the settings' grace, but join
+    none.
     """
     every = tuple(wishes)
     bad = _before_uplink(observed.networks, settings.uplink)
@@ -38,11 +42,15 @@ def desire(
     ]
     live = [wish for wish in every if wish.alive and wish.networks & usable]
     desired = tuple(
-        _one(key, settings.ports, live, _kept(key, recent, observed), usable)
+        replace(
+            _one(key, settings.ports, live, _kept(key, recent, observed), usable),
+            data_plane=_data_plane(key, [*live, *recent], settings),
+        )
         for key in sorted(keys)
     )
     wanted = {name for wish in every if wish.alive for name in wish.networks}
-    return desired, tuple(_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
+    bad_networks = (_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
+    return desired, (*bad_networks, *outvoted(desired))
 
 
 def _one(
@@ -57,6 +65,10 @@ def _one(
         networks=frozenset(joined.intersection(usable)),
         wishes=own,
     )
+
+
+def _data_plane(key: Key, wishes: Iterable[Wish], settings: PlanSettings) -> DataPlane:
+    return chosen((wish for wish in wishes if wish.key == key), settings.data_plane)
 
 
 def _kept(key: Key, recent: Iterable[Wish], observed: Observed) -> frozenset[str]:

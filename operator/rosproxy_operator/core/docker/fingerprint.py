@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosproxy.core.ports import PortRange
-from rosproxy.core.settings import SettingError, parse_range
+from rosproxy.core.settings import DataPlane, SettingError, parse_range
 from rosproxy.core.uris import HostPort, parse_slave_uri
 from rosproxy_operator.core.docker.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.core.docker.model import Key
@@ -31,6 +31,11 @@ LOCAL_PORTS = "1024 11000"
 ADMIN_PORT = 11312
 WAIT = ("sleep", "infinity")
 """What a sandbox does: nothing, as long as it is let."""
+_KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
+"""What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
+
+Said in so many words, as an engine may have no-new-privileges for its default.
+"""
 _SLUG = 30
 
 
@@ -109,18 +114,27 @@ def own_labels(spec: SandboxSpec | ProxySpec) -> dict[str, str]:
     }
 
 
-def sandbox_fingerprint(key: Key, ports: PortRange, settings: PlanSettings) -> str:
+def sandbox_fingerprint(
+    key: Key, ports: PortRange, settings: PlanSettings, forwards: bool = False
+) -> str:
     """What a sandbox is made of, in 16 hex digits. The image is not in it: any will do."""
-    body = sandbox_config(SandboxSpec("", key, ports, "", settings.uplink), settings)
+    body = sandbox_config(SandboxSpec("", key, ports, "", settings.uplink, forwards), settings)
     return _digest({**body, "Image": ""})
 
 
-def fingerprint(key: Key, ports: PortRange, settings: PlanSettings, image_id: str) -> str:
+def fingerprint(
+    key: Key,
+    ports: PortRange,
+    settings: PlanSettings,
+    image_id: str,
+    data_plane: DataPlane = "auto",
+) -> str:
     """What a proxy's own container is made of, in 16 hex digits.
 
     Neither its name, its token, its sandbox nor the master's address are in it.
     """
-    body = container_config(ProxySpec("", key, ports, "", ""), settings, "", "")
+    spec = ProxySpec("", key, ports, "", "", data_plane=data_plane)
+    body = container_config(spec, settings, "", "")
     return _digest({**body, "Image": image_id})
 
 
@@ -139,7 +153,7 @@ def sandbox_config(spec: SandboxSpec, settings: PlanSettings) -> dict[str, Any]:
             "Init": True,
             "NetworkMode": spec.uplink,
             "PortBindings": _bindings(spec.range, settings),
-            "Sysctls": {"net.ipv4.ip_local_port_range": LOCAL_PORTS},
+            "Sysctls": _sysctls(spec),
         },
         "NetworkingConfig": {"EndpointsConfig": {spec.uplink: {}}},
     }
@@ -160,19 +174,27 @@ def container_config(
         "Labels": own_labels(spec),
         "HostConfig": {
             **_hardened(),
+            **(_KERNEL if spec.data_plane == "kernel" else {}),
             "Init": False,
             "NetworkMode": f"container:{spec.sandbox}",
         },
     }
 
 
+def _sysctls(spec: SandboxSpec) -> dict[str, str]:
+    sysctls = {"net.ipv4.ip_local_port_range": LOCAL_PORTS}
+    return sysctls | {"net.ipv4.ip_forward": "1"} if spec.forwards else sysctls
+
+
 def _environment(spec: ProxySpec) -> dict[str, str]:
+    plane = "" if spec.data_plane == "auto" else spec.data_plane
     return {
         "ROS_MASTER_URI": spec.key.master_uri,
         "ROSPROXY_ADVERTISE_HOST": spec.key.advertise_host,
         "ROSPROXY_PORT_RANGE": str(spec.range),
         "ROSPROXY_MASTER_PORT": str(master(spec.key).port),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(spec.key)}",
+        "ROSPROXY_DATA_PLANE": plane,
     }
 
 

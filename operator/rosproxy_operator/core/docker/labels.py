@@ -4,6 +4,7 @@ import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from rosproxy.core.settings import DataPlane
 from rosproxy.core.text import listed
 from rosproxy_operator.core.docker import values
 from rosproxy_operator.core.docker.fingerprint import MANAGED, master
@@ -100,8 +101,14 @@ def _wish(container: Container, seen: _Seen) -> tuple[Wish, str]:
         ),
         needs=needs,
         alive=container.alive,
+        data_plane=_data_plane(container),
     )
     return wish, text
+
+
+def _data_plane(container: Container) -> DataPlane | None:
+    label = container.labels.get(values.DATA_PLANE)
+    return None if label is None else values.data_plane(values.DATA_PLANE, label)
 
 
 def _counts(container: Container, settings: PlanSettings) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import DataPlane
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which it is or may soon be somebody's node."""
@@ -151,10 +152,10 @@ class Observed:
 class Wish:
     """What a labelled container wants, its labels and settings put together.
 
-    ``ports`` is 0 without a label. ``networks`` are the names of those on which it wants to meet
-    its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which it looks for the
-    proxy, ``rosproxy`` if it has no such variable, empty where no alias can help it. A container
-    that is not ``alive`` only keeps its networks joined for a while.
+    ``ports`` is 0 and ``data_plane`` None without a label. ``networks`` are the names of those on
+    which it wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which
+    it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
+    it. A container that is not ``alive`` only keeps networks joined and the data plane for a while.
     """
 
     container: str
@@ -164,6 +165,7 @@ class Wish:
     networks: frozenset[str] = frozenset()
     needs: str = ""
     alive: bool = True
+    data_plane: DataPlane | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,3 +181,4 @@ class Desired:
     ports: int
     networks: frozenset[str] = frozenset()
     wishes: tuple[Wish, ...] = ()
+    data_plane: DataPlane = "auto"

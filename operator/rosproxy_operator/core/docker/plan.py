@@ -221,5 +221,5 @@ def _ends(view: _View, desired: Iterable[Desired], wishes: Iterable[Wish]) -> It
     for wish in wishes:
         left = 0.0 if wish.alive else view.left(memory.exited[wish.id])
         joined = any(s.container.networks & wish.networks for s in view.sandboxes(wish.key))
-        if left > 0 and joined:
+        if left > 0 and (joined or wish.data_plane):
             yield left

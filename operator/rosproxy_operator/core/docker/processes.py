@@ -26,7 +26,8 @@ def process_steps(case: Case, home: Home, gone: Collection[str]) -> tuple[Action
     ``gone`` are the names of containers that are removed before. None if one ought to be created
     but can't.
     """
-    print_ = fingerprint(case.key, case.ports, case.settings, case.observed.image_id)
+    image, plane = case.observed.image_id, case.desired.data_plane
+    print_ = fingerprint(case.key, case.ports, case.settings, image, plane)
     there = [one for one in case.proxies if one.container.name not in gone]
     right = {
         one.container.id
@@ -106,7 +107,8 @@ def _created(
     if old and former != old.name:
         yield Rename(old.name, former)
     replaces = former or before
-    yield Create(ProxySpec(name, case.key, case.ports, print_, home.name, replaces))
+    plane = case.desired.data_plane
+    yield Create(ProxySpec(name, case.key, case.ports, print_, home.name, replaces, plane))
     if old:
         yield Remove(former, "made anew")
     yield Start(name)

@@ -84,9 +84,10 @@ def line(action: Action) -> str:  # noqa: C901, PLR0911 - one case per action
 def _create(action: Create) -> str:
     proxy = action.proxy
     instead = f", instead of {proxy.replaces}" if proxy.replaces else ""
+    rights = ", with NET_ADMIN" if proxy.data_plane == "kernel" else ""
     return (
         f"create container {proxy.name}: proxy of the master {proxy.key.master_uri} at "
-        f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{instead}"
+        f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{rights}{instead}"
     )
 
 

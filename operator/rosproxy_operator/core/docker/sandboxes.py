@@ -22,7 +22,14 @@ from rosproxy_operator.core.docker.actions import (
     Unpause,
 )
 from rosproxy_operator.core.docker.aliases import holds, needed_by
-from rosproxy_operator.core.docker.case import Case, former_name, inhabitants, named, removed
+from rosproxy_operator.core.docker.case import (
+    Case,
+    former_name,
+    inhabitants,
+    named,
+    removed,
+    stopped,
+)
 from rosproxy_operator.core.docker.fingerprint import sandbox_fingerprint, sandbox_name
 from rosproxy_operator.core.docker.memory import SERVING
 from rosproxy_operator.core.docker.model import Attachment, Container, Desired, Observed
@@ -59,7 +66,8 @@ class SandboxSteps:
 
 def sandbox_steps(case: Case) -> SandboxSteps:
     """The next actions for the sandbox of a key that is wanted."""
-    print_ = sandbox_fingerprint(case.key, case.ports, case.settings)
+    forwards = _forwards(case)
+    print_ = sandbox_fingerprint(case.key, case.ports, case.settings, forwards)
     right = {
         one.container.id
         for one in case.sandboxes
@@ -81,8 +89,17 @@ def sandbox_steps(case: Case) -> SandboxSteps:
     if found.waiting or found.stuck:
         return SandboxSteps(stuck=found.stuck)
     name = free_name(sandbox_name(case.key), _others(case))
-    spec = SandboxSpec(name, case.key, case.ports, print_, case.settings.uplink)
+    spec = SandboxSpec(name, case.key, case.ports, print_, case.settings.uplink, forwards)
     return SandboxSteps(tuple(_created(case, found, spec)), Home(name, starts=True))
+
+
+def _forwards(case: Case) -> bool:
+    """Whether the kernel is to forward in the sandbox.
+
+    One where it did is not used without: a proxy that was killed has left its rules there, and one
+    without the capability can't take them away.
+    """
+    return case.desired.data_plane == "kernel"
 
 
 def leave(
@@ -134,7 +151,7 @@ def _started(case: Case, found: Succession, kept: Container) -> Iterator[Action]
     if case.settings.uplink not in kept.networks:
         yield Connect(kept.name, case.settings.uplink, ())
     if found.old:
-        yield from removed(inhabitants(case, found.old.id), "its sandbox is made anew")
+        yield from stopped(inhabitants(case, found.old.id), "its sandbox is made anew")
         yield from removed((found.old,), "another one takes over")
     yield Start(kept.name)
     yield from _connect(case, kept.name)
@@ -150,7 +167,7 @@ def _created(case: Case, found: Succession, spec: SandboxSpec) -> Iterator[Actio
         yield Rename(old.name, former)
     yield CreateSandbox(spec)
     if old:
-        yield from removed(inhabitants(case, old.id), "its sandbox is made anew")
+        yield from stopped(inhabitants(case, old.id), "its sandbox is made anew")
         yield Remove(former, "made anew")
     yield Start(spec.name)
     yield from _connect(case, spec.name)

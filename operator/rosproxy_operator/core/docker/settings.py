@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import DataPlane
 
 MOST_PORTS = 1000
 """Ports that one proxy may ask for: each costs rules and, by default, a process of the engine."""
@@ -17,7 +18,8 @@ class PlanSettings:
     ``master_uri`` and ``advertise_host`` are for containers without a label of their own and may
     be empty. ``ports`` is the least number of ports that a proxy gets, ``window`` where they are
     looked for, ``publish`` the host's addresses on which they are published. ``grace`` is in
-    seconds: how long a proxy outlives its last container.
+    seconds: how long a proxy outlives its last container. ``data_plane`` is that of proxies whose
+    containers ask for none.
     """
 
     master_uri: str = ""
@@ -29,3 +31,4 @@ class PlanSettings:
     expose_by_default: bool = False
     grace: float = 60.0
     uplink: str = "0-rosproxy"
+    data_plane: DataPlane = "auto"

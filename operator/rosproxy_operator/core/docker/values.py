@@ -1,7 +1,9 @@
 """The values of users' labels."""
 
 import re
+from typing import get_args
 
+from rosproxy.core.settings import DataPlane
 from rosproxy.core.uris import is_address, is_loopback
 from rosproxy_operator.core.docker.settings import MOST_PORTS
 from rosproxy_operator.core.text import bounded
@@ -11,7 +13,8 @@ MASTER_URI = "rosproxy.master-uri"
 PORTS = "rosproxy.ports"
 ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
-LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK)
+DATA_PLANE = "rosproxy.data-plane"
+LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE)
 
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
@@ -44,6 +47,19 @@ def count(label: str, value: str) -> int:
             f"ports the whole proxy is to have, one for each node, e.g. {label}=32"
         )
     return int(word)
+
+
+def data_plane(label: str, value: str) -> DataPlane:
+    """One of the proxy's data planes. Raises Unusable."""
+    planes: tuple[DataPlane, ...] = get_args(DataPlane)
+    word = value.strip().lower()
+    for plane in planes:
+        if word == plane:
+            return plane
+    raise Unusable(
+        f"label {label}={quoted(value)} is none of {', '.join(planes)}: write {label}=kernel for a "
+        "proxy that lets the kernel forward, or leave it out"
+    )
 
 
 def host(source: str, value: str) -> str:

@@ -231,11 +231,20 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},
         "terminationMessagePolicy": "FallbackToLogsOnError",
-        "securityContext": {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        },
+        "securityContext": _rights(spec.data_plane == "kernel"),
+    }
+
+
+def _rights(forwarding: bool) -> dict[str, Any]:
+    """What a proxy may do; ``forwarding`` is by rules that it makes in the kernel.
+
+    The programs for that have the capability from their files: Kubernetes calls it escalation.
+    """
+    add = {"add": ["NET_ADMIN"]} if forwarding else {}
+    return {
+        "allowPrivilegeEscalation": forwarding,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"], **add},
     }
 
 
@@ -252,6 +261,7 @@ def _environment(site: Site) -> Mapping[str, str]:
         "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
         "ROSPROXY_SLAVE_CONTROL": spec.slave_control,
+        "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
     }
     return {name: value for name, value in variables.items() if value} | {TOKEN_VARIABLE: ""}
 

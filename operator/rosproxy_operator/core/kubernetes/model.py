@@ -6,6 +6,7 @@ from enum import Enum
 from typing import Any
 
 from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import DataPlane
 from rosproxy_operator.core.problem import Problem
 
 Json = Mapping[str, Any]
@@ -82,6 +83,7 @@ class Spec:
     cleanup_after: float = 30.0
     grace: float = 60.0
     slave_control: str = "any"
+    data_plane: DataPlane = "auto"
     image: str = ""
     image_pull_policy: str = ""
     image_pull_secrets: tuple[Json, ...] = ()

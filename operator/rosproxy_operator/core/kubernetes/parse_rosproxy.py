@@ -6,7 +6,7 @@ pod is admitted) is checked here again. Defaults are those of the CRD.
 """
 
 from rosproxy.core.ports import PortRange
-from rosproxy.core.settings import SettingError, parse_range
+from rosproxy.core.settings import DataPlane, SettingError, parse_range
 from rosproxy.core.uris import is_address, parse_slave_uri
 from rosproxy_operator.core.kubernetes.model import (
     Advertise,
@@ -40,6 +40,12 @@ RESOURCES: Json = {
     "limits": {"memory": "512Mi"},
 }
 _SLAVE_CONTROL = {"Any": "any", "Master": "master"}
+_DATA_PLANE: dict[str, DataPlane] = {
+    "Auto": "auto",
+    "Kernel": "kernel",
+    "Splice": "splice",
+    "Copy": "copy",
+}
 _PULL_POLICIES = ("", "Always", "IfNotPresent", "Never")
 
 
@@ -93,6 +99,7 @@ def _spec(spec: Field, of: Name) -> Spec:
         slave_control=_SLAVE_CONTROL[
             spec.child("policy").child("slaveControl").choice(_SLAVE_CONTROL, "Any")
         ],
+        data_plane=_DATA_PLANE[spec.child("dataPlane").choice(_DATA_PLANE, "Auto")],
         image=spec.child("image").text(),
         image_pull_policy=spec.child("imagePullPolicy").choice(_PULL_POLICIES, ""),
         image_pull_secrets=spec.child("imagePullSecrets").maps(),

@@ -10,7 +10,6 @@ from rosproxy_operator.core.kubernetes.model import (
     Failure,
     Finding,
     InvalidRosProxy,
-    Name,
     NodeState,
     ProxyPod,
     Reference,
@@ -28,6 +27,7 @@ SILENT = "ProxyUnreachable"
 NO_MASTER = "MasterUnreachable"
 WARNS = "ProxyWarns"
 _LONGEST = 600
+_ENFORCE = "pod-security.kubernetes.io/enforce"
 _TERMINATING = "because it is being terminated"
 """The namespace is being deleted: nothing can be created there, and nothing is to be."""
 
@@ -137,23 +137,22 @@ def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
 
 
 def _refused(rosproxy: RosProxy, failure: Failure) -> Finding:
-    said = clean(" ".join(failure.text.split()))[: _LONGEST - 200]
-    text = f"the API server refused it ({said}): {_remedy(said, rosproxy.id)}"
-    return _finding(rosproxy, failure.subject, text, NOT_ADMITTED)
+    said = clean(" ".join(failure.text.split()))
+    remedy = _remedy(said, rosproxy)
+    head = "the API server refused it"
+    said = said[: _LONGEST - len(f"{head} (): {remedy}")]
+    return _finding(rosproxy, failure.subject, f"{head} ({said}): {remedy}", NOT_ADMITTED)
 
 
-def _remedy(said: str, id: Name) -> str:
+def _remedy(said: str, rosproxy: RosProxy) -> str:
     """What to do about a refusal.
 
-    The words are from k8s.io/pod-security-admission, admission/admission.go, and k8s.io/apiserver,
-    pkg/admission/plugin/resourcequota/controller.go.
+    The words are from k8s.io/pod-security-admission, admission/admission.go and policy/, and
+    k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go.
     """
     low = said.lower()
-    if "violates podsecurity" in low:
-        return (
-            "a proxy takes hostPorts, which needs Pod Security privileged: kubectl label namespace "
-            f"{id.namespace} pod-security.kubernetes.io/enforce=privileged --overwrite"
-        )
+    if "violates podsecurity" in low or "net_admin" in low or "privilegeescalation" in low:
+        return _security_remedy(low, rosproxy)
     if "exceeded quota" in low or "must specify" in low:
         return "raise the namespace's ResourceQuota, or set spec.resources"
     if "is invalid" in low:
@@ -163,3 +162,14 @@ def _remedy(said: str, id: Name) -> str:
     if "not the controller's" in low:
         return "delete or rename that object, or the RosProxy"
     return "it is tried again"
+
+
+def _security_remedy(low: str, rosproxy: RosProxy) -> str:
+    if "hostport" not in low and ("net_admin" in low or "privilegeescalation" in low):
+        return "allow proxies NET_ADMIN in that namespace, or set spec.dataPlane: Auto"
+    kernel = rosproxy.spec.data_plane == "kernel"
+    takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
+    return (
+        f"a proxy takes {takes}, which needs Pod Security privileged: kubectl label namespace "
+        f"{rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
+    )

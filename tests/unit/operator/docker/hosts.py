@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from rosproxy.core.ports import PortRange
+from rosproxy.core.settings import DataPlane
 from rosproxy_operator.core.docker.actions import Action, CreateSandbox, Start
 from rosproxy_operator.core.docker.fingerprint import (
     ROLE_PROXY,
@@ -23,6 +24,7 @@ from rosproxy_operator.core.docker.labels import read_wishes
 from rosproxy_operator.core.docker.memory import Memory
 from rosproxy_operator.core.docker.model import STARTED, Key, Wish
 from rosproxy_operator.core.docker.plan import Plan
+from rosproxy_operator.core.docker.planes import chosen
 from rosproxy_operator.core.docker.settings import PlanSettings
 from rosproxy_operator.core.ports import overlap
 from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engine, Failed, Refused
@@ -34,6 +36,7 @@ EPHEMERAL = PortRange(11414, 11500)
 MASTERS = ("http://robot:11311", "http://arm:11312", "http://192.0.2.9:11402")
 NETWORKS = ("app", "lab", "inner", "0-early", "0-inner")
 COUNTS = ("2", "1", "3", "5", "nonsense")
+PLANES = ("", "kernel", "splice", "auto", "nonsense")
 ENVS = ("", "http://rosproxy:11311", "http://robot:11311", "http://arm:11312")
 STATES = ("running", "exited", "created", "paused", "restarting", "dead", "removing")
 STRANGERS = ("robot", "rosproxy", "web", proxy_name(ROBOT), sandbox_name(ROBOT))
@@ -78,6 +81,8 @@ class Hosts:
             "rosproxy.master-uri": pick(MASTERS, n),
             "rosproxy.ports": pick(COUNTS, n // 3),
         }
+        if plane := pick(PLANES, (n + m) // 7):
+            labels["rosproxy.data-plane"] = plane
         if len(self.strangers()) > 6:
             return
         box = self.engine.add(
@@ -318,12 +323,13 @@ class Hosts:
         for key in sorted({wish.key for wish in live}):
             if not fatal & {f"proxy image {SETTINGS.image}", f"proxy {proxy_name(key)}"}:
                 mine = [wish for wish in live if wish.key == key]
-                self.check_key(key, {n for wish in mine for n in wish.networks & fine})
+                plane = chosen(mine, SETTINGS.data_plane)
+                self.check_key(key, {n for wish in mine for n in wish.networks & fine}, plane)
                 for wish in mine:
                     if f"container {wish.container}" not in told:
                         self.check_names(wish, wish.networks & fine)
 
-    def check_key(self, key: Key, wanted: set[str]) -> None:
+    def check_key(self, key: Key, wanted: set[str], plane: DataPlane) -> None:
         own = [(box, own) for box, own in self.own() if own.key == key]
         if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
             return
@@ -338,8 +344,13 @@ class Hosts:
         assert proxy.namespace == sandbox.namespace or proxy.state == "restarting"
         assert runs.range == is_.range
         if self.engine.image:
-            assert is_.fingerprint == sandbox_fingerprint(key, is_.range, SETTINGS)
-            assert runs.fingerprint == fingerprint(key, is_.range, SETTINGS, self.engine.image)
+            self.check_made_of(key, is_, runs, plane)
+
+    def check_made_of(self, key: Key, is_: Own, runs: Own, plane: DataPlane) -> None:
+        forwards = plane == "kernel"
+        assert is_.fingerprint == sandbox_fingerprint(key, is_.range, SETTINGS, forwards)
+        image = self.engine.image
+        assert runs.fingerprint == fingerprint(key, is_.range, SETTINGS, image, plane)
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

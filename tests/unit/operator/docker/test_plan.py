@@ -309,7 +309,7 @@ def test_other_ports_replace_both() -> None:
     assert actions(observed(container(labels=labels), **both())) == [
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(longer),
-        Remove(NAME, "its sandbox is made anew"),
+        Remove(NAME, "its sandbox is made anew", stop=True),
         Remove(f"{PORTS}-old", "made anew"),
         Start(PORTS),
         Connect(PORTS, "app", ALIASES),
@@ -327,7 +327,7 @@ def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
     lives = proxy(sandbox_id=old.container.id)
     seen = observed(container(labels=labels), sandboxes=[old, new], proxies=[lives])
     assert actions(seen) == [
-        Remove(NAME, "its sandbox is made anew"),
+        Remove(NAME, "its sandbox is made anew", stop=True),
         Remove(f"{PORTS}-old", "another one takes over"),
         Start(PORTS),
         Connect(PORTS, "app", ALIASES),
@@ -340,7 +340,7 @@ def test_another_publish_address_replaces_both() -> None:
     settings = replace(SETTINGS, publish=("192.0.2.10",))
     found = actions(observed(container(), **both()), settings=settings)
     assert found[0] == Rename(PORTS, f"{PORTS}-old")
-    assert found[2] == Remove(NAME, "its sandbox is made anew")
+    assert found[2] == Remove(NAME, "its sandbox is made anew", stop=True)
 
 
 def test_names_of_strangers_are_left_to_them() -> None:

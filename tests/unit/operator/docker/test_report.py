@@ -33,6 +33,7 @@ PROXY = {
     "reachable": True,
     "master_up": True,
     "networks": ["app"],
+    "data_plane": "splice",
     "used": 2,
     "free": 30,
     "problems": [],

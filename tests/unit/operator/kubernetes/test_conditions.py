@@ -1,5 +1,7 @@
 """The conditions of a RosProxy: what is wrong, and what to do."""
 
+from dataclasses import replace
+
 import pytest
 
 from rosproxy_operator.core.kubernetes.model import (
@@ -158,6 +160,36 @@ def test_what_the_api_server_refuses(text, fix):
     assert judged(found, "Ready") == ("False", "ProxyNotAdmitted")
     assert message(found).startswith("robots/rosproxy-arm-node1-1: the API server refused it")
     assert fix in message(found)
+
+
+@pytest.mark.parametrize(
+    ("text", "fix"),
+    [
+        (
+            'pods "x" is forbidden: violates PodSecurity "baseline:latest": non-default '
+            'capabilities (container "rosproxy" must not include "NET_ADMIN" in securityContext.'
+            "capabilities.add), hostPort (container uses hostPorts " + "11400, " * 99 + ")",
+            "a proxy takes hostPorts (and NET_ADMIN for spec.dataPlane: Kernel), which needs Pod "
+            "Security privileged: kubectl label namespace robots "
+            "pod-security.kubernetes.io/enforce=privileged --overwrite",
+        ),
+        (
+            'admission webhook "x" denied the request: NET_ADMIN is not allowed',
+            "or set spec.dataPlane: Auto",
+        ),
+        (
+            "pods is forbidden: allowPrivilegeEscalation must be false",
+            "or set spec.dataPlane: Auto",
+        ),
+    ],
+)
+def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
+    of = replace(rosproxy(), spec=replace(rosproxy().spec, data_plane="kernel"))
+
+    (found,) = findings(of, (), (Failure("robots/rosproxy-arm-node1-1", text),))
+
+    assert found.text.endswith(fix)
+    assert len(found.text) <= 600
 
 
 def test_a_namespace_that_is_being_deleted_is_no_problem():

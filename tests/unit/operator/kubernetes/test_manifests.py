@@ -66,6 +66,13 @@ def test_what_is_not_known_is_left_to_the_proxy() -> None:
     assert not {f"ROSPROXY_{name}" for name in left_out} & names.keys()
 
 
+@pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy"])
+def test_it_is_told_how_to_forward(plane: str) -> None:
+    variables = env(data_plane=plane)
+    assert settings_of(variables).data_plane == plane
+    assert ("ROSPROXY_DATA_PLANE" in variables) == (plane != "auto")
+
+
 def test_clean_up_can_be_switched_off() -> None:
     assert settings_of(env(cleanup_after=0.0)).cleanup_after == 0.0
 
@@ -91,6 +98,19 @@ def test_it_can_do_nothing_that_it_need_not() -> None:
         "capabilities": {"drop": ["ALL"]},
     }
     assert not {"hostNetwork", "hostPID", "hostIPC", "volumes", "priorityClassName"} & pod.keys()
+
+
+def test_only_the_kernel_plane_may_make_rules() -> None:
+    assert container(data_plane="kernel")["securityContext"] == {
+        "allowPrivilegeEscalation": True,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"], "add": ["NET_ADMIN"]},
+    }
+    pod = spec(data_plane="kernel")
+    assert pod["securityContext"] == spec()["securityContext"]
+    assert pod["securityContext"]["runAsNonRoot"] is True
+    for plane in ("splice", "copy"):
+        assert container(data_plane=plane)["securityContext"] == container()["securityContext"]
 
 
 def test_it_is_bound_to_its_node_but_placed_by_the_scheduler() -> None:

@@ -27,7 +27,7 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
     assert (spec.ports, spec.window) == (32, PortRange(11400, 29999))
     assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
-    assert (spec.cleanup_after, spec.grace) == (30.0, 60.0)
+    assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
     assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", RESOURCES)
     assert (found.former, found.cluster_ip, found.deleting) == ({}, "", False)
 
@@ -52,6 +52,7 @@ def test_all_fields():
                 "cleanupAfterSeconds": 0,
                 "graceSeconds": 5,
                 "policy": {"slaveControl": "Master"},
+                "dataPlane": "Kernel",
                 "image": "rosproxy:2",
                 "imagePullPolicy": "Never",
                 "imagePullSecrets": [{"name": "pull"}],
@@ -73,7 +74,7 @@ def test_all_fields():
     assert found.node_selector == {"disk": "ssd"}
     assert found.tolerations == ({"operator": "Exists"},)
     assert (found.advertise, found.slave_control) == (Advertise.HOSTNAME, "master")
-    assert (found.cleanup_after, found.grace) == (0.0, 5.0)
+    assert (found.cleanup_after, found.grace, found.data_plane) == (0.0, 5.0, "kernel")
     assert (found.image, found.image_pull_policy) == ("rosproxy:2", "Never")
     assert found.image_pull_secrets == ({"name": "pull"},)
     assert found.resources == {"requests": {"cpu": 1}}
@@ -178,6 +179,7 @@ def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> d
         ({"cleanupAfterSeconds": -1}, "spec.cleanupAfterSeconds"),
         ({"graceSeconds": "1m"}, "spec.graceSeconds"),
         ({"policy": {"slaveControl": "any"}}, "spec.policy.slaveControl"),
+        ({"dataPlane": "kernel"}, "spec.dataPlane"),
         ({"imagePullPolicy": "Maybe"}, "spec.imagePullPolicy"),
         ({"hostAliases": {"robot": "192.0.2.7"}}, "spec.hostAliases"),
         ({"hostAliases": [{"ip": "robot", "hostnames": []}]}, "spec.hostAliases[0].ip"),
@@ -221,6 +223,7 @@ _FIELDS = [
     *("master", "uri", "address", "service", "publish", "ports", "portWindow", "first", "last"),
     *("podSelector", "matchLabels", "matchExpressions", "key", "operator", "values", "advertise"),
     *("nodeSelector", "tolerations", "policy", "slaveControl", "cleanupAfterSeconds", "image"),
+    "dataPlane",
     *("imagePullSecrets", "resources", "hostAliases", "ip", "hostnames"),
 ]
 _json = st.recursive(

@@ -156,6 +156,7 @@ def test_another_image_is_given_to_the_pod_that_is_there() -> None:
         {"ports": 5},
         {"cleanup_after": 5.0},
         {"slave_control": "master"},
+        {"data_plane": "kernel"},
         {"image_pull_policy": "Never"},
         {"resources": {"limits": {"memory": "1Gi"}}},
         {"tolerations": ({"operator": "Exists"},)},

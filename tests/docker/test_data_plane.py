@@ -1,0 +1,111 @@
+"""Topics that the kernel forwards: what the containers get for it, and that messages flow."""
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.docker.controller import Controller, Proxy, the_proxy
+from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.nodes import LIBRARIES
+from tests.docker.robot import Robot
+from tests.docker.test_proxy_lost import recovered
+from tests.docker.traffic import Traffic, crash, traffic
+
+KERNEL = (ENABLE, "rosproxy.data-plane=kernel", "rosproxy.ports=40")
+"""Nodes of the test before hold their ports for a while, and each node is to have two."""
+
+
+def status(proxy: Proxy) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(docker("exec", proxy.name, "rosproxy", "status", "--json"))
+    return found
+
+
+def plane_of(node: str) -> dict[str, Any]:
+    """How the topics of an inside node are forwarded."""
+    nodes = status(the_proxy())["nodes"]
+    mine = [one["data_plane"] for one in nodes if f"/{node}" in one["nodes"]]
+    assert len(mine) == 1, nodes
+    found: dict[str, Any] = mine[0]
+    return found
+
+
+def wait_forwarded(flow: Traffic) -> dict[str, Any]:
+    """Wait until the kernel forwards the talker's topic, and return what the proxy says of it."""
+    talker = flow.talker.node
+    wait_until(
+        lambda: plane_of(talker)["plane"] == "kernel" and plane_of(talker)["connections"] > 0,
+        20, lambda: str(status(the_proxy())),
+    )  # fmt: skip
+    before = plane_of(talker)
+    assert before["port"] in the_proxy().ports
+    wait_until(lambda: plane_of(talker)["sent"] > before["sent"], 20, "its bytes are counted")
+    return before
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_kernel_forwards_what_the_label_asks_for(
+    library: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    with traffic(net, named, net.network(), library, labels=KERNEL) as flow:
+        wait_forwarded(flow)
+
+        found = status(the_proxy())["data_plane"]
+        assert (found["mode"], found["plane"]) == ("kernel", "kernel")
+        assert controller.status()["proxies"][0]["data_plane"] == "kernel"
+        has_one_capability(the_proxy())
+
+
+def has_one_capability(proxy: Proxy) -> None:
+    """Which the user that the proxy runs as can't use but by two programs."""
+    host = inspect(proxy.name)["HostConfig"]
+    assert (host["CapDrop"], host["CapAdd"]) == (["ALL"], ["NET_ADMIN"])
+    assert host["ReadonlyRootfs"]
+    assert not host["Privileged"]
+    lines = docker("exec", proxy.name, "cat", "/proc/1/status").splitlines()
+    rights = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+    assert rights["Uid"].split() == ["10001"] * 4
+    assert int(rights["CapEff"], 16) == int(rights["CapPrm"], 16) == 0
+    assert not inspect(proxy.sandbox)["HostConfig"]["CapAdd"]
+
+
+LOSSES: dict[str, Callable[[Proxy], object]] = {
+    "crash": lambda proxy: crash(proxy.name),
+    "docker kill": lambda proxy: docker("kill", proxy.name),
+    "docker rm --force": lambda proxy: docker("rm", "--force", proxy.name),
+    "docker stop": lambda proxy: docker("stop", proxy.name),
+}
+
+
+@pytest.mark.parametrize(
+    ("how", "library"),
+    [("crash", "rospy"), ("docker kill", "roscpp"), ("docker rm --force", "rospy"),
+     ("docker rm --force", "roscpp"), ("docker stop", "rospy")],
+)  # fmt: skip
+def test_kernel_forwards_again_after_the_proxy_was_lost(
+    how: str, library: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    with traffic(net, named, net.network(), library, labels=KERNEL) as flow:
+        before = wait_forwarded(flow)
+        proxy, lost = the_proxy(), time.time()
+
+        LOSSES[how](proxy)
+
+        flow.wait(since=recovered(lost), seconds=40)
+        print(f"{how}, {library}: {flow.gaps(lost)}")
+        after = wait_forwarded(flow)
+        assert after["port"] == before["port"]
+
+
+def test_nobody_asks_and_the_proxy_says_why_the_kernel_does_not_forward(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    with traffic(net, named, net.network(), "roscpp") as flow:
+        found = plane_of(flow.talker.node)
+        assert found["plane"] == "splice"
+        whole = status(the_proxy())["data_plane"]
+        assert (whole["mode"], whole["plane"]) == ("auto", "splice")
+        assert "NET_ADMIN" in whole["reason"]

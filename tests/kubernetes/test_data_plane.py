@@ -1,0 +1,71 @@
+"""A RosProxy whose proxies let the kernel forward topics."""
+
+import json
+import time
+from typing import Any
+
+from tests.docker.engine import wait_until
+from tests.kubernetes.pods import Namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import RosProxy, rosproxy
+from tests.kubernetes.traffic import Flow, flow
+
+
+def status(made: RosProxy) -> dict[str, Any]:
+    """What the proxy on node1 says of itself."""
+    found: dict[str, Any] = json.loads(made.the_proxy().run("rosproxy", "status", "--json"))
+    return found
+
+
+def plane_of(made: RosProxy, node: str) -> dict[str, Any]:
+    nodes = status(made)["nodes"]
+    found = [one["data_plane"] for one in nodes if f"/{node}" in one["nodes"]]
+    return dict(found[0]) if found else {}
+
+
+def wait_forwarded(made: RosProxy, moving: Flow) -> None:
+    """Wait until the kernel forwards the talker's topic and counts its bytes."""
+    talker = moving.talker.node
+
+    def so() -> bool:
+        found = plane_of(made, talker)
+        return found.get("plane") == "kernel" and found["connections"] > 0 and found["sent"] > 0
+
+    wait_until(so, 30, lambda: f"the kernel forwards: {status(made)}")
+    before = plane_of(made, talker)["sent"]
+    wait_until(lambda: plane_of(made, talker)["sent"] > before, 20, "bytes are counted")
+
+
+def test_kernel_forwards_again_after_the_proxy_was_killed(net: Namespace, robot: Robot) -> None:
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=16, dataPlane="Kernel")
+    with flow(net, robot, "roscpp") as moving:
+        wait_forwarded(made, moving)
+        proxy = made.the_proxy()
+        given = proxy.body["spec"]["containers"][0]["securityContext"]
+        assert given["capabilities"] == {"add": ["NET_ADMIN"], "drop": ["ALL"]}
+        assert "CapEff:\t0000000000000000" in proxy.run("cat", "/proc/1/status")
+        restarts = proxy.restarts
+
+        proxy.crash()
+
+        wait_until(lambda: made.the_proxy().restarts > restarts, 30, made.tell)
+        moving.wait(since=time.time())
+        wait_forwarded(made, moving)
+
+
+def test_another_plane_makes_the_proxy_anew(net: Namespace, robot: Robot) -> None:
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=16, dataPlane="Splice")
+    with flow(net, robot, "rospy") as moving:
+        before = made.the_proxy()
+        assert plane_of(made, moving.talker.node)["plane"] == "splice"
+
+        made.change(dataPlane="Kernel")
+
+        def anew() -> bool:
+            found = made.proxy_on("node1")
+            return found is not None and found.uid_then != before.uid_then and found.ready
+
+        wait_until(anew, 40, made.tell)
+        assert made.the_proxy().ports == before.ports
+        moving.wait(since=time.time())
+        wait_forwarded(made, moving)

@@ -1,0 +1,202 @@
+"""How a proxy is told to forward, and what its containers are given for that."""
+
+from dataclasses import replace
+
+import pytest
+
+from rosproxy.core.settings import DataPlane
+from rosproxy_operator.core.docker.actions import (
+    Action,
+    Create,
+    CreateSandbox,
+    ProxySpec,
+    SandboxSpec,
+)
+from rosproxy_operator.core.docker.fingerprint import (
+    container_config,
+    fingerprint,
+    proxy_name,
+    sandbox_config,
+    sandbox_fingerprint,
+)
+from rosproxy_operator.core.docker.labels import read_wishes
+from rosproxy_operator.core.docker.memory import Memory
+from rosproxy_operator.core.docker.model import Container, Proxy, Sandbox
+from rosproxy_operator.core.docker.plan import Plan, plan
+from rosproxy_operator.core.docker.report import line
+from rosproxy_operator.core.docker.settings import PlanSettings
+from tests.unit.operator.docker.builders import (
+    ENABLED,
+    IMAGE,
+    KEY,
+    RANGE,
+    SETTINGS,
+    container,
+    observed,
+    proxy,
+    sandbox,
+)
+
+LABEL = "rosproxy.data-plane"
+NAME = proxy_name(KEY)
+SANDBOX = SandboxSpec("s", KEY, RANGE, "f1", "0-rosproxy")
+PROXY = ProxySpec("p", KEY, RANGE, "f2", "s")
+
+
+def asking(name: str, plane: str, state: str = "running") -> Container:
+    return container(name, {**ENABLED, LABEL: plane}, state=state)
+
+
+def look(
+    *containers: Container,
+    there: tuple[Sandbox, Proxy] | None = None,
+    settings: PlanSettings = SETTINGS,
+    memory: Memory | None = None,
+    now: float = 0.0,
+) -> Plan:
+    boxes, proxies = ([there[0]], [there[1]]) if there else ([], [])
+    seen = observed(*containers, sandboxes=boxes, proxies=proxies)
+    return plan(seen, settings, memory or Memory(), now)
+
+
+def given(found: Plan) -> DataPlane:
+    return found.desired[0].data_plane
+
+
+def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
+    """What sandboxes are created with, and what proxies."""
+    boxes = [action.sandbox.forwards for action in actions if isinstance(action, CreateSandbox)]
+    return boxes, [action.proxy.data_plane for action in actions if isinstance(action, Create)]
+
+
+def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
+    """A sandbox and its proxy, as they were created for a data plane."""
+    box = sandbox(made=sandbox_fingerprint(KEY, RANGE, SETTINGS, forwards))
+    return box, proxy(made=fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
+
+
+# what is asked for
+
+
+def test_nobody_asks_for_anything() -> None:
+    assert given(look(container())) == "auto"
+    assert given(look(container(), settings=replace(SETTINGS, data_plane="kernel"))) == "kernel"
+
+
+@pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy", " Kernel "])
+def test_a_label_goes_before_the_option(plane: str) -> None:
+    for option in ("auto", "kernel", "copy"):
+        found = look(asking("a", plane), settings=replace(SETTINGS, data_plane=option))
+        assert given(found) == plane.strip().lower()
+        assert found.problems == ()
+
+
+@pytest.mark.parametrize("value", ["", "fast", "kernel,splice", "true"])
+def test_a_label_that_names_no_plane(value: str) -> None:
+    wishes, problems = read_wishes(observed(asking("a", value), container("b")), SETTINGS)
+    assert [wish.container for wish in wishes] == ["b"]
+    assert [problem.text for problem in problems] == [
+        f"label rosproxy.data-plane={value!r} is none of auto, kernel, splice, copy: write "
+        "rosproxy.data-plane=kernel for a proxy that lets the kernel forward, or leave it out"
+    ]
+
+
+def test_a_misspelt_label() -> None:
+    _, problems = read_wishes(
+        observed(container(labels={**ENABLED, "rosproxy.dataplane": "kernel"})), SETTINGS
+    )
+    assert "did you mean rosproxy.data-plane?" in problems[0].text
+
+
+def test_who_is_outvoted_is_told() -> None:
+    found = look(asking("a", "copy"), asking("b", "kernel"), container("c"), asking("d", "auto"))
+    assert given(found) == "kernel"
+    assert [(p.subject, p.fatal) for p in found.problems] == [
+        ("container a", False),
+        ("container d", False),
+    ]
+    assert found.problems[0].text == (
+        "label rosproxy.data-plane=copy is ignored: its proxy also serves b, which asks for "
+        "kernel; give both the same"
+    )
+
+
+# what is created
+
+
+@pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy"])
+def test_the_first_container_of_a_host(plane: DataPlane) -> None:
+    assert made(look(asking("a", plane)).actions) == ([plane == "kernel"], [plane])
+
+
+def test_the_capability_is_for_the_kernel_plane_alone() -> None:
+    host = container_config(replace(PROXY, data_plane="kernel"), SETTINGS, "t", "")["HostConfig"]
+    assert host["CapAdd"] == ["NET_ADMIN"]
+    assert host["CapDrop"] == ["ALL"]
+    assert host["SecurityOpt"] == ["no-new-privileges:false"]
+    assert host["ReadonlyRootfs"] is True
+    assert not {"Privileged", "Binds", "Devices", "Sysctls"} & host.keys()
+    for plane in ("auto", "splice", "copy"):
+        spec = replace(PROXY, data_plane=plane)
+        host = container_config(spec, SETTINGS, "t", "")["HostConfig"]
+        assert "CapAdd" not in host
+        assert host["SecurityOpt"] == ["no-new-privileges:true"]
+
+
+@pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy"])
+def test_the_proxy_is_told(plane: DataPlane) -> None:
+    body = container_config(replace(PROXY, data_plane=plane), SETTINGS, "t", "")
+    told = [pair for pair in body["Env"] if pair.startswith("ROSPROXY_DATA_PLANE=")]
+    assert told == ([] if plane == "auto" else [f"ROSPROXY_DATA_PLANE={plane}"])
+    assert body["User"] == "10001:10001"
+
+
+def test_the_sandbox_forwards_and_gets_no_capability() -> None:
+    host = sandbox_config(replace(SANDBOX, forwards=True), SETTINGS)["HostConfig"]
+    assert host["Sysctls"] == {
+        "net.ipv4.ip_local_port_range": "1024 11000",
+        "net.ipv4.ip_forward": "1",
+    }
+    assert "CapAdd" not in host
+    assert host["SecurityOpt"] == ["no-new-privileges:true"]
+    assert "net.ipv4.ip_forward" not in sandbox_config(SANDBOX, SETTINGS)["HostConfig"]["Sysctls"]
+
+
+def test_the_plan_names_the_capability() -> None:
+    texts = [line(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
+    assert ["NET_ADMIN" in text for text in texts] == [True, False]
+
+
+# what is changed
+
+
+def test_all_is_as_it_ought_to_be() -> None:
+    assert look(asking("a", "kernel"), there=own("kernel", forwards=True)).actions == ()
+    assert look(asking("a", "splice"), there=own("splice", forwards=False)).actions == ()
+
+
+def test_the_kernel_plane_makes_both_anew() -> None:
+    found = look(asking("a", "kernel"), there=own("auto", forwards=False))
+    assert made(found.actions) == ([True], ["kernel"])
+
+
+@pytest.mark.parametrize("plane", ["auto", "splice", "copy"])
+def test_who_gives_the_kernel_plane_up_leaves_no_rules_behind(plane: DataPlane) -> None:
+    """A proxy that was killed has not taken them away, and its successor can't."""
+    found = look(asking("a", plane), there=own("kernel", forwards=True))
+    assert made(found.actions) == ([False], [plane])
+
+
+def test_between_other_planes_the_sandbox_stays() -> None:
+    found = look(asking("a", "copy"), there=own("splice", forwards=False))
+    assert made(found.actions) == ([], ["copy"])
+
+
+def test_a_container_that_is_restarted_does_not_change_the_plane() -> None:
+    there = own("kernel", forwards=True)
+    who = container("b"), asking("a", "kernel", state="exited")
+    first = look(*who, there=there)
+    assert first.actions == ()
+    assert look(*who, there=there, memory=first.memory, now=59.0).actions == ()
+    found = look(*who, there=there, memory=first.memory, now=60.0)
+    assert made(found.actions) == ([False], ["auto"])
