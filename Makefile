@@ -10,6 +10,8 @@ IMAGE ?= rosproxy:latest
 OPERATOR_IMAGE ?= rosproxy-operator:latest
 # Which layers `make test` runs, for example: make test LAYERS="unit ros"
 LAYERS ?=
+# Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
+BENCH ?=
 SOURCES := proxy operator tests scripts
 
 $(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
@@ -19,6 +21,10 @@ $(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
 $(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh
 	@scripts/venv.sh $(VENV) dev,uvloop,operator
 	@touch $(VENV)/.runtime $@
+
+$(VENV)/.bench: $(VENV)/.dev
+	@scripts/venv.sh $(VENV) dev,uvloop,operator,bench
+	@touch $@
 
 .PHONY: help
 help: ## list the targets
@@ -33,9 +39,9 @@ test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS, 
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
 .PHONY: bench
-bench: $(VENV)/.dev ## the proxy's speed and memory next to a direct connection and socat, in a minute
+bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in twelve minutes (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS
 	@scripts/install-bench.sh
-	@$(BIN)/python -m tests.bench
+	@$(BIN)/python -m tests.bench $(BENCH)
 
 .PHONY: check
 check: $(VENV)/.dev ## format, lint, types, import rules, unit tests

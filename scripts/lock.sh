@@ -10,7 +10,7 @@ trap 'rm -rf "$work"' EXIT
 "${PYTHON:-python3}" -m venv "$work/venv"
 pip=("$work/venv/bin/python" -m pip --disable-pip-version-check)
 # The build backend is pinned with the rest, so that an image built later is the same image.
-"${pip[@]}" install --quiet --upgrade '.[dev,operator,uvloop]' hatchling
+"${pip[@]}" install --quiet --upgrade '.[bench,dev,operator,uvloop]' hatchling
 {
   echo "# Written by \`make lock\`. Versions that the tests ran with; pyproject.toml has the floors."
   "${pip[@]}" freeze --exclude rosproxy --exclude-editable

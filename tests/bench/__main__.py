@@ -1,95 +1,107 @@
-"""``make bench``: the proxy next to a direct connection and socat.
+"""``make bench``: rosproxy next to a direct connection and to its peers.
 
-They take turns in every round, so that a machine that is busy for a while is so for all.
+They take turns within every round, so that a machine that is busy for a while is so for all.
+The numbers are kept after each section: a run that is broken off has what it got so far.
 """
 
-import json
+from __future__ import annotations
+
+import argparse
 import os
-import platform
-import shutil
+import resource
 import signal
 import sys
-from collections import defaultdict
-from importlib.util import find_spec
+import time
+import traceback
+from importlib import import_module
 from pathlib import Path
-from statistics import median
-from subprocess import getoutput
-from typing import Any
+from typing import NamedTuple
 
-from tests.bench import measures, parts
-from tests.bench.node import NAME
-from tests.integration.net import NODE, OUTSIDE, Where, where
+from tests.bench import machine, report
+from tests.bench.book import Book
+from tests.bench.world import DESCRIPTORS, remove_leftovers
 
-ROUNDS = 5
-REPORT = Path("build/bench.json")
-RESULTS: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-"""The numbers of all rounds, by row and path."""
+FOLDER = Path("build/bench")
+
+
+class Section(NamedTuple):
+    """What the sizes of a part of the benchmark count, and how often it is run."""
+
+    axis: str
+    rounds: int
+
+
+SECTIONS = {
+    "streams": Section("connections", 3),
+    "control": Section("nodes", 5),
+    "nodes": Section("nodes", 1),
+    "ros": Section("bytes", 3),
+}
+"""Each is a module beside with a ``run(book, rounds, quick)``."""
 
 
 def main() -> None:
+    options = parse()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    machine = describe()
-    print(*(f"{name + ':':<10}{text}" for name, text in machine.items()), sep="\n", flush=True)
-    with parts.master() as uri:
-        compare(uri)
-        for _ in range(ROUNDS):
-            with parts.proxied(uri) as proxied:
-                add("rosproxy", measures.memory(proxied))
-    rows = [row(name, path) for name, paths in RESULTS.items() for path in paths]
-    show(rows)
-    REPORT.parent.mkdir(exist_ok=True)
-    REPORT.write_text(json.dumps({"machine": machine, "rounds": ROUNDS, "rows": rows}, indent=1))
+    if os.geteuid() != 0:
+        sys.exit("make bench lays out network namespaces: run it as root")
+    raise_limits()
+    remove_leftovers()
+    book = Book(machine.described())
+    print(*(f"{name + ':':<10}{text}" for name, text in book.machine.items()), sep="\n", flush=True)
+    whole = [measured(book, name, options) for name in options.sections]
+    report.write(book, options.folder)
+    print(f"\nresults.json, performance.md and plots are in {options.folder}")
+    sys.exit(not all(whole))
 
 
-def compare(uri: str) -> None:
-    with parts.proxied(uri) as proxied, parts.socat(proxied.direct) as through_socat:
-        paths: dict[str, tuple[Where, int | None]] = {"direct": (proxied.direct, None)}
-        paths |= {"socat": through_socat} if through_socat else {}
-        paths |= {"rosproxy": (proxied.lease, proxied.pid)}
-        outside = OUTSIDE, "/bench_outside", f"http://{OUTSIDE}:9/"
-        for _ in range(ROUNDS):
-            for measure in (measures.stream, measures.ping_pong):
-                for path, way in paths.items():
-                    add(path, measure(*way))
-            add("direct", measures.register(where(uri), *outside))
-            add("rosproxy", measures.register(proxied.master, NODE, NAME, proxied.node_uri))
+def measured(book: Book, name: str, options: argparse.Namespace) -> bool:
+    """Whether a section came to its end; what it has got until then is kept, and shown."""
+    section = SECTIONS[name]
+    book.begin(name, section.axis)
+    started = time.monotonic()
+    rounds = 1 if options.quick else options.rounds or section.rounds
+    print(f"\nmeasuring {name}, rounds: {rounds}", flush=True)
+    try:
+        import_module(f"tests.bench.{name}").run(book, rounds, options.quick)
+    except Exception as error:
+        book.note(f"the measurements broke off: {error!r}")
+        traceback.print_exc()
+        return False
+    finally:
+        book.machine[f"{name} took"] = f"{time.monotonic() - started:.0f} s"
+        book.save(options.folder / "results.json")
+        report.print_table(book, name)
+    return True
 
 
-def add(path: str, numbers: measures.Numbers) -> None:
-    for name, number in numbers.items():
-        RESULTS[name][path].append(number)
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    known = ", ".join(SECTIONS)
+    parser.add_argument(
+        "--sections", type=sections, default=list(SECTIONS), help=f"some of {known}, with commas"
+    )
+    parser.add_argument("--rounds", type=int, help="instead of each section's own number")
+    parser.add_argument("--quick", action="store_true", help="one short round, for a first look")
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="where the results go")
+    return parser.parse_args()
 
 
-def row(name: str, path: str) -> dict[str, Any]:
-    """A row of the report; its ratio is the median of the rounds' own ratios."""
-    values, direct = RESULTS[name][path], RESULTS[name].get("direct", [])
-    ratios = [a / b for a, b in zip(values, direct, strict=False)]
-    numbers = {"median": median(values), "lowest": min(values), "highest": max(values)}
-    ratio = median(ratios) if ratios else None
-    return {"row": name, "path": path, **numbers, "to_direct": ratio, "values": values}
+def sections(text: str) -> list[str]:
+    names = text.split(",")
+    if unknown := [name for name in names if name not in SECTIONS]:
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r} is none of {', '.join(SECTIONS)}")
+    return names
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    print(f"\n{ROUNDS} rounds{'median':>39}{'lowest .. highest':>22}{'to direct':>12}")
-    for held in rows:
-        low, middle, high = (f"{held[key]:.4g}" for key in ("lowest", "median", "highest"))
-        ratio = f"{held['to_direct']:8.2f} x" if held["to_direct"] else ""
-        print(f"{held['row']:<28}{held['path']:<9}{middle:>9}{low:>11} .. {high:<9}{ratio}")
-
-
-def describe() -> dict[str, str]:
-    """The machine before it is put to work, and what runs on it."""
-    dpkg, model = "dpkg-query -W python3-rosmaster", "sed -n '/^model name/{s/.*: //p;q}'"
-    with_socat = shutil.which("socat")
-    return {
-        "rosproxy": getoutput("git describe --always --dirty"),
-        "machine": f"{os.cpu_count()} cores, {getoutput(model + ' /proc/cpuinfo')}",
-        "kernel": platform.platform(),
-        "load": f"{os.getloadavg()[0]:.2f} before",
-        "python": f"{sys.version.split()[0]}, {'uvloop' if find_spec('uvloop') else 'asyncio'}",
-        "master": getoutput(dpkg) if os.path.exists(parts.ROSMASTER) else "the embedded one",
-        "socat": getoutput("socat -V | sed -n 2p") if with_socat else "not installed: not compared",
-    }
+def raise_limits() -> None:
+    """A thousand connections are two thousand open files in a relay, and twice that in pipes."""
+    wanted = DESCRIPTORS, DESCRIPTORS
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, wanted)
+    except (OSError, ValueError):
+        hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 if __name__ == "__main__":

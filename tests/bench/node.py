@@ -1,43 +1,55 @@
-"""The inside node: ``python -m tests.bench.node MASTER_URI``.
+"""The inside node of the streams: ``python -m tests.bench.node MASTER WIRE``.
 
-It registers, prints its slave URI, and serves until its standard input ends.
+A slave API in Python in front of a TCPROS server in C++, which is the source of the bytes. It
+publishes /stream (without end) and /echo (what comes goes back), prints the port of the server
+when it has registered, and runs until it is ended.
 """
 
-import os
-import socket
-import sys
+from __future__ import annotations
 
-from rosproxy.demo.boundary import Boundary
-from rosproxy.demo.node import Node
-from rosproxy.demo.publisher import Publisher
-from rosproxy.demo.wire import STRING, pack_string, send_header
-from tests.integration.net import NODE
+import subprocess
+import sys
+from typing import Any
+from xmlrpc.client import ServerProxy
+from xmlrpc.server import SimpleXMLRPCServer
+
+from tests.bench.world import INSIDE
 
 NAME = "/bench_inside"
-FRAME = pack_string("x" * (2**20 - 8))  # with its two lengths exactly 1 MiB
-FRAMES = 256  # that a subscriber of /offer is sent
+TOPICS = ("/stream", "/echo")
+NO_MASTER = "none"
 
 
-class Topic(Publisher):
-    """/stream writes without end, /offer writes 256 MiB, /echo sends back what comes."""
+class SlaveApi:
+    """What master and subscribers call."""
 
-    def serve(self, connection: socket.socket, header: dict[str, str]) -> None:
-        connection.settimeout(None)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        send_header(connection, self._reply())
-        if self.topic == "/echo":
-            while data := connection.recv(65536):
-                connection.sendall(data)
-        for _ in range({"/stream": sys.maxsize, "/offer": FRAMES}.get(self.topic, 0)):
-            connection.sendall(FRAME)
+    def __init__(self, port: int) -> None:
+        self._port = port
+
+    def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> list[Any]:
+        tcpros = ["TCPROS", INSIDE, self._port]
+        values = {"requestTopic": tcpros, "getPid": 1, "getBusInfo": [], "getPublications": []}
+        return [1, "", values.get(method, 0)]
+
+
+def main(master: str, wire: str) -> None:
+    with subprocess.Popen([wire, "source"], stdout=subprocess.PIPE, text=True) as source:
+        assert source.stdout
+        port = int(source.stdout.readline())
+        server = SimpleXMLRPCServer((INSIDE, 0), logRequests=False, allow_none=True)
+        server.register_instance(SlaveApi(port))
+        if master != NO_MASTER:
+            register(master, f"http://{INSIDE}:{server.server_address[1]}/")
+        print("port", port, flush=True)
+        server.serve_forever()
+
+
+def register(master: str, uri: str) -> None:
+    with ServerProxy(master) as proxy:
+        for topic in TOPICS:
+            reply: Any = proxy.registerPublisher(NAME, topic, "std_msgs/String", uri)
+            assert reply[0] == 1, reply
 
 
 if __name__ == "__main__":
-    boundary = Boundary(leave_from=(("127.0.2.0/24", NODE),))
-    node = Node(NAME, sys.argv[1], NODE, NODE, boundary)
-    node.publishers |= {t: Topic(NAME, t, STRING) for t in ("/stream", "/offer", "/echo")}
-    node.start()
-    if node.registered.wait(20):
-        print(node.uri, flush=True)
-        sys.stdin.read()
-    os._exit(0)  # threads may hang in the middle of a write
+    main(*sys.argv[1:])

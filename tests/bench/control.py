@@ -1,0 +1,201 @@
+"""Calls of the control plane through the proxy, next to the same calls without it.
+
+Each measurement is one kept connection, as rospy keeps one to its master. There are two proxies,
+with uvloop where that is installed and with Python's own event loop, each with a rospy node.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from http.client import HTTPConnection
+from importlib.util import find_spec
+from statistics import median
+from time import perf_counter
+from typing import Any
+from urllib.parse import urlsplit
+from xmlrpc.client import dumps, loads
+
+from tests.bench.book import DIRECT, Book
+from tests.bench.world import GATEWAY, HOST, MASTER, MASTER_PORT, OUTSIDE, World, world
+
+CALL_SECONDS, QUICK_SECONDS = 0.5, 0.1
+WARM_UP_CALLS = 20
+TOPICS = 100
+ENDING_TOPICS = 10
+"""That a node publishes, and as many that it subscribes to: rospy ends both in one multicall."""
+STRING = "std_msgs/String"
+LOOPS = {"uvloop": 0, "asyncio": 1}
+"""What the ports of the proxy on an event loop are counted from."""
+NODE = """
+import rospy, std_msgs.msg, sys
+rospy.init_node(sys.argv[1])
+topic = rospy.Publisher("/stream", std_msgs.msg.String, queue_size=1)
+print("uri", rospy.get_node_uri(), flush=True)
+rospy.spin()
+"""
+
+Where = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Way:
+    """Whom inside and outside call, and as whom: ``name`` at ``uri``."""
+
+    path: str
+    master: Where
+    node: Where
+    name: str
+    uri: str
+
+
+class Line:
+    """A kept connection; ``times`` are the seconds that the calls on it took."""
+
+    def __init__(self, address: Where) -> None:
+        self.times: list[float] = []
+        self._http = HTTPConnection(*address, timeout=10)
+        self._http.connect()
+        self._sock = self._http.sock
+
+    def close(self) -> None:
+        self._http.close()
+
+    def call(self, method: str, *params: Any, timed: bool = True) -> Any:
+        """The value of a call; writing and reading XML is not part of the time."""
+        body = dumps(params, method).encode()
+        started = perf_counter()
+        self._http.request("POST", "/", body, {"Content-Type": "text/xml"})
+        reply = self._http.getresponse().read()
+        if timed:
+            self.times.append(perf_counter() - started)
+        assert self._http.sock is self._sock, "the connection was not kept"
+        return loads(reply)[0][0]
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    """Add rates and medians of all calls; the ways take turns in each round."""
+    seconds = QUICK_SECONDS if quick else CALL_SECONDS
+    with world() as machines, machines.master(), ExitStack() as stack:
+        loops = [name for name in LOOPS if name == "asyncio" or find_spec(name)]
+        proxied = [stack.enter_context(proxy(machines, loop)) for loop in loops]
+        node = where(proxied[0].uri)
+        direct = Way(DIRECT, (OUTSIDE, MASTER_PORT), node, "/bench_direct", f"http://{OUTSIDE}:9/")
+        for _ in range(rounds):
+            for method, step in CALLS.items():
+                compare(book, machines, [direct, *proxied], method, step, seconds)
+
+
+Step = Callable[[Way, Line, int], None]
+"""The n-th call of a measurement, and those that it needs and that are not timed."""
+
+
+def compare(
+    book: Book, machines: World, ways: list[Way], method: str, step: Step, seconds: float
+) -> None:
+    """One round of one call on all ways, the direct one first."""
+    direct = 0.0
+    for way in ways:
+        times = timed(machines, way, method, step, seconds)
+        middle = median(times) * 1e6
+        direct = direct or middle
+        book.add(f"{method}, 1/s", way.path, len(times) / sum(times))
+        book.add(f"{method} p50, us", way.path, middle)
+        if way.path != DIRECT:
+            book.add(f"{method} p50 added, us", way.path, middle - direct)
+
+
+def timed(machines: World, way: Way, method: str, step: Step, seconds: float) -> list[float]:
+    """The seconds that each of many calls took, without the first ones."""
+    from_outside = method == "requestTopic"
+    with machines.entered("outside" if from_outside else "inside"):
+        line = Line(way.node if from_outside else way.master)
+    end = perf_counter() + seconds
+    while perf_counter() < end or len(line.times) <= 2 * WARM_UP_CALLS:
+        step(way, line, len(line.times))
+    line.close()
+    return line.times[WARM_UP_CALLS:]
+
+
+def register(way: Way, line: Line, number: int) -> None:
+    topic = f"/bench{way.name}/{number % TOPICS}"
+    reply = line.call("registerPublisher", way.name, topic, STRING, way.uri)
+    assert reply[0] == 1, reply
+
+
+def look_up(way: Way, line: Line, _: int) -> None:
+    reply = line.call("lookupNode", way.name, way.name)
+    assert reply[::2] == [1, way.uri], reply
+
+
+def request_topic(way: Way, line: Line, _: int) -> None:
+    reply = line.call("requestTopic", "/bench_outside", "/stream", [["TCPROS"]])
+    assert reply[2][0] == "TCPROS", reply
+
+
+def end_node(way: Way, line: Line, _: int) -> None:
+    """A node's end, as rospy does it (rospy/impl/registration.py), after registering anew."""
+    topics = [f"/bench_ending{way.name}/{number}" for number in range(ENDING_TOPICS)]
+    made = [["registerPublisher", topic, STRING] for topic in topics]
+    made += [["registerSubscriber", f"{topic}/sub", STRING] for topic in topics]
+    line.call("system.multicall", elements(way, made), timed=False)
+    ended = [[method.replace("register", "unregister"), topic] for method, topic, _ in made]
+    replies = line.call("system.multicall", elements(way, ended))
+    assert [reply[0][::2] for reply in replies] == [[1, 1]] * len(ended), replies
+
+
+def elements(way: Way, calls: list[list[str]]) -> list[dict[str, Any]]:
+    return [
+        {"methodName": method, "params": [way.name, *params, way.uri]} for method, *params in calls
+    ]
+
+
+CALLS: dict[str, Step] = {
+    "registerPublisher": register,
+    "lookupNode": look_up,
+    "system.multicall": end_node,
+    "requestTopic": request_topic,
+}
+
+
+@contextmanager
+def proxy(machines: World, loop: str) -> Iterator[Way]:
+    """A proxy on an event loop, and a rospy node behind it."""
+    shift, name = 1000 * LOOPS[loop], f"/bench_{loop}"
+    port = MASTER_PORT + shift
+    argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER, "--advertise-host"]
+    argv += [HOST, "--port-range", f"{45000 + shift}-{45099 + shift}", "--log-level", "info"]
+    argv += ["--master-port", str(port), "--admin-bind", f"127.0.0.1:{port + 1}"]
+    ros = machines.ros_environment("inside") | {"ROS_MASTER_URI": f"http://{GATEWAY}:{port}/"}
+    node = "/usr/bin/python3", "-c", NODE, f"__name:={name[1:]}", name[1:]
+    with machines.running("host", *argv, env=environment(machines, loop)) as process:
+        process.wait_for("ready: ", timeout=60)
+        with machines.running("inside", *node, env=ros) as rospy:
+            uri = rospy.wait_for(r"^uri (\S+)", timeout=30)[1]
+            process.wait_for(rf"{name} at \S+ is http://{HOST}:(\d+)/")
+            with machines.entered("outside"):
+                line = Line((OUTSIDE, MASTER_PORT))
+            lease = where(line.call("lookupNode", name, name)[2])
+            line.close()
+            yield Way(f"rosproxy, {loop}", (GATEWAY, port), lease, name, uri)
+
+
+def environment(machines: World, loop: str) -> dict[str, str]:
+    """That of a proxy on an event loop: it takes uvloop if that can be imported."""
+    env = machines.environment("host")
+    if loop == "uvloop":
+        return env
+    folder = machines.folder / "without-uvloop"
+    folder.mkdir(exist_ok=True)
+    (folder / "uvloop.py").write_text("raise ImportError\n")
+    return env | {"PYTHONPATH": os.pathsep.join([str(folder), env["PYTHONPATH"]])}
+
+
+def where(uri: str) -> Where:
+    parts = urlsplit(uri)
+    assert parts.hostname
+    assert parts.port
+    return parts.hostname, parts.port

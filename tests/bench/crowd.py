@@ -1,0 +1,87 @@
+"""Many inside nodes in one process: ``python -m tests.bench.crowd MASTER_URI ADDRESS PORT COUNT``.
+
+Each has a slave API of its own, on ports from PORT on, and publishes ten topics. It prints how
+long their registration took, and serves until it is killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import time
+from functools import partial
+from http.client import HTTPConnection
+from urllib.parse import urlsplit
+from xmlrpc.client import dumps, loads
+
+TOPICS = 10
+AT_ONCE = 8
+"""Nodes that register at the same time, each on a connection of its own."""
+STRING = "std_msgs/String"
+
+
+class Slave(asyncio.Protocol):
+    """One connection to the slave API of a node."""
+
+    def __init__(self, number: int) -> None:
+        self._number, self._data = number, b""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        self._data += data
+        head, end, body = self._data.partition(b"\r\n\r\n")
+        if end and len(body) >= int(head.lower().partition(b"content-length:")[2].split()[0]):
+            self._data = b""
+            method = body.partition(b"<methodName>")[2].partition(b"<")[0].decode()
+            reply = dumps((answer(method, self._number),), methodresponse=True).encode()
+            first = b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n"
+            self._transport.write(first % len(reply) + reply)
+
+
+def answer(method: str, number: int) -> list[object]:
+    if method == "getPid":
+        return [1, "", os.getpid()]
+    if method == "getPublications":
+        return [1, "", [[topic, STRING] for topic in topics(number)]]
+    if method == "requestTopic":
+        return [1, "ready", ["TCPROS", "nowhere", 9]]
+    return [1, "", []]
+
+
+def topics(number: int) -> list[str]:
+    return [f"/crowd/{number}/{index}" for index in range(TOPICS)]
+
+
+def register(master: str, uri: str, number: int) -> None:
+    """What one node calls when it starts, on a kept connection."""
+    http = HTTPConnection(urlsplit(master).netloc, timeout=60)
+    for topic in topics(number):
+        body = dumps((f"/crowd_{number}", topic, STRING, uri), "registerPublisher").encode()
+        http.request("POST", "/", body, {"Content-Type": "text/xml"})
+        reply = loads(http.getresponse().read())[0][0]
+        assert reply[0] == 1, reply
+    http.close()
+
+
+async def main(master: str, address: str, port: int, count: int) -> None:
+    loop, limit = asyncio.get_running_loop(), asyncio.Semaphore(AT_ONCE)
+    for number in range(count):
+        await loop.create_server(partial(Slave, number), address, port + number)
+
+    async def start(number: int) -> None:
+        uri = f"http://{address}:{port + number}/"
+        async with limit:
+            await asyncio.to_thread(register, master, uri, number)
+
+    started = time.perf_counter()
+    await asyncio.gather(*map(start, range(count)))
+    print("registered", time.perf_counter() - started, flush=True)
+    await asyncio.sleep(3600)
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])))

@@ -1,0 +1,177 @@
+"""Real nodes: images at full rate and small messages at 1 kHz, of rospy and roscpp, both ways."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tests.bench.book import DIRECT, Book, loss, percentile
+from tests.bench.compiled import compiled
+from tests.bench.ways import KERNEL, PLANES, SPLICE, tcpros_address
+from tests.bench.world import INSIDE, MASTER, PROXY, World, world
+
+LIBRARIES = ("rospy", "roscpp")
+IMAGE, SMALL = 6_000_000, 1024
+WINDOW = 4
+"""Images on their way at most: enough to keep both ends busy, few enough that none is dropped."""
+SECONDS, QUICK_SECONDS = 0.8, 0.5
+PATIENCE = 1.0
+"""Seconds without another message after which what is missing counts as lost."""
+_NUMBERS = itertools.count(1)
+# As a container's network has it.
+_MASQUERADE = f"""
+table ip nat {{
+  chain leaving {{
+    type nat hook postrouting priority srcnat
+    ip saddr {INSIDE} oifname "out0" masquerade
+  }}
+}}
+"""
+
+
+class Kind(NamedTuple):
+    """Messages of a size, at a rate; 0 is as fast as they are received."""
+
+    title: str
+    size: int
+    rate: float
+
+
+KINDS = (Kind("6 MB at full rate", IMAGE, 0), Kind("1 KiB at 1 kHz", SMALL, 1000))
+
+
+class Pair(NamedTuple):
+    """Who publishes to whom."""
+
+    publisher: str
+    subscriber: str
+    role: str
+
+    @property
+    def title(self) -> str:
+        ends = ("inside", "outside") if self.role == "inside" else ("outside", "inside")
+        return f"{self.publisher} {ends[0]} → {self.subscriber} {ends[1]}"
+
+
+PAIRS = [Pair(*words) for words in itertools.product(LIBRARIES, LIBRARIES, ("inside", "outside"))]
+
+
+class Site(NamedTuple):
+    """A way with a node of each library at either end."""
+
+    name: str
+    world: World
+    nodes: dict[tuple[str, str], RosNode]
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    with ExitStack() as stack:
+        sites = [stack.enter_context(site(name)) for name in (DIRECT, KERNEL, SPLICE)]
+        for _ in range(rounds):
+            for kind, pair in itertools.product(KINDS, PAIRS):
+                for one in sites:
+                    measure(book, one, kind, pair, QUICK_SECONDS if quick else SECONDS)
+
+
+@contextmanager
+def site(name: str) -> Iterator[Site]:
+    """A world with its master, its proxy if there is one, and four nodes that wait to be told."""
+    with world(apart=True) as place, place.master(), ExitStack() as stack:
+        if name != DIRECT:
+            place.run("host", "nft", "-f", "-", text=_MASQUERADE)
+            stack.enter_context(place.proxy(PLANES[name]))
+        uris = {"outside": MASTER, "inside": MASTER if name == DIRECT else PROXY}
+        keys = itertools.product(LIBRARIES, uris)
+        nodes = {key: stack.enter_context(ros_node(place, *key, uris[key[1]])) for key in keys}
+        yield Site(name, place, nodes)
+
+
+def measure(book: Book, where: Site, kind: Kind, pair: Pair, seconds: float) -> None:
+    """One topic: a new one each time, so that nothing of an earlier one is taken for it."""
+    other = "outside" if pair.role == "inside" else "inside"
+    publisher = where.nodes[pair.publisher, pair.role]
+    subscriber = where.nodes[pair.subscriber, other]
+    number = next(_NUMBERS)
+    topic, path = f"/images_{number}", where.world.folder / f"{number}.socket"
+    try:
+        subscriber.ask("on", topic, path)
+        sent = publisher.ask("go", topic, kind.size, kind.rate, seconds, WINDOW, path)
+        wait_for_rest(subscriber, int(sent[1]))
+        count, took, *times = map(float, subscriber.ask("off")[1:])
+        if pair.role == "inside" and where.name == KERNEL:
+            tcpros_address(where.world, f"/{pair.publisher}_inside", topic, must_be_fast=True)
+        enter(book, where.name, f"{pair.title}, {kind.title}", float(sent[1]), count, took, times)
+    except RuntimeError as error:
+        book.note(f"{where.name}, {pair.title}, {kind.title}: {error}")
+
+
+def wait_for_rest(subscriber: RosNode, sent: int) -> None:
+    """Until all have arrived, or no more come."""
+    count, since = 0, time.monotonic()
+    while count < sent and time.monotonic() < since + PATIENCE:
+        time.sleep(0.02)
+        if (now := int(subscriber.ask("count")[1])) > count:
+            count, since = now, time.monotonic()
+
+
+def enter(
+    book: Book, path: str, title: str, sent: float, count: float, took: float, times: list[float]
+) -> None:
+    if count < 2:
+        raise RuntimeError(f"{count:.0f} of {sent:.0f} messages arrived")
+    book.add(f"{title}: rate, 1/s", path, (count - 1) / took)
+    book.add(f"{title}: latency p50, ms", path, percentile(times, 50) / 1000)
+    book.add(f"{title}: latency p99, ms", path, percentile(times, 99) / 1000)
+    book.add(f"{title}: loss, %", path, 100 * loss(sent, count))
+
+
+class RosNode:
+    """A running node that is told what to do, one line after another."""
+
+    def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
+        self._process = process
+        self._log = log
+
+    def ask(self, *words: object) -> list[str]:
+        """The words of its answer. RuntimeError if it says that it failed, or has ended."""
+        pipe: Any = self._process.stdin
+        pipe.write(" ".join(map(str, words)) + "\n")
+        pipe.flush()
+        return self.answer()
+
+    def answer(self) -> list[str]:
+        lines: Any = self._process.stdout
+        reply = next((line for line in lines if line.startswith("= ")), "= failed: it has ended")
+        words: list[str] = reply.split()[1:]
+        if words[0] == "failed:":
+            raise RuntimeError(" ".join(words[1:]) + self._log.read_text()[-500:])
+        return words
+
+
+@contextmanager
+def ros_node(place: World, library: str, role: str, master: str) -> Iterator[RosNode]:
+    """A node of a library on a machine, when it is ready."""
+    programs = {
+        "rospy": ["/usr/bin/python3", str(Path(__file__).with_name("images.py"))],
+        "roscpp": [str(compiled("images", "roscpp", "sensor_msgs"))],
+    }
+    command = place.command(role, *programs[library], f"__name:={library}_{role}")
+    env = place.ros_environment(role) | {"ROS_MASTER_URI": master}
+    log, pipe = place.folder / f"{library}-{role}.log", subprocess.PIPE
+    with (
+        log.open("w") as errors,
+        subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=errors, text=True, env=env
+        ) as process,
+    ):
+        node = RosNode(process, log)
+        try:
+            node.answer()
+            yield node
+        finally:
+            process.kill()
