@@ -17,13 +17,16 @@ from rosproxy.core.tcpros import speaks_http
 from rosproxy.core.uris import HostPort
 from rosproxy.http_server import Service, XmlRpcServer
 from rosproxy.keeper import TICK, Keeper
+from rosproxy.kernel_plane import KernelPlane
 from rosproxy.leases import Leases
 from rosproxy.master_service import MasterService, PublishedMaster
 from rosproxy.master_watch import MasterWatch
 from rosproxy.metrics import StateCollector
 from rosproxy.mirror import TIDY_INTERVAL, Mirror
 from rosproxy.node_client import NodeClient
+from rosproxy.publisher_updates import PublisherUpdates
 from rosproxy.range_probe import probe_range
+from rosproxy.silent import SILENT_TICK, Silent
 from rosproxy.slave_service import SlaveService
 from rosproxy.status import describe
 from rosproxy.strays import Strays
@@ -44,11 +47,21 @@ class App:
         self.context = context = make_context(settings)
         nodes = NodeClient(context.upstream, settings.probe_timeout)
         self._tcpros = TcprosService(context, nodes)
-        self._leases = Leases(context, nodes, self._connection, self._close_port)
+        self._plane = KernelPlane(context)
         self._mirror = Mirror(context)
-        self._upkeep = Upkeep(context, nodes, self._mirror)
+        updates = PublisherUpdates(context, self._mirror)
+        silent = Silent(context, updates, self._tcpros.topic_connections, self._plane.look)
+        self._leases = Leases(
+            context,
+            nodes,
+            self._plane,
+            self._connection,
+            self._close_port,
+            lambda endpoint: silent.watch([endpoint]),
+        )
+        self._upkeep = Upkeep(context, nodes, updates, silent)
         self._keeper = Keeper(context, self._leases, nodes, self._upkeep)
-        self._watch = MasterWatch(context, self._keeper, self._upkeep)
+        self._watch = MasterWatch(context, self._keeper, self._upkeep, self._plane)
         self._strays = Strays(context, self._leases, nodes, self._upkeep)
         self._slaves = XmlRpcServer(
             SlaveService(context, self._leases, self._mirror, self._strays.spared),
@@ -62,6 +75,7 @@ class App:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         self._check_bind()
         self._reserve_range()
+        await self._plane.start()
         settings = self.settings
         master = MasterService(
             self.context, self._leases, self._mirror, self._watch.recovered, self._strays.heed
@@ -77,6 +91,7 @@ class App:
         repeat(self._watch.look, settings.master_interval, "watching the master")
         repeat(self._keeper.look, TICK, "looking after nodes")
         repeat(self._leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
+        repeat(self._upkeep.look_for_silent, SILENT_TICK, "looking for silent subscribers")
         repeat(self._mirror.tidy, TIDY_INTERVAL, "looking after mirrored ports")
         repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
@@ -91,13 +106,14 @@ class App:
         self.context.bank.close_all()
         self._mirror.close()
         await self.context.tasks.cancel()
+        await self._plane.stop()
         servers = (server.close() for server in self._servers)
         await asyncio.gather(self._admin.stop(), self._tcpros.stop(), self._mirror.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return describe(self.context, self._watch, self._tcpros, self._mirror)
+        return describe(self.context, self._watch, self._tcpros, self._mirror, self._plane)
 
     def _make_admin(self, nodes: NodeClient) -> Admin:
         parts = Parts(
@@ -107,7 +123,7 @@ class App:
             self._upkeep,
             self._strays,
             self._watch.recovered,
-            self._tcpros.cut,
+            self._cut,
         )
         containers = Containers(parts)
         actions = {
@@ -152,6 +168,13 @@ class App:
             await self._slaves.serve(conn)
         else:
             await self._tcpros.serve(endpoint, conn, peer)
+
+    def _cut(self, port: int) -> None:
+        """End the connections through a lease, also those that the kernel forwards."""
+        self._tcpros.cut(port)
+        endpoint = self.context.registry.by_port.get(port)
+        if endpoint is not None:
+            self._plane.cut(endpoint)
 
     def _close_port(self, port: int) -> None:
         self._slaves.close_port(port)
@@ -204,6 +227,7 @@ class App:
             lambda: len(self._tcpros.relays),
             lambda: len(self._mirror),
             lambda: bool(self._watch.up),
+            self._plane.tally,
         )
 
     def _log_start(self) -> None:

@@ -175,6 +175,12 @@ def main() -> None:
     default="any",
     help="Who may call shutdown, publisherUpdate and paramUpdate at inside nodes.",
 )
+@click.option(
+    "--data-plane",
+    type=click.Choice(["auto", "kernel", "splice", "copy"]),
+    default="auto",
+    help="How topics' bytes are forwarded: by the kernel, where the proxy may; spliced; or copied.",
+)
 @log_options
 @click.option("--check", is_flag=True, help="Validate the options and exit.")
 def run(check: bool, log_format: str, log_level: str, **options: Any) -> None:

@@ -36,6 +36,7 @@ class Context:
     retired: bool = False
     """Whether nothing is registered any more, neither for nodes nor by the proxy itself."""
     _networks: tuple[float, Sequence[Network]] = (0.0, ())
+    _towards: dict[str, str] = field(default_factory=dict)
 
     def now(self) -> float:
         """Seconds of the monotonic clock."""
@@ -54,15 +55,20 @@ class Context:
 
     def read_networks(self) -> None:
         """The same at once."""
+        self._towards.clear()
         self._networks = (self.now(), self.settings.inside_networks or interface_networks())
         self.addressing.networks = self._networks[1]
 
     def node_asker(self, endpoint: Endpoint) -> Asker:
         """The node of an endpoint as somebody who is given addresses."""
-        address = endpoint.place.address
-        return Asker(
-            address, address_towards(address), next(iter(endpoint.caller_ids), ""), "", endpoint
-        )
+        address, name = endpoint.place.address, min(endpoint.callers, default="")
+        return Asker(address, self._address_towards(address), name, "", endpoint)
+
+    def _address_towards(self, address: str) -> str:
+        """The proxy's own address that a node sees, looked up as often as the networks are."""
+        if address not in self._towards:
+            self._towards[address] = address_towards(address)
+        return self._towards[address]
 
 
 def make_context(settings: Settings) -> Context:

@@ -15,8 +15,9 @@ from aiohttp import HttpVersion11, web
 
 from rosproxy.core import xmlrpc
 from rosproxy.core.uris import HostPort, parse_host_port, plain_address
+from rosproxy.http_client import read_bounded
 from rosproxy.relay import reset_on_close
-from rosproxy.upstream import LOOP_HEADER, Unreachable, read_bounded
+from rosproxy.upstream import LOOP_HEADER, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -32,12 +33,11 @@ class Call:
     """One XML-RPC request: its body, who sent it and where it arrived."""
 
     def __init__(self, request: web.BaseRequest, body: bytes) -> None:
-        peer = _address(request, "peername")
-        here = _address(request, "sockname")
+        protocol = request.protocol
         self.body = body
         self.path = request.path_qs
-        self.source = peer.host
-        self.local = here
+        self.source = _address(protocol.peername).host
+        self.local = _address(protocol.sockname)
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
 
@@ -64,13 +64,32 @@ class Call:
 Service = Callable[[Call], Awaitable[bytes]]
 
 
+class Connections:
+    """The connections of a port; those that have ended are forgotten now and then."""
+
+    def __init__(self) -> None:
+        self._known: list[web.RequestHandler] = []
+        self._enough = 16
+
+    def add(self, handler: web.RequestHandler) -> None:
+        """Take one in; all are looked at only once their number has doubled."""
+        self._known.append(handler)
+        if len(self._known) > self._enough:
+            self._known = self.alive()
+            self._enough = max(16, 2 * len(self._known))
+
+    def alive(self) -> list[web.RequestHandler]:
+        """Those that are open."""
+        return [handler for handler in self._known if handler.transport is not None]
+
+
 class XmlRpcServer:
     """Turns accepted sockets into XML-RPC calls to a service."""
 
     def __init__(self, service: Service, greeting: str) -> None:
         self._service, self._greeting = service, greeting
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
-        self._by_port: dict[int, list[web.RequestHandler]] = {}
+        self._by_port: dict[int, Connections] = {}
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
@@ -80,16 +99,15 @@ class XmlRpcServer:
         _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
         self._mute.add(handler)
         loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
-        alive = [known for known in self._by_port.get(port, []) if known.transport is not None]
-        self._by_port[port] = [*alive, handler]
+        self._by_port.setdefault(port, Connections()).add(handler)
 
     def connections(self, port: int) -> int:
         """How many connections are open that came in on a port."""
-        return sum(handler.transport is not None for handler in self._by_port.get(port, ()))
+        return len(self._by_port[port].alive()) if port in self._by_port else 0
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in self._by_port.pop(port, []):
+        for handler in self._by_port.pop(port, Connections()).alive():
             if handler in self._busy:
                 handler.close()
             else:
@@ -131,17 +149,21 @@ class XmlRpcServer:
         except Exception:
             log.exception("a call from %s failed in the proxy", request.remote)
             reply = xmlrpc.dump_fault(xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see its log")
-        return web.Response(body=reply, content_type="text/xml")
+        return web.Response(body=reply, headers=_XML)
 
 
-def _address(request: web.BaseRequest, which: str) -> HostPort:
-    found: Any = request.transport.get_extra_info(which) if request.transport else None
+_XML = {"Content-Type": "text/xml"}
+
+
+def _address(found: Any) -> HostPort:
     return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
 
 
 async def _body(request: web.BaseRequest) -> bytes | web.StreamResponse:
     """A request's body, or the response to one that can't be read."""
     try:
+        if request.content.is_eof():  # it came together with the header
+            return await read_bounded(request.content)
         async with asyncio.timeout(BODY_TIMEOUT):
             _invite(request)
             return await read_bounded(request.content)

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Iterable
 from dataclasses import replace
 
 from rosproxy.context import Context
@@ -34,6 +35,8 @@ class Keeper:
         self._context, self._leases, self._nodes, self._upkeep = context, leases, nodes, upkeep
         self._probing: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_PROBES)
+        self._unannounced: list[Endpoint] = []
+        self._announcing = asyncio.Lock()
 
     async def look(self) -> None:
         """Look after all endpoints once."""
@@ -49,6 +52,25 @@ class Keeper:
             return None
         said = await self._nodes.describe(HostPort(*claim.key))
         return frozenset(said.topics) if said else None
+
+    async def resume(self, endpoints: Iterable[Endpoint]) -> None:
+        """Verify and announce recovered endpoints. Raises Unreachable, MasterError.
+
+        None waits for another that does not answer, and none is probed meanwhile.
+        """
+        limit, resumed = asyncio.Semaphore(PARALLEL_PROBES), set(endpoints)
+
+        async def resume(endpoint: Endpoint) -> None:
+            try:
+                async with limit:
+                    await self.verify(endpoint)
+            finally:
+                self._probing.discard(endpoint)
+            if self._leases.is_open(endpoint):
+                await self._announce(endpoint)
+
+        self._probing |= resumed
+        await asyncio.gather(*map(resume, resumed))
 
     async def verify(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears out what the master says of it."""
@@ -116,7 +138,7 @@ class Keeper:
             if endpoint.health.pid is None:
                 endpoint.health.pid = pid
             if self._leases.is_open(endpoint):
-                await self._upkeep.announce([endpoint])
+                await self._announce(endpoint)
             return
         if endpoint.health.cleaned:
             await self._upkeep.come_back(endpoint, pid)
@@ -129,6 +151,17 @@ class Keeper:
             log.info("%s answers again", endpoint.label)
             self._leases.open(endpoint)
             await self._upkeep.remind(endpoint)
+
+    async def _announce(self, endpoint: Endpoint) -> None:
+        """Announce an endpoint, together with those that came up during the one before.
+
+        Each time the whole graph is read: one by one, that would grow with the square of nodes.
+        """
+        self._unannounced.append(endpoint)
+        async with self._announcing:
+            found, self._unannounced = self._unannounced, []
+            if found:
+                await self._upkeep.announce(found)
 
     def _report_down(self, endpoint: Endpoint, reason: str) -> None:
         if endpoint.registrations:
@@ -144,7 +177,7 @@ class Keeper:
 
     def _maybe_end(self, endpoint: Endpoint) -> None:
         now, health = self._context.now(), endpoint.health
-        if endpoint.connections or endpoint.pending or not (endpoint.idle or health.cleaned):
+        if endpoint.connected or endpoint.pending or not (endpoint.idle or health.cleaned):
             endpoint.idle_since = None
             return
         if endpoint.idle_since is None:

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 from rosproxy.acceptor import Acceptor
 from rosproxy.context import Context
+from rosproxy.core import fast_ports
 from rosproxy.core.addressing import Asker
 from rosproxy.core.liveness import Probe
 from rosproxy.core.master_api import Admission, Refusal, registering_uri
 from rosproxy.core.registry import Endpoint, Place, RangeExhausted
 from rosproxy.core.uris import HostPort, is_loopback, parse_slave_uri
 from rosproxy.core.xmlrpc import Call
+from rosproxy.kernel_plane import KernelPlane
 from rosproxy.names import resolve
 from rosproxy.node_client import NodeClient
 
@@ -24,17 +26,24 @@ Connection = Callable[[Endpoint, socket.socket, str], Awaitable[None]]
 
 
 class Leases:
-    """Which node holds which port, and whether the port listens."""
+    """Which node holds which port, and whether the port listens.
+
+    ``on_close`` is told the ports that refuse from now on, ``on_short`` the endpoints that lost
+    their fast port.
+    """
 
     def __init__(
         self,
         context: Context,
         nodes: NodeClient,
+        plane: KernelPlane,
         on_connection: Connection,
         on_close: Callable[[int], None],
+        on_short: Callable[[Endpoint], None],
     ) -> None:
-        self._context, self._nodes = context, nodes
+        self._context, self._nodes, self._plane = context, nodes, plane
         self._on_connection, self._on_close = on_connection, on_close
+        self._on_short = on_short
         self._acceptors: dict[int, Acceptor] = {}
 
     async def admit(self, call: Call, asker: Asker) -> Admission:
@@ -68,28 +77,59 @@ class Leases:
         return await self._admit_new(uri, node, asker)
 
     def open(self, endpoint: Endpoint) -> None:
-        """Let an endpoint's port listen, if it still holds the lease."""
-        held = self._context.registry.by_port.get(endpoint.port) is endpoint
-        if not held or endpoint.port in self._acceptors:
+        """Let an endpoint's ports listen, if it still holds the lease."""
+        if self._context.registry.by_port.get(endpoint.port) is not endpoint:
             return
-        try:
-            sock = self._context.bank.open(endpoint.port)
-        except OSError as error:
+        self._plane.wake(endpoint)
+        if error := self._listen(endpoint, endpoint.port):
             text = f"port {endpoint.port} is taken: {error}"
             self._context.problems.add(endpoint.label, text, endpoint.port)
             log.error("port %d of %s can't be opened: %s", endpoint.port, endpoint.label, error)
-            return
-        self._acceptors[endpoint.port] = Acceptor(
+        elif endpoint.fast_port is not None and self._listen(endpoint, endpoint.fast_port):
+            fast_ports.give_back(self._context.registry, endpoint, blocked=True)
+
+    def _listen(self, endpoint: Endpoint, port: int) -> OSError | None:
+        """Let a port listen for an endpoint; the error if another program has it."""
+        if port in self._acceptors:
+            return None
+        try:
+            sock = self._context.bank.open(port)
+        except OSError as error:
+            return error
+        self._acceptors[port] = Acceptor(
             self._context.tasks, sock, lambda conn, peer: self._on_connection(endpoint, conn, peer)
         )
+        return None
 
     def close(self, endpoint: Endpoint) -> None:
-        """Let an endpoint's port refuse; the lease and open connections stay."""
-        acceptor = self._acceptors.pop(endpoint.port, None)
-        if acceptor is not None:
+        """Let an endpoint's ports refuse; the lease and open connections stay."""
+        self._plane.wake(endpoint)
+        for port in (endpoint.port, endpoint.fast_port):
+            self._refuse(port)
+
+    def _refuse(self, port: int | None) -> None:
+        acceptor = self._acceptors.pop(port, None) if port is not None else None
+        if acceptor is not None and port is not None:
             acceptor.stop()
-            self._on_close(endpoint.port)
-            self._context.bank.close(endpoint.port, acceptor.sock)
+            self._on_close(port)
+            self._context.bank.close(port, acceptor.sock)
+
+    async def cleared(self, endpoint: Endpoint) -> None:
+        """Wait a moment until the kernel no longer forwards a new lease, which was a fast port."""
+        await self._plane.cleared(endpoint.port)
+
+    async def fast_port(self, endpoint: Endpoint, tcpros_port: int) -> int | None:
+        """The port that the kernel forwards to a TCPROS port of an endpoint's node; None if none.
+
+        It is handed out when a subscriber first asks for a topic, while the range has ports left.
+        """
+        if self._plane.may_forward(endpoint):
+            if endpoint.fast_port is None and fast_ports.claim(self._context.registry, endpoint):
+                self.open(endpoint)
+            if endpoint.fast_port and await self._plane.forwards(endpoint, tcpros_port):
+                return endpoint.fast_port
+        self._plane.tell(endpoint)
+        return None
 
     def end(self, endpoint: Endpoint) -> None:
         """End a lease: close its port and forget its endpoint."""
@@ -97,6 +137,7 @@ class Leases:
         if registry.by_port.get(endpoint.port) is endpoint:
             self.close(endpoint)
             self._context.problems.solved_at(endpoint.port)
+            fast_ports.give_back(registry, endpoint)
             registry.remove(endpoint)
 
     async def retry_blocked(self) -> None:
@@ -118,6 +159,7 @@ class Leases:
         place = await self._place(node, asker.address)
         endpoint = self.take_in(uri, node, place, asker)
         if isinstance(endpoint, Endpoint):
+            await self.cleared(endpoint)
             greeting = self._greet(endpoint, asker.caller_id)
             self._context.tasks.spawn(greeting, f"first probe of {uri}")
         return endpoint
@@ -158,14 +200,28 @@ class Leases:
 
     def _take(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         registry = self._context.registry
-        try:
-            return registry.admit(uri, node, place, source)
-        except RangeExhausted:
-            oldest = registry.reclaimable()
-            if oldest is None:
-                raise
+        while True:
+            try:
+                return registry.admit(uri, node, place, source)
+            except RangeExhausted:
+                if not self._make_room():
+                    raise
+
+    def _make_room(self) -> bool:
+        """Take a port back that is needed least, if there is one: a fast port, or an idle lease."""
+        registry = self._context.registry
+        holder = fast_ports.to_give_back(registry)
+        if holder is not None:
+            self._refuse(holder.fast_port)
+            log.info("%s: port %s is needed as a lease", holder.label, holder.fast_port)
+            fast_ports.give_back(registry, holder)
+            self._plane.wake(holder)
+            self._on_short(holder)
+            return True
+        oldest = registry.reclaimable()
+        if oldest is not None:
             self.end(oldest)
-            return registry.admit(uri, node, place, source)
+        return oldest is not None
 
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""

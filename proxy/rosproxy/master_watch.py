@@ -7,6 +7,7 @@ from rosproxy.context import Context
 from rosproxy.core import recovery
 from rosproxy.core.registry import Endpoint, Place
 from rosproxy.keeper import Keeper
+from rosproxy.kernel_plane import KernelPlane
 from rosproxy.master_graph import read_graph, read_registrations
 from rosproxy.upkeep import Upkeep
 from rosproxy.upstream import MasterError, Unreachable
@@ -22,8 +23,11 @@ LOOKS_PER_CHECK = 5
 class MasterWatch:
     """Polls the master, recovers from what it holds, and restores what it has lost."""
 
-    def __init__(self, context: Context, keeper: Keeper, upkeep: Upkeep) -> None:
+    def __init__(
+        self, context: Context, keeper: Keeper, upkeep: Upkeep, plane: KernelPlane
+    ) -> None:
         self._context, self._keeper, self._upkeep = context, keeper, upkeep
+        self._plane = plane
         self._recovering = asyncio.Lock()
         self._recovered = False
         self._failures = 0
@@ -35,10 +39,15 @@ class MasterWatch:
         self.since = context.now()
 
     async def recovered(self) -> None:
-        """Wait until the registry is rebuilt from the master. Raises Unreachable.
+        """Wait until the registry is rebuilt from the master. Raises Unreachable."""
+        if not self._recovered:
+            await self._await_recovery()
 
-        All who wait for the same attempt share its failure: a master that hangs would keep the
-        last of them waiting for as many attempts as there are callers.
+    async def _await_recovery(self) -> None:
+        """All who wait for the same attempt share its failure.
+
+        A master that hangs would keep the last of them waiting for as many attempts as there are
+        callers.
         """
         failures = self._failures
         async with self._recovering:
@@ -93,6 +102,7 @@ class MasterWatch:
         graph = await read_graph(self._context.upstream)
         claims = await self._settled(recovery.claims(graph, self._context.addressing))
         endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
+        self._plane.recovered(endpoints)
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
@@ -128,8 +138,8 @@ class MasterWatch:
     async def _resume(self, endpoints: list[Endpoint]) -> None:
         """Serve recovered endpoints, then make up for the calls that were missed."""
         try:
-            await asyncio.gather(*(self._keeper.verify(endpoint) for endpoint in endpoints))
-            await self._upkeep.announce(e for e in endpoints if e.trusted)
+            await self._keeper.resume(endpoints)
+            log.info("recovered %d nodes", sum(e.trusted for e in endpoints))
         except (Unreachable, MasterError) as error:
             log.warning("recovery is incomplete: %s", error)
 

@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from rosproxy import __version__
+from rosproxy.core import fast_ports
 from rosproxy.core.methods import MASTER_METHODS
 from rosproxy.core.registry import Endpoint, Registry
 
@@ -73,6 +75,15 @@ class Traffic:
         self.received[key] = self.received.get(key, 0) + received
 
 
+@dataclass(frozen=True, slots=True)
+class KernelTally:
+    """What the kernel forwards: whether it does, how many connections, bytes by node."""
+
+    usable: bool
+    connections: int
+    traffic: Traffic
+
+
 class Metrics:
     """All metrics of a proxy, in a registry of their own."""
 
@@ -88,6 +99,7 @@ class Metrics:
             ["api", "method", "outcome"],
             registry=self.registry,
         )
+        self._counters: dict[tuple[str, str, str], Counter] = {}
         self.relay_errors = Counter(
             "rosproxy_relay_errors",
             "TCPROS connections that could not be relayed.",
@@ -114,7 +126,9 @@ class Metrics:
     def count(self, api: str, method: str, outcome: str) -> None:
         """Count a call; method names that nobody defined share one label."""
         known = method if method in _KNOWN_METHODS else "other"
-        self.calls.labels(api, known, outcome).inc()
+        key = api, known, outcome
+        counter = self._counters.get(key) or self._counters.setdefault(key, self.calls.labels(*key))
+        counter.inc()
 
 
 class StateCollector(Collector):
@@ -127,16 +141,19 @@ class StateCollector(Collector):
         open_connections: Callable[[], int],
         mirrored: Callable[[], int],
         master_up: Callable[[], bool],
+        kernel: Callable[[], KernelTally],
     ) -> None:
         self._registry, self._totals = registry, totals
         self._open_connections, self._mirrored = open_connections, mirrored
-        self._master_up = master_up
+        self._master_up, self._kernel = master_up, kernel
 
     def collect(self) -> Iterable[Metric]:
         """All state metrics."""
         pool = self._registry.pool
+        fast = fast_ports.held(self._registry)
         yield _gauge("leases_used", "Ports held by inside nodes.", len(self._registry))
-        yield _gauge("leases_free", "Ports left for inside nodes.", pool.free)
+        yield _gauge("leases_free", "Ports left for inside nodes.", pool.free + fast)
+        yield _gauge("fast_ports", "Of the ports left, those that serve topics meanwhile.", fast)
         yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
         yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())
         yield _gauge(
@@ -147,6 +164,7 @@ class StateCollector(Collector):
         yield _gauge("master_up", "Whether the master answers.", int(self._master_up()))
         yield self._endpoints()
         yield self._bytes()
+        yield from self._forwarded()
 
     def _endpoints(self) -> Metric:
         family = GaugeMetricFamily("rosproxy_endpoints", "Inside nodes by state.", labels=["state"])
@@ -166,6 +184,25 @@ class StateCollector(Collector):
             for (kind, name), size in sums.items():
                 family.add_metric([kind, name, direction], size)
         return family
+
+    def _forwarded(self) -> Iterable[Metric]:
+        tally = self._kernel()
+        yield _gauge("kernel_plane", "Whether the kernel forwards topics.", int(tally.usable))
+        yield _gauge(
+            "kernel_connections", "TCPROS connections that the kernel forwards.", tally.connections
+        )
+        family = CounterMetricFamily(
+            "rosproxy_kernel_bytes",
+            "Bytes of IP packets, headers included, that the kernel forwarded, by node.",
+            labels=["node", "direction"],
+        )
+        for direction, sums in (
+            ("outward", tally.traffic.sent),
+            ("inward", tally.traffic.received),
+        ):
+            for (_, name), size in sums.items():
+                family.add_metric([name, direction], size)
+        yield family
 
 
 def _gauge(name: str, text: str, value: float) -> Metric:

@@ -217,6 +217,7 @@ class Mirror:
                 self._leave(port)
             return
         relay = Relay(port, "service", f"at port {port}", "", peer, outside=node, inside=conn)
+        relay.splice = self._context.settings.data_plane != "copy"
         self._relays.start(relay, self._ended)
 
     def _ended(self, relay: Relay) -> None:

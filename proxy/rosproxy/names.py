@@ -9,8 +9,6 @@ import socket
 import threading
 from concurrent.futures import Future
 
-from aiohttp.abc import AbstractResolver, ResolveResult
-
 from rosproxy.core.uris import is_address, plain_address
 
 RESOLVE_TIMEOUT = 1.0
@@ -31,38 +29,6 @@ async def resolve(host: str) -> list[str]:
             return await asyncio.shield(asyncio.wrap_future(lookup))
     except TimeoutError:
         return []
-
-
-class Resolver(AbstractResolver):
-    """The same for aiohttp's client; ``last`` is the address that it found last."""
-
-    def __init__(self) -> None:
-        self.last: str | None = None
-
-    async def resolve(
-        self, host: str, port: int = 0, family: socket.AddressFamily = socket.AF_UNSPEC
-    ) -> list[ResolveResult]:
-        """The addresses of a host. Raises OSError if there is none."""
-        addresses = await resolve(host)
-        if not addresses:
-            raise OSError(None, f"host name {host} can't be resolved")
-        self.last = addresses[0]
-        return [_result(host, port, address) for address in addresses]
-
-    async def close(self) -> None:
-        """Nothing is kept open."""
-
-
-def _result(host: str, port: int, address: str) -> ResolveResult:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    return ResolveResult(
-        hostname=host,
-        host=address,
-        port=port,
-        family=family,
-        proto=socket.IPPROTO_TCP,
-        flags=socket.AI_NUMERICHOST,
-    )
 
 
 def _start(host: str) -> Future[list[str]]:

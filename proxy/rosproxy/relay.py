@@ -1,8 +1,8 @@
 """Moving bytes between two sockets: one blocking thread per direction.
 
-On Linux bulk data moves by splice(2) through a pipe and never enters Python; small messages are
-copied, which is one system call less. Back-pressure is the kernel's own: a thread that can't
-write doesn't read. The GIL is released in every call that blocks.
+On Linux bulk data moves by splice(2) through a pipe and never enters Python; messages below some
+8 KiB cost the same either way, and copying them needs no pipe. Back-pressure is the kernel's own:
+a thread that can't write doesn't read. The GIL is released in every call that blocks.
 """
 
 import contextlib
@@ -18,15 +18,27 @@ from dataclasses import dataclass, field
 log = logging.getLogger(__name__)
 
 COPY_SIZE = 16 * 1024
-"""Bytes read at once while copying; a full read switches the direction to splice."""
+"""Bytes read at once while copying; a full read switches the direction to splice.
+
+From here on splice costs less, with the opening of a pipe counted in.
+"""
 PIPE_SIZE = 1024 * 1024
 """Bytes that a splice pipe should hold; the kernel may give an unprivileged process less."""
+LARGE_PIPES = 16
+"""Pipes of that size at the same time; with more streams the CPU is busy, and each turn shorter."""
+SHARED_PIPE = 256 * 1024
+"""Bytes that each further pipe should hold: an unprivileged user has 64 MiB for all of them."""
 LEAST_PIPE = 64 * 1024
 """A pipe that holds fewer bytes is not spliced through."""
-BLOCK_SIZE = 256 * 1024
-"""Bytes copied at once where there is no pipe."""
+BLOCK_SIZE = 128 * 1024
+"""Bytes copied at once where there is no pipe; a buffer to keep would have to be zeroed first."""
 RESET_GRACE = 0.1
 """Seconds that the other direction gets to notice a reset before its peer is shut down."""
+
+Finished = Callable[["Relay"], None]
+"""Is told that a relay has ended."""
+WhenReadable = Callable[[socket.socket, Callable[[], object]], None]
+"""Has a function called, once, when a socket has bytes, has ended or has failed."""
 
 _LINGER_RESET = struct.pack("ii", 1, 0)
 
@@ -37,7 +49,8 @@ class Relay:
 
     ``kind`` is topic or service and ``name`` which; ``caller_id`` and ``peer`` tell who connected
     from outside. ``sent`` are bytes towards outside, ``received`` bytes towards the inside node;
-    ``rates`` are both in bytes per second, as of the last `sample`.
+    ``rates`` are both in bytes per second, as of the last `sample`. Without ``splice`` all bytes
+    are copied.
     """
 
     port: int
@@ -47,6 +60,7 @@ class Relay:
     peer: str
     outside: socket.socket
     inside: socket.socket
+    splice: bool = True
     sent: int = 0
     received: int = 0
     failed: bool = False
@@ -57,23 +71,18 @@ class Relay:
     )
     _ended: bool = False
 
-    def start(self, finished: Callable[["Relay"], None]) -> None:
-        """Relay both directions in the background; ``finished`` is called from a thread."""
+    def start(self, finished: Finished, when_readable: WhenReadable) -> None:
+        """Relay both directions in the background; ``finished`` is called from any thread.
+
+        A subscriber says nothing after its header: its direction gets a thread when it does.
+        """
         for sock in (self.outside, self.inside):
             _prepare(sock)
-        threads = [
-            threading.Thread(
-                target=self._direction, args=(index, finished), name=f"relay {self.name}"
-            )
-            for index in (0, 1)
-        ]
-        for index, thread in enumerate(threads):
-            thread.daemon = True
-            try:
-                thread.start()
-            except RuntimeError as error:
-                self._give_up(error, index, finished)
-                return
+        if self._start_direction(0, finished):
+            if self.kind == "topic":
+                when_readable(self.outside, lambda: self._start_direction(1, finished))
+            else:
+                self._start_direction(1, finished)
 
     def end(self) -> None:
         """End both directions; ``finished`` is called when that is done."""
@@ -89,19 +98,30 @@ class Relay:
             passed = now - before
             self.rates = (self.sent - sent) / passed, (self.received - received) / passed
 
-    def _direction(self, index: int, finished: Callable[["Relay"], None]) -> None:
-        pair = (self.inside, self.outside) if index == 0 else (self.outside, self.inside)
+    def _start_direction(self, index: int, finished: Finished) -> bool:
+        """Whether the direction could be started; if not, the relay ends."""
+        thread = threading.Thread(
+            target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
+        )
         try:
-            _Pump(*pair, self._count_sent if index == 0 else self._count_received).run()
+            thread.start()
+        except RuntimeError as error:
+            self._give_up(error, index, finished)
+            return False
+        return True
+
+    def _direction(self, index: int, finished: Finished) -> None:
+        pair = (self.inside, self.outside) if index == 0 else (self.outside, self.inside)
+        count = self._count_sent if index == 0 else self._count_received
+        try:
+            _Pump(*pair, count, self.splice).run()
             self._pass_end_on(pair[1])
         except OSError as error:
             log.debug("relay of %s: %s", self.name, error)
             self._pass_reset_on(index)
         self._finish(index, finished)
 
-    def _give_up(
-        self, error: RuntimeError, index: int, finished: Callable[["Relay"], None]
-    ) -> None:
+    def _give_up(self, error: RuntimeError, index: int, finished: Finished) -> None:
         """Reset both sides: direction ``index`` can't be started, those before it run."""
         log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
         self.failed = True
@@ -130,7 +150,7 @@ class Relay:
             if self._done[1 - index].wait(RESET_GRACE):
                 return
 
-    def _finish(self, index: int, finished: Callable[["Relay"], None]) -> None:
+    def _finish(self, index: int, finished: Finished) -> None:
         self._done[index].set()
         if not self._done[1 - index].is_set() or not self._claim_end():
             return
@@ -169,9 +189,14 @@ class _Pump:
     """One direction: from ``source`` to ``target`` until the source ends. Raises OSError."""
 
     def __init__(
-        self, source: socket.socket, target: socket.socket, count: Callable[[int], None]
+        self,
+        source: socket.socket,
+        target: socket.socket,
+        count: Callable[[int], None],
+        may_splice: bool,
     ) -> None:
         self._source, self._target, self._count = source, target, count
+        self._may_splice = may_splice and hasattr(os, "splice")
 
     def run(self) -> None:
         while self._copy() and self._bulk():
@@ -179,9 +204,10 @@ class _Pump:
 
     def _copy(self) -> bool:
         """Copy until a read is full; False at the end."""
-        while data := self._source.recv(COPY_SIZE):
-            self._target.sendall(data)
-            self._count(len(data))
+        receive, send, count = self._source.recv, self._target.sendall, self._count
+        while data := receive(COPY_SIZE):
+            send(data)
+            count(len(data))
             if len(data) == COPY_SIZE:
                 return True
         return False
@@ -191,48 +217,70 @@ class _Pump:
 
         The pipe is held no longer than that: pipes are scarce for an unprivileged user.
         """
-        with _pipe() as pipe:
+        if not self._may_splice:
+            return self._copy_blocks()
+        with _PIPES.borrow() as pipe:
             return self._splice(*pipe) if pipe else self._copy_blocks()
 
     def _splice(self, read_end: int, write_end: int) -> bool:
         source, target = self._source.fileno(), self._target.fileno()
+        splice, count = os.splice, self._count
         while True:
-            size = left = os.splice(source, write_end, PIPE_SIZE)
+            size = left = splice(source, write_end, PIPE_SIZE)
             while left:
-                left -= os.splice(read_end, target, left)
-            self._count(size)
+                left -= splice(read_end, target, left)
+            count(size)
             if size < COPY_SIZE:
                 return size > 0
 
     def _copy_blocks(self) -> bool:
-        block = memoryview(bytearray(BLOCK_SIZE))
-        while True:
-            size = self._source.recv_into(block)
-            self._target.sendall(block[:size])
-            self._count(size)
-            if size < COPY_SIZE:
-                return size > 0
+        receive, send, count = self._source.recv, self._target.sendall, self._count
+        while data := receive(BLOCK_SIZE):
+            send(data)
+            count(len(data))
+            if len(data) < COPY_SIZE:
+                return True
+        return False
 
 
-@contextlib.contextmanager
-def _pipe() -> Iterator[tuple[int, int] | None]:
-    """A pipe that is worth splicing through, or None.
+class _Pipes:
+    """The pipes of all relays."""
 
-    An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they hold
-    two pages each, and copying is faster.
-    """
-    try:
-        ends = os.pipe() if hasattr(os, "splice") else None
-    except OSError as error:  # no file descriptor left
-        log.debug("no pipe: %s", error)
-        ends = None
-    if ends is None:
-        yield None
-        return
-    try:
-        with contextlib.suppress(OSError):
-            fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-        yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
-    finally:
+    def __init__(self) -> None:
+        self._lock, self._held = threading.Lock(), 0
+
+    @contextlib.contextmanager
+    def borrow(self) -> Iterator[tuple[int, int] | None]:
+        """A pipe that is worth splicing through, or None.
+
+        An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they
+        hold two pages each, and copying is faster.
+        """
+        try:
+            ends = os.pipe()
+        except OSError as error:  # no file descriptor left
+            log.debug("no pipe: %s", error)
+            yield None
+            return
+        size = self._take()
+        try:
+            with contextlib.suppress(OSError):
+                fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, size)
+            yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
+        finally:
+            self._give_back(*ends)
+
+    def _take(self) -> int:
+        """The size of one more pipe."""
+        with self._lock:
+            self._held += 1
+            return PIPE_SIZE if self._held <= LARGE_PIPES else SHARED_PIPE
+
+    def _give_back(self, *ends: int) -> None:
+        with self._lock:
+            self._held -= 1
         for end in ends:
             os.close(end)
+
+
+_PIPES = _Pipes()

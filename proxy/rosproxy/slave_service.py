@@ -7,7 +7,6 @@ from collections.abc import Awaitable, Callable
 from rosproxy.context import Context
 from rosproxy.core import mirror, multicall, slave_api, strays, xmlrpc
 from rosproxy.core.liveness import Change, Probe
-from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
 from rosproxy.core.slave_api import TopicPort, Visit
 from rosproxy.core.uris import HostPort, parse_inside_path
@@ -94,11 +93,15 @@ class SlaveService:
             await self._after_registration(endpoint)
             await self._mirror.hand_over(mirror.announced(parsed))
         self._context.refresh_networks()
-        visit = self._visit(endpoint, call)
+        visit = self._visit(endpoint, call, endpoint.port)
         addressing = self._context.addressing
         body = self._mirror.toward_inside(call.body, parsed)
         reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
-        self._note_port(endpoint, slave_api.topic_port(parsed, reply))
+        said = slave_api.topic_port(parsed, reply)
+        if said is not None:
+            self._note_port(endpoint, said)
+            port = await self._leases.fast_port(endpoint, said.port) or endpoint.port
+            visit = self._visit(endpoint, call, port)
         return slave_api.export_reply(parsed, reply, visit, addressing)
 
     async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
@@ -120,15 +123,14 @@ class SlaveService:
         while endpoint.pending and self._context.now() < deadline:  # noqa: ASYNC110 - rare, short
             await asyncio.sleep(0.002)
 
-    def _note_port(self, endpoint: Endpoint, said: TopicPort | None) -> None:
+    def _note_port(self, endpoint: Endpoint, said: TopicPort) -> None:
         """Note a TCPROS port; by topic only for topics that the node has registered.
 
         roscpp names its port for any topic, so anybody could have names remembered without end.
         """
-        if said is not None:
-            endpoint.tcpros_port = said.port
-            if said.topic in endpoint.names(Kind.PUBLISHER):
-                endpoint.topic_ports[said.topic] = said.port
+        endpoint.tcpros_port = said.port
+        if endpoint.publishes(said.topic):
+            endpoint.topic_ports[said.topic] = said.port
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         try:
@@ -146,10 +148,11 @@ class SlaveService:
             log.info("%s is gone: %s", endpoint.label, error)
             self._leases.close(endpoint)
 
-    def _visit(self, endpoint: Endpoint, call: Call) -> Visit:
-        reached = self._context.addressing.outside(endpoint.port)
+    def _visit(self, endpoint: Endpoint, call: Call, port: int) -> Visit:
+        """A call at an endpoint, whose topics the caller is to find at a ``port``."""
+        reached = self._context.addressing.outside(port)
         if call.reached_locally:
-            reached = HostPort(call.local.host, endpoint.port)
+            reached = HostPort(call.local.host, port)
         return Visit(self._context.node_asker(endpoint), reached, self._context.settings.master_uri)
 
     async def _may(self, method: str, source: str) -> bool:

@@ -6,8 +6,10 @@ from typing import Any
 
 from rosproxy import __version__
 from rosproxy.context import Context
+from rosproxy.core import fast_ports
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
+from rosproxy.kernel_plane import KernelPlane
 from rosproxy.master_watch import MasterWatch
 from rosproxy.metrics import state_of
 from rosproxy.mirror import Mirror
@@ -17,7 +19,11 @@ from rosproxy.tcpros_service import TcprosService
 
 
 def describe(
-    context: Context, watch: MasterWatch, tcpros: TcprosService, mirror: Mirror
+    context: Context,
+    watch: MasterWatch,
+    tcpros: TcprosService,
+    mirror: Mirror,
+    plane: KernelPlane,
 ) -> dict[str, Any]:
     """Everything that ``rosproxy status`` and ``rosproxy doctor`` show.
 
@@ -36,8 +42,12 @@ def describe(
         "settings": _settings(context),
         "master": _master(context, watch),
         "ports": _ports(context),
+        "data_plane": plane.status(),
         "mirrored": mirror.status(),
-        "nodes": [_node(context, e, relays.get(e.port, [])) for e in endpoints],
+        "nodes": [
+            _node(context, e, relays.get(e.port, [])) | {"data_plane": plane.status_of(e)}
+            for e in endpoints
+        ],
         "problems": [_problem(problem) for problem in context.problems.all()],
     }
 
@@ -74,7 +84,7 @@ def _ports(context: Context) -> dict[str, Any]:
         "listen": str(ports.listen),
         "advertise": str(ports.advertise),
         "used": len(context.registry),
-        "free": pool.free,
+        "free": pool.free + fast_ports.held(context.registry),
         "blocked": pool.blocked,
     }
 

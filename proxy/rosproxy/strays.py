@@ -178,6 +178,7 @@ class Strays:
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.pending += 1
+        await self._leases.cleared(endpoint)
         self._note(endpoint, sight)
         for stray in found:
             endpoint.former_uris.add(stray.uri)

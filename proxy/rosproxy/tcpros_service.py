@@ -8,6 +8,7 @@ from rosproxy.acceptor import read_header
 from rosproxy.context import Context
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint
+from rosproxy.core.silent import Connection
 from rosproxy.core.tcpros import HeaderError, decode_header, encode_header
 from rosproxy.core.uris import HostPort, is_loopback
 from rosproxy.dialing import CONNECT_TIMEOUT, dial
@@ -30,6 +31,7 @@ class TcprosService:
 
     def __init__(self, context: Context, nodes: NodeClient) -> None:
         self._context, self._nodes = context, nodes
+        self._may_splice = context.settings.data_plane != "copy"
         self._relays = OpenRelays()
         self._ended = Traffic()
         self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
@@ -38,6 +40,10 @@ class TcprosService:
     def relays(self) -> list[Relay]:
         """The open connections."""
         return list(self._relays)
+
+    def topic_connections(self) -> set[Connection]:
+        """The open connections of topics: port, topic and the subscriber's name."""
+        return {(r.port, r.name, r.caller_id) for r in self._relays if r.kind == "topic"}
 
     def traffic(self) -> Traffic:
         """Bytes by topic and service, of ended and open connections."""
@@ -114,7 +120,10 @@ class TcprosService:
     ) -> None:
         kind = "service" if "service" in fields else "topic"
         name = self._registered_name(endpoint, kind, fields.get(kind, ""))
-        relay = Relay(endpoint.port, kind, name, fields.get("callerid", ""), peer, conn, inside)
+        caller_id = fields.get("callerid", "")
+        relay = Relay(
+            endpoint.port, kind, name, caller_id, peer, conn, inside, splice=self._may_splice
+        )
         endpoint.connections += 1
         endpoint.idle_since = None
         self._relays.start(relay, lambda ended: self._finished(endpoint, ended))

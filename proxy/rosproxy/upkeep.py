@@ -6,35 +6,32 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from rosproxy.context import Context
-from rosproxy.core import strays, upkeep, xmlrpc
-from rosproxy.core.addressing import Asker
+from rosproxy.core import strays, upkeep
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
-from rosproxy.core.uris import HostPort, parse_slave_uri
-from rosproxy.master_graph import read_graph
-from rosproxy.mirror import Mirror
 from rosproxy.node_client import NodeClient, SelfDescription
+from rosproxy.publisher_updates import PublisherUpdates
 from rosproxy.reclaim import Reclaim
-from rosproxy.upstream import CALLER_ID, Unreachable
+from rosproxy.silent import Silent
+from rosproxy.upstream import CALLER_ID, MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
 Held = tuple[Endpoint, Registration]
 Former = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
-PARALLEL_CALLS = 32
 SETTLE_TIME = 2.0
 """Seconds in which the master's news of a publisher that is registered anew come in."""
-OUTSIDER = Asker("", "")
-"""A subscriber outside, who is given addresses as the master holds them."""
 
 
 class Upkeep:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, nodes: NodeClient, mirror: Mirror) -> None:
-        self._context, self._nodes, self._mirror = context, nodes, mirror
-        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
+    def __init__(
+        self, context: Context, nodes: NodeClient, updates: PublisherUpdates, silent: Silent
+    ) -> None:
+        self._context, self._nodes = context, nodes
+        self._updates, self._silent = updates, silent
         self._reclaim = Reclaim(context)
 
     async def register(self, held: Sequence[Held]) -> None:
@@ -60,7 +57,7 @@ class Upkeep:
         """
         moved = list(endpoints)
         topics = [(e, topic) for e in moved for topic in e.names(Kind.SUBSCRIBER)]
-        await asyncio.gather(*(self._update(e.slave, topic, []) for e, topic in topics))
+        await asyncio.gather(*(self._updates.tell_inside(e, t, []) for e, t in topics))
         await self.register([(e, held) for e in moved for held in e.registrations.values()])
         for endpoint in moved:
             endpoint.unsettled = False
@@ -82,22 +79,30 @@ class Upkeep:
     async def announce(self, endpoints: Iterable[Endpoint]) -> None:
         """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError.
 
-        Subscribers are told first that the relayed publishers have gone and then, by the master,
-        that they are there: roscpp never tries again after a connection that was refused at once
-        (transport_publisher_link.cpp, onRetryTimer), and rospy doesn't try at all. Registering
+        Subscribers that have no connection are told first that the relayed publishers have gone
+        and then, by the master, that they are there: roscpp never tries again after a connection
+        that was refused at once (see `core.silent`), and rospy doesn't try at all. Registering
         one publisher of a topic makes the master notify all of its subscribers; registering a
         subscriber again yields its publishers.
         """
-        topics: dict[str, Held] = {}
-        subscribers: list[Held] = []
-        for endpoint in endpoints:
-            for held in endpoint.registrations.values():
-                if held.kind is Kind.PUBLISHER:
-                    topics.setdefault(held.name, (endpoint, held))
-                elif held.kind is Kind.SUBSCRIBER:
-                    subscribers.append((endpoint, held))
-        await self._withdraw(topics)
-        await self.register([*topics.values(), *subscribers])
+        found = list(endpoints)
+        self._silent.watch(found)
+        await self._silent.withdraw(found, ask=False)
+        held = [(e, held) for e in found for held in e.registrations.values()]
+        subscribers = [one for one in held if one[1].kind is Kind.SUBSCRIBER]
+        await self.register([*_one_per_topic(found), *subscribers])
+
+    async def look_for_silent(self) -> None:
+        """Have subscribers connect that have lost a publisher in spite of `announce`."""
+        endpoints = [] if self._context.retired else self._silent.due()
+        try:
+            topics = await self._silent.withdraw(endpoints) if endpoints else set()
+            if topics:
+                log.info("subscribers of %d topics had no connection; told anew", len(topics))
+                held = _one_per_topic(endpoints)
+                await self.register([one for one in held if one[1].name in topics])
+        except (Unreachable, MasterError) as error:
+            log.debug("looking for silent subscribers: %s", error)
 
     async def remind(self, endpoint: Endpoint) -> None:
         """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
@@ -105,6 +110,7 @@ class Upkeep:
         A subscriber whose requestTopic was refused does not ask again by itself: it is told of
         its publishers once more when one registers. Connections that have lasted stay.
         """
+        self._silent.watch([endpoint])
         topics = (Kind.PUBLISHER, Kind.SUBSCRIBER)
         held = [one for one in endpoint.registrations.values() if one.kind in topics]
         await self.register([(endpoint, one) for one in held])
@@ -237,46 +243,10 @@ class Upkeep:
         found, stuck = await self._reclaim.take_back(direct)
         return moved | found, stuck
 
-    async def _withdraw(self, topics: Iterable[str]) -> None:
-        """Tell the subscribers of topics that none but directly reached publishers are left."""
-        graph = await read_graph(self._context.upstream)
-        publishers = graph.by_topic(Kind.PUBLISHER)
-        subscribers = graph.by_topic(Kind.SUBSCRIBER)
-        calls = [
-            self._tell(topic, uri, publishers.get(topic, []))
-            for topic in topics
-            for uri in subscribers.get(topic, [])
-        ]
-        await asyncio.gather(*calls)
-
-    async def _tell(self, topic: str, subscriber: str, publishers: list[str]) -> None:
-        endpoint = self._context.addressing.stands_for(subscriber)
-        where = endpoint.slave if endpoint else parse_slave_uri(subscriber)
-        if where is None:
-            return
-        asker = self._context.node_asker(endpoint) if endpoint else OUTSIDER
-        left = upkeep.reached_directly(publishers, asker, self._context.addressing)
-        if endpoint:
-            await self._mirror.hand_over(left)
-        await self._update(where, topic, left)
-
     async def _tell_publishers(self, updates: Sequence[tuple[Held, list[str]]]) -> None:
-        await asyncio.gather(*(self._tell_all(item, uris) for item, uris in updates))
-
-    async def _tell_all(self, item: Held, uris: list[str]) -> None:
-        endpoint, held = item
-        asker = self._context.node_asker(endpoint)
-        publishers = self._context.addressing.import_slaves(uris, asker)
-        await self._mirror.hand_over(uris)
-        await self._update(endpoint.slave, held.name, publishers)
-
-    async def _update(self, where: HostPort, topic: str, publishers: list[str]) -> None:
-        body = xmlrpc.dump_call("publisherUpdate", "/master", topic, publishers)
-        async with self._limit:
-            try:
-                await self._context.upstream.node(where, body, self._context.settings.probe_timeout)
-            except Unreachable as error:
-                log.debug("publisherUpdate of %s: %s", topic, error)
+        await asyncio.gather(
+            *(self._updates.tell_inside(e, held.name, uris) for (e, held), uris in updates)
+        )
 
 
 _ORDER = (Kind.PUBLISHER, Kind.SERVICE, Kind.SUBSCRIBER, Kind.PARAM)
@@ -287,3 +257,13 @@ def _current(item: Held) -> bool:
     """Whether a registration has not ended meanwhile."""
     endpoint, held = item
     return endpoint.registrations.get(held.key) is held
+
+
+def _one_per_topic(endpoints: Iterable[Endpoint]) -> list[Held]:
+    """One publisher of each topic that some endpoints' nodes publish."""
+    topics: dict[str, Held] = {}
+    for endpoint in endpoints:
+        for held in endpoint.registrations.values():
+            if held.kind is Kind.PUBLISHER:
+                topics.setdefault(held.name, (endpoint, held))
+    return list(topics.values())

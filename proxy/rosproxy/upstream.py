@@ -10,21 +10,22 @@ import aiohttp
 
 from rosproxy.core import xmlrpc
 from rosproxy.core.liveness import Probe
-from rosproxy.core.uris import HostPort, is_address, slave_uri
+from rosproxy.core.uris import HostPort, is_address
+from rosproxy.http_client import HttpClient
 from rosproxy.metrics import Metrics
-from rosproxy.names import Resolver, resolve
+from rosproxy.names import resolve
 
 CALLER_ID = "/rosproxy"
 """The node name under which the proxy itself calls."""
 LOOP_HEADER = "X-Rosproxy"
 """Carries the proxy's own id, so that it notices when a call of its own comes back to it."""
-MAX_BODY = 64 * 1024 * 1024
-"""Longest XML-RPC body in bytes, either way."""
 MULTICALL_SIZE = 100
-CONNECT_TIMEOUT = 2.0
+MASTER_CONNECTIONS = 64
 MASTER_TIMEOUT = 30.0
 MASTER_KEEPALIVE = 8.0
 """Seconds that an unused connection to the master is kept; rosmaster spends a thread on each."""
+NODE_KEEPALIVE = 2.0
+"""The same for a node; rospy spends a thread on each."""
 NODE_TIMEOUT = 15.0
 
 
@@ -48,8 +49,8 @@ class MasterError(Exception):
 class Upstream:
     """HTTP sessions towards the master and the nodes.
 
-    The master's connections are kept alive. A node's are not: roscpp's server and a node's end
-    make reuse unsafe, and calls to nodes are rare.
+    Connections are kept alive: the master's between any two calls, a node's for the calls that
+    follow each other closely, as when a machine subscribes to several of its topics.
 
     ``master_address``, which may be changed at any time, is the IP address at which the host of
     ``master_uri`` is reached; None: where its name leads. In a container network that name may
@@ -60,20 +61,12 @@ class Upstream:
         self, master_uri: str, instance: str, metrics: Metrics, master_address: str | None = None
     ) -> None:
         self.master_uri, self.master_address = master_uri, master_address
-        self._metrics, self._resolver = metrics, Resolver()
+        self._metrics = metrics
         parts = urlsplit(master_uri)
         self._master_path, self._netloc = parts.path or "/", parts.netloc
         self._master_where = HostPort(parts.hostname or "", parts.port or 80)
-        self._master = _session(
-            aiohttp.TCPConnector(
-                resolver=self._resolver, limit=64, keepalive_timeout=MASTER_KEEPALIVE
-            ),
-            {LOOP_HEADER: instance},
-        )
-        self._nodes = _session(
-            aiohttp.TCPConnector(resolver=Resolver(), limit=0, force_close=True),
-            {LOOP_HEADER: f"{instance} node"},
-        )
+        self._master = HttpClient({LOOP_HEADER: instance}, MASTER_KEEPALIVE, MASTER_CONNECTIONS)
+        self._nodes = HttpClient({LOOP_HEADER: f"{instance} node"}, NODE_KEEPALIVE, 10_000)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -83,7 +76,7 @@ class Upstream:
     def reached_at(self) -> str | None:
         """The address at which the master is looked for; None before its name was resolved."""
         host = self._master_where.host
-        return self.master_address or (host if is_address(host) else self._resolver.last)
+        return self.master_address or (host if is_address(host) else self._master.last)
 
     async def master_addresses(self) -> list[str]:
         """The addresses of the master's host; empty if its name can't be resolved."""
@@ -103,15 +96,13 @@ class Upstream:
     async def master(self, body: bytes) -> bytes:
         """The master's reply to a call. Raises Unreachable.
 
-        Calls to the master can be repeated without harm, so a kept connection that the master
-        had closed costs one more try.
+        Kept connections are told apart by address, so a new address means new connections.
         """
+        where, path = self.reach(self._master_where), self._master_path
         try:
-            return await self._post_master(body)
-        except aiohttp.ServerDisconnectedError:
-            return await self._again(body)
+            return await self._master.post(where, path, self._netloc, body, MASTER_TIMEOUT)
         except _FAILURES as error:
-            raise self._master_gone(error) from error
+            raise _unreachable(f"master {self.master_uri}", error) from error
 
     async def ask_master(self, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
@@ -139,9 +130,8 @@ class Upstream:
         self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
     ) -> bytes:
         """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
-        url = slave_uri(self.reach(where), path)
         try:
-            return await _post(self._nodes, url, body, within, str(where))
+            return await self._nodes.post(self.reach(where), path, str(where), body, within)
         except _FAILURES as error:
             raise _unreachable(f"node at {where}", error) from error
 
@@ -150,70 +140,18 @@ class Upstream:
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return _value(method, _parsed(await self.node(where, body, within)))
 
-    async def _again(self, body: bytes) -> bytes:
-        try:
-            return await self._post_master(body)
-        except _FAILURES as error:
-            raise self._master_gone(error) from error
-
-    async def _post_master(self, body: bytes) -> bytes:
-        """Kept connections are told apart by address, so a new address means new connections."""
-        url = slave_uri(self.reach(self._master_where), self._master_path)
-        return await _post(self._master, url, body, MASTER_TIMEOUT, self._netloc)
-
-    def _master_gone(self, error: BaseException) -> Unreachable:
-        return _unreachable(f"master {self.master_uri}", error)
-
 
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
 
 
-def _session(connector: aiohttp.TCPConnector, headers: dict[str, str]) -> aiohttp.ClientSession:
-    return aiohttp.ClientSession(
-        connector=connector,
-        headers={"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers},
-        cookie_jar=aiohttp.DummyCookieJar(),
-        skip_auto_headers=["Accept-Encoding", "Accept"],
-        auto_decompress=True,
-    )
-
-
-async def _post(
-    session: aiohttp.ClientSession, url: str, body: bytes, within: float, host: str
-) -> bytes:
-    """A reply's body; ``host`` is what the peer is called by, whatever address ``url`` names."""
-    if session.closed:
-        raise ConnectionAbortedError("the proxy is stopping")
-    timeout = aiohttp.ClientTimeout(total=within, sock_connect=min(CONNECT_TIMEOUT, within))
-    # A peer that could redirect the proxy would make it fetch from any host that it reaches.
-    async with session.post(
-        url, data=body, headers={"Host": host}, timeout=timeout, allow_redirects=False
-    ) as reply:
-        if reply.status != 200:
-            raise ValueError(f"HTTP status {reply.status}")
-        return await read_bounded(reply.content)
-
-
-async def read_bounded(stream: aiohttp.StreamReader) -> bytes:
-    """All of a body. Raises ValueError if it is longer than MAX_BODY."""
-    parts, size = [], 0
-    async for part in stream.iter_any():
-        size += len(part)
-        if size > MAX_BODY:
-            raise ValueError(f"a body of more than {MAX_BODY} bytes")
-        parts.append(part)
-    return b"".join(parts)
-
-
 def _unreachable(who: str, error: BaseException) -> Unreachable:
-    cause = error.os_error if isinstance(error, aiohttp.ClientConnectorError) else error
-    refused = isinstance(cause, ConnectionRefusedError)
+    refused = isinstance(error, ConnectionRefusedError)
     if isinstance(error, TimeoutError):
         reason = "no answer in time"
-    elif isinstance(cause, OSError) and cause.strerror:
-        reason = cause.strerror.lower()
+    elif isinstance(error, OSError) and error.strerror:
+        reason = error.strerror.lower()
     else:
-        reason = str(cause) or type(cause).__name__
+        reason = str(error) or type(error).__name__
     return Unreachable(f"{who}: {reason}", refused)
 
 

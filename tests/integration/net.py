@@ -92,6 +92,8 @@ async def knock(address: Where, data: bytes, source: str = OUTSIDE) -> str:
                 return await wire.outcome()
     except ConnectionRefusedError:
         return "refused"
+    except ConnectionResetError:
+        return "reset"  # it stops listening just now
     except TimeoutError:
         return "silent"
 

@@ -17,6 +17,7 @@ PORTS = 8
 def options_for(**options: Any) -> dict[str, Any]:
     """Command-line options for a test: free ports, and patience measured in tenths of seconds.
 
+    The kernel's tables of this machine are left alone, even if root runs the tests.
     ``publish_master`` may be True: on a free port.
     """
     count = options.pop("ports", PORTS)
@@ -34,6 +35,7 @@ def options_for(**options: Any) -> dict[str, Any]:
         "cleanup_after": 1.0,
         "linger": 0.5,
         "master_interval": 0.2,
+        "data_plane": "splice",
         **options,
     }
 

@@ -199,7 +199,7 @@ async def test_a_body_beyond_the_bound_is_refused(
     proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await look_up(proxy, robot)
-    monkeypatch.setattr("rosproxy.upstream.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
     assert (await exchange(slave(robot), post(b"x" * 100_001), NODE)).status == 413
     robot.answers["getPid"] = ok(b"x" * 100_001)
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"

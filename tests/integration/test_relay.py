@@ -2,18 +2,19 @@
 
 import asyncio
 import errno
+import fcntl
 import hashlib
 import os
 import random
 import socket
 import threading
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Any
 
 import pytest
 
-from rosproxy import relay
+from rosproxy import open_relays, relay
 from tests.integration.net import Wire, connect, refuses, until
 from tests.integration.node import read_header, topic_header
 
@@ -44,12 +45,13 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
         arrived.set_result(wire)
         await over.wait()
 
-    node.stream = hold
+    before, node.stream = node.stream, hold
     async with connect(lease) as outside:
         await outside.send(topic_header())
         try:
             yield Ends(outside, await arrived)
         finally:
+            node.stream = before
             over.set()
 
 
@@ -236,6 +238,9 @@ async def test_connections_leave_neither_descriptors_nor_threads(proxy, node, le
 async def test_without_a_thread_left_a_connection_is_reset(
     proxy, node, lease, monkeypatch, started
 ):
+    async with relayed(node, lease):
+        pass
+    await quiet(proxy)
     real, budget = threading.Thread.start, [started]
 
     def start(thread: threading.Thread) -> None:
@@ -248,7 +253,7 @@ async def test_without_a_thread_left_a_connection_is_reset(
     monkeypatch.setattr(threading.Thread, "start", start)
     before = len(os.listdir("/proc/self/fd"))
     async with connect(lease) as wire:
-        await wire.send(topic_header())
+        await wire.send(topic_header() + b"says more")
         assert await wire.end() == "reset"
     await quiet(proxy)
     assert proxy.endpoint(node).connections == 0
@@ -276,6 +281,66 @@ async def test_stopping_the_proxy_ends_its_connections(make_proxy, node):
             assert await ends.outside.end() == "closed"
             assert await ends.inside.end() == "closed"
         await asyncio.gather(flood, return_exceptions=True)
+
+
+async def test_in_copy_mode_nothing_is_spliced(make_proxy, node, monkeypatch):
+    def fail(*_: Any) -> None:
+        raise AssertionError("spliced")
+
+    monkeypatch.setattr(os, "pipe", fail)
+    monkeypatch.setattr(os, "splice", fail)
+    proxy = await make_proxy(data_plane="copy")
+    await node.publish(proxy.master)
+    async with relayed(node, proxy.lease(node)) as ends:
+        data = random.Random(8).randbytes(3 * relay.BLOCK_SIZE + 17)
+        for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+            _, got = await asyncio.gather(one.send(data), other.exactly(len(data)))
+            assert got == data
+
+
+async def test_a_subscriber_that_says_nothing_costs_one_thread(proxy, node, lease):
+    before = threading.active_count()
+    async with relayed(node, lease) as ends:
+        await ends.inside.send(b"message")
+        assert await ends.outside.exactly(7) == b"message"
+        assert threading.active_count() == before + 1
+        await ends.outside.send(b"says something")
+        assert await ends.inside.exactly(14) == b"says something"
+        assert threading.active_count() == before + 2
+    await quiet(proxy)
+
+
+async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, lease, monkeypatch):
+    monkeypatch.setattr(open_relays, "STARTS_PER_TURN", 3)
+    async with AsyncExitStack() as stack:
+        for _ in range(10):
+            await stack.enter_async_context(relayed(node, lease))
+        assert len(proxy.app._tcpros.relays) == 10
+    await quiet(proxy)
+
+
+async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
+    """The user's pages for pipes are not used up by the first streams."""
+    monkeypatch.setattr(relay, "LARGE_PIPES", 1)
+    sizes: list[int] = []
+    real = os.splice
+
+    def splice(source: int, target: int, size: int) -> int:
+        with suppress(OSError):
+            sizes.append(fcntl.fcntl(target, fcntl.F_GETPIPE_SZ))
+        return real(source, target, size)
+
+    monkeypatch.setattr(os, "splice", splice)
+    async with AsyncExitStack() as stack:
+        floods = []
+        for _ in range(3):
+            ends = await stack.enter_async_context(relayed(node, lease))
+            floods.append(asyncio.create_task(ends.inside.send(b"x" * 50_000_000)))
+        await until(lambda: len(set(sizes)) > 1, "a second stream is spliced")
+        for flood in floods:
+            flood.cancel()
+        await asyncio.gather(*floods, return_exceptions=True)
+    assert set(sizes) == {relay.PIPE_SIZE, relay.SHARED_PIPE}
 
 
 async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):

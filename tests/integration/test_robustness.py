@@ -161,7 +161,7 @@ async def test_a_body_that_is_not_what_its_encoding_says_is_refused(door):
 
 
 async def test_a_body_above_the_limit_is_413(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.upstream.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
     for body, headers in [
         (b" " * 100_001, []),
         (b" " * 100_001, [f"Content-Length: {10**15}"]),
@@ -173,7 +173,7 @@ async def test_a_body_above_the_limit_is_413(door, monkeypatch):
 
 
 async def test_a_connection_is_usable_after_413(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.upstream.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
     async with connect(door.address) as wire:
         await wire.send(post(b" " * 150_000))
         assert (await wire.reply()).status == 413

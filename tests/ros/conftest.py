@@ -1,7 +1,8 @@
 """Fixtures of the real-ROS layer, and the report at its end.
 
 With ROS_TESTS_FLAT=1 the same tests run in a network without boundary and without the
-proxy: what fails there is wrong with a test, or with ROS, and not with the proxy.
+proxy: what fails there is wrong with a test, or with ROS, and not with the proxy. With
+ROS_TESTS_KERNEL=1 the kernel forwards topics in all of them.
 """
 
 from __future__ import annotations

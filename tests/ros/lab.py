@@ -48,6 +48,8 @@ class Lab:
         self.advertise_host = OUT_HOST
         self.master_role = "out"
         self.proxy_options: tuple[str, ...] = ()
+        self.proxy_prefix: tuple[str, ...] = ()
+        self.proxy_path = SYSTEM_PATH
         self.master: Process | None = None
         self.proxy: Process | None = None
         self.nodes: list[Process] = []
@@ -101,9 +103,9 @@ class Lab:
         return f"http://{self.place(self.master_role).address}:{MASTER_PORT}"
 
     def _spawn_proxy(self, argv: list[str]) -> Process:
-        env = {"PATH": SYSTEM_PATH, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
+        env = {"PATH": self.proxy_path, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
         env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
-        return self._spawn("rosproxy", self.place("px"), argv, env)
+        return self._spawn("rosproxy", self.place("px"), [*self.proxy_prefix, *argv], env)
 
     def ensure_running(self) -> None:
         """Starts roscore and proxy where a test before has left them dead."""

@@ -68,6 +68,8 @@ class Plan:
     Docker does; in the proxy's own machine it does so, too.
     With `hairpin`, inside reaches the published ports at the host's address too, as it does
     with Docker's own proxy process; without, a wrong address handed to inside is found out.
+    With `forwarding`, the proxy's machine forwards, as containers of Docker do, and as the
+    kernel plane needs it; without, every topic goes through the proxy itself.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Plan:
     flat: bool = False
     alias: bool = False
     hairpin: bool = False
+    forwarding: bool = False
 
 
 SHARED = Plan("s", (("c1", "c2"),), PortMap(45000, 45099, 45000))
@@ -181,10 +184,15 @@ class Topology:
 
     def _load_rules(self) -> None:
         host = self.places["host"].namespace
-        _run("ip", "netns", "exec", host, "sysctl", "-q", "-w", "net.ipv4.ip_forward=1")
+        self._forward("host", True)
+        self._forward("px", self.plan.forwarding or os.environ.get("ROS_TESTS_KERNEL") == "1")
         if not self.plan.flat:
             rules = _rules(self.plan, self.places["px"].address)
             _run("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
+
+    def _forward(self, role: str, forwards: bool) -> None:
+        enter = ("ip", "netns", "exec", self.places[role].namespace)
+        _run(*enter, "sysctl", "-q", "-w", f"net.ipv4.ip_forward={forwards:d}")
 
     def _keep_ports_free(self) -> None:
         """Keeps the proxy's own connections off the ports that nodes on the robot may have."""

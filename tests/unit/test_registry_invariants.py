@@ -1,5 +1,6 @@
 """The registry's tables agree with each other after any sequence of operations."""
 
+from collections import Counter
 from typing import Any
 
 from hypothesis import settings
@@ -164,6 +165,10 @@ class Registries(RuleBasedStateMachine):
         assert set(self.registry._admitted.values()) <= live
         assert not set(self.registry._former.values()) & live
         assert not set(self.registry._former) & set(self.registry.by_port)
+        for former in self.registry._former.values():
+            assert former in self.registry.by_uri(former.uri)
+        kept = [e for found in self.registry._former_uris.values() for e in found.values()]
+        assert sorted(e.port for e in kept) == sorted(self.registry._former)
         last = self.registry._last_port
         assert all(last[endpoint.key] == endpoint.port for endpoint in live)
         assert len(last) <= len(PORTS)
@@ -179,6 +184,8 @@ class Registries(RuleBasedStateMachine):
                 assert known
                 assert known[0] is endpoint
         assert set(self.registry._by_caller) == {key[2] for key in self.expected}
+        for endpoint in self.registry:
+            assert endpoint.callers == Counter(key[2] for key in endpoint.registrations)
         services = {key[1] for key in self.expected if key[0] is Kind.SERVICE}
         assert set(self.registry._services) == services
 

@@ -167,3 +167,40 @@ def test_a_short_screen_shows_problems_before_nodes() -> None:
 def test_a_screen_that_is_long_enough_shows_details() -> None:
     status = make_status(make_node())
     assert render(status, 120, lines=50) == render(status, 120)
+
+
+def a_plane(**changes: Any) -> dict[str, Any]:
+    return {
+        "plane": "kernel",
+        "port": 45050,
+        "reason": "",
+        "connections": 2,
+        "sent": 3_400_000,
+        "received": 120,
+        "sent_rate": 1200.0,
+        "received_rate": 10.0,
+        **changes,
+    }
+
+
+def planes(*nodes: dict[str, Any], **whole: str) -> str:
+    status = make_status(*nodes)
+    status["data_plane"] = {"mode": "auto", "plane": "kernel", "reason": ""} | whole
+    return render(status, 120)
+
+
+def test_the_kernels_connections_count_as_the_proxys_own() -> None:
+    text = planes(make_node(data_plane=a_plane(), connections=[make_connection()]))
+    assert "topics   forwarded by the kernel (--data-plane auto)" in text
+    row = next(line for line in text.split("\n") if line.startswith("/talker"))
+    assert row.split()[-5:] == ["3", "2.4", "kB/s", "10", "B/s"]
+    assert "kernel     2 connections through port 45050: 3.4 MB out, 120 B in as IP packets" in text
+
+
+def test_why_a_node_is_not_forwarded_is_told_where_others_are() -> None:
+    plane = a_plane(plane="splice", port=None, reason="port 45050 is in use", connections=0)
+    node = make_node(data_plane=plane)
+    assert "kernel     not used: port 45050 is in use" in planes(node)
+    text = planes(node, plane="splice", reason="nft is not installed")
+    assert "topics   relayed by the proxy (splice): nft is not installed" in text
+    assert "not used" not in text

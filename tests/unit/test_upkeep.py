@@ -111,18 +111,3 @@ def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     assert found == [Registration(PUB, "/b", "/n", "t/B"), Registration(SUB, "/a", "/n", "t/A")]
     add_registration(addressing, endpoint, SUB, "/c", "/m")
     assert upkeep.unregistered(endpoint, {"/b": "t/B"}, {}) == []
-
-
-OUT, LAPTOP = "http://robot-host:45000/10.0.0.5:40001/", "http://laptop:5/"
-FAR_OUT = "http://robot-host:45001/172.20.0.7:40001/"
-
-
-def test_publishers_that_a_subscriber_reaches_without_the_proxy() -> None:
-    addressing = make_addressing()
-    node = add_node(addressing)
-    add_node(addressing, "http://172.20.0.7:40001/")
-    uris = [LAPTOP, OUT, FAR_OUT]
-    outsider = make_asker("192.168.1.77")
-    assert upkeep.reached_directly(uris, outsider, addressing) == [LAPTOP]
-    insider = make_asker("10.0.0.5", endpoint=node)
-    assert upkeep.reached_directly(uris, insider, addressing) == [LAPTOP, OWN]

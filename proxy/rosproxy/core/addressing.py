@@ -6,13 +6,14 @@ them back, as ``rosnode cleanup`` does when it unregisters somebody else's node.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from ipaddress import IPv4Network, IPv6Network, ip_address
+from ipaddress import IPv4Network, IPv6Network
 
 from rosproxy.core.ports import PortMap
-from rosproxy.core.registry import Endpoint, Registry
+from rosproxy.core.registry import Endpoint, Place, Registry
 from rosproxy.core.uris import (
     HostPort,
     InsidePath,
+    as_ip,
     inside_path,
     parse_inside_path,
     parse_service_uri,
@@ -51,6 +52,8 @@ class Addressing:
     host: str
     ports: PortMap
     networks: Sequence[Network] = field(default_factory=tuple)
+    _advertised: dict[int, tuple[HostPort, Place, str]] = field(default_factory=dict)
+    """What `advertised_uri` said last of each port, and what it was made of."""
 
     def outside(self, port: int) -> HostPort:
         """What outside sees of a port that the proxy listens on."""
@@ -58,7 +61,11 @@ class Addressing:
 
     def advertised_uri(self, endpoint: Endpoint) -> str:
         """The slave URI that stands for an endpoint at the master and outside."""
-        return slave_uri(self.outside(endpoint.port), self._path(endpoint))
+        node, place, uri = self._advertised.get(endpoint.port, (None, None, ""))
+        if node is not endpoint.node or place is not endpoint.place:
+            uri = slave_uri(self.outside(endpoint.port), self._path(endpoint))
+            self._advertised[endpoint.port] = endpoint.node, endpoint.place, uri
+        return uri
 
     def advertised_service(self, endpoint: Endpoint) -> str:
         """The service URI that stands for an endpoint's services outside."""
@@ -138,7 +145,9 @@ class Addressing:
         return endpoint.place.named and self._neighbours(asker.address, endpoint.place.address)
 
     def _neighbours(self, one: str, other: str) -> bool:
-        first, second = ip_address(one), ip_address(other)
+        first, second = as_ip(one), as_ip(other)
+        if first is None or second is None:
+            return False
         return any(first in network and second in network for network in self.networks)
 
     def _path(self, endpoint: Endpoint) -> str:

@@ -1,6 +1,6 @@
 """The ROS graph as the master tells it: who publishes, subscribes and serves what, and where."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ class GraphError(ValueError):
 class Graph:
     """What each node has registered, and each node's slave URI as far as known."""
 
-    held: Mapping[str, list[Registration]]
+    held: Mapping[str, Sequence[Registration]]
     uris: Mapping[str, str]
 
     def by_topic(self, kind: Kind) -> dict[str, list[str]]:

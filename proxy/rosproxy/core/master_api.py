@@ -102,11 +102,11 @@ def read_request(body: bytes, asker: Asker) -> Request:
     """Parse a request. Raises XmlRpcError if it is none."""
     call = xmlrpc.parse_call(body)
     if call.method != MULTICALL:
-        return Request(body, [call], False, replace(asker, caller_id=_caller_id(call)))
+        return Request(body, [call], False, _named(asker, _caller_id(call)))
     calls = inner_calls(call)
     caller_id = next((_caller_id(inner) for inner in calls if inner), "")
     items = inner_items(call)
-    return Request(body, calls, True, replace(asker, caller_id=caller_id), items)
+    return Request(body, calls, True, _named(asker, caller_id), items)
 
 
 def registering_uri(call: Call | None) -> str | None:
@@ -150,8 +150,11 @@ def import_answer(request: Request, answer: Answer, addressing: Addressing) -> b
     """The reply for the inside node: URIs imported, refused calls answered."""
     edits: list[Edit] = []
     for result in answer.results:
-        asker = replace(request.asker, endpoint=result.endpoint or request.asker.endpoint)
-        edits += _import_result(result, asker, addressing)
+        if row(result.call.method).reply is not Reply.OTHER:
+            asker = request.asker
+            if result.endpoint and result.endpoint is not asker.endpoint:
+                asker = replace(asker, endpoint=result.endpoint)
+            edits += _import_result(result, asker, addressing)
     if request.multicall and answer.value and answer.value.items:
         edits += insert_items(answer.value, _refused_results(request))
     return xmlrpc.apply(answer.body, edits)
@@ -180,6 +183,10 @@ def noted(answer: Answer, now: float) -> list[Noted]:
             made = row(result.call.method).registers is not None
             facts.append(Noted(held, result.endpoint if made else None))
     return facts
+
+
+def _named(asker: Asker, caller_id: str) -> Asker:
+    return Asker(asker.address, asker.proxy, caller_id, asker.master, asker.endpoint)
 
 
 def _caller_id(call: Call) -> str:

@@ -80,6 +80,10 @@ class PortPool:
             return prefer
         return self._free.popitem(last=False)[0] if self._free else None
 
+    def is_free(self, port: int) -> bool:
+        """Whether nobody has a port of the range."""
+        return port in self._free
+
     def claim(self, port: int) -> bool:
         """Take exactly this port; False if it is not free."""
         return port in self._free and self.take(port) == port

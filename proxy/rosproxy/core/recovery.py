@@ -8,13 +8,12 @@ master, so what is found there is only a claim: the shell asks the node itself b
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 
 from rosproxy.core.addressing import Addressing, Network
 from rosproxy.core.graph import Graph
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
-from rosproxy.core.uris import InsidePath, is_address, slave_uri
+from rosproxy.core.uris import InsidePath, as_ip, slave_uri
 
 NO_MERIT = -(10**9)
 _EVERYBODYS = frozenset({"/rosout"})
@@ -90,7 +89,8 @@ def settle(found: Sequence[Claim], said: Mapping[int, frozenset[str] | None]) ->
 
 def allowed(address: str, networks: Sequence[Network]) -> bool:
     """Whether a recovered endpoint may lie at an address: inside the inside networks only."""
-    return is_address(address) and any(ip_address(address) in network for network in networks)
+    parsed = as_ip(address)
+    return parsed is not None and any(parsed in network for network in networks)
 
 
 def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:

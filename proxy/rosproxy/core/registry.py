@@ -58,6 +58,7 @@ class Registration:
 class Endpoint:
     """An inside slave URI and the port that stands for it outside.
 
+    ``callers`` are the nodes' names with the number of their registrations, which `Registry` keeps.
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
     ``trusted`` is False while only the master's data tell of the endpoint.
@@ -66,6 +67,10 @@ class Endpoint:
     registered around the proxy, and advertised ones of places where it was. ``unsettled``: what
     the master has may still be registered with one of them. Until ``settles_at``, a time, a list
     of publishers without this one is taken for one from before it was registered anew.
+
+    ``fast_port`` is a second port of the range, for topics alone, which the kernel forwards where
+    it may (None: it has none). ``fast_peers`` tells how many connections the kernel forwards now,
+    by the peer's address.
     """
 
     uri: str
@@ -73,6 +78,7 @@ class Endpoint:
     place: Place
     port: int
     registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
+    callers: dict[str, int] = field(default_factory=dict)
     topic_ports: dict[str, int] = field(default_factory=dict)
     tcpros_port: int | None = None
     connections: int = 0
@@ -84,6 +90,8 @@ class Endpoint:
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
+    fast_port: int | None = None
+    fast_peers: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def direct(self) -> bool:
@@ -103,7 +111,7 @@ class Endpoint:
     @property
     def caller_ids(self) -> list[str]:
         """The names of the nodes registered here; one, as a rule."""
-        return sorted({held.caller_id for held in self.registrations.values()})
+        return sorted(self.callers)
 
     @property
     def label(self) -> str:
@@ -114,15 +122,24 @@ class Endpoint:
         """The topics, services or parameters registered as ``kind``."""
         return sorted(held.name for held in self.registrations.values() if held.kind is kind)
 
+    def publishes(self, topic: str) -> bool:
+        """Whether a topic is registered as published."""
+        return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
+
     @property
     def topics(self) -> set[str]:
         """The topics registered here, published or subscribed to."""
         return {*self.names(Kind.PUBLISHER), *self.names(Kind.SUBSCRIBER)}
 
     @property
+    def connected(self) -> bool:
+        """Whether somebody outside is connected, through the proxy or through the kernel."""
+        return bool(self.connections or self.fast_peers)
+
+    @property
     def idle(self) -> bool:
         """Whether nothing is registered, nobody is connected and no call is under way."""
-        return not (self.registrations or self.connections or self.pending)
+        return not (self.registrations or self.connected or self.pending)
 
 
 class Registry:
@@ -138,6 +155,7 @@ class Registry:
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[tuple[str, int], int] = {}
         self._former: dict[int, Endpoint] = {}
+        self._former_uris: dict[str, dict[int, Endpoint]] = {}
 
     def __iter__(self) -> Iterator[Endpoint]:
         """All endpoints; safe against changes while iterating."""
@@ -183,6 +201,7 @@ class Registry:
         for admission in endpoint.admissions:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
+        self._former_uris.setdefault(endpoint.uri, {})[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
 
     def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
@@ -209,7 +228,7 @@ class Registry:
 
         One that has just been admitted is not idle: the master's reply is still on its way.
         """
-        unused = [e for e in self if not (e.connections or e.pending or e.idle_since is None)]
+        unused = [e for e in self if not (e.connected or e.pending or e.idle_since is None)]
         idle = [e for e in unused if e.idle or e.health.cleaned]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
@@ -232,6 +251,8 @@ class Registry:
             self.drop_caller(other, held.caller_id)
         if held.kind is Kind.SERVICE:
             self._replace_service(endpoint, held)
+        if held.key not in endpoint.registrations:
+            endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.registrations[held.key] = held
         self._by_caller[held.caller_id] = endpoint
         endpoint.idle_since = None
@@ -253,8 +274,8 @@ class Registry:
         Those removed come last, until somebody else has their port: a node that was handed their
         URI may still send it back.
         """
-        former = [endpoint for endpoint in self._former.values() if endpoint.uri == uri]
-        return self._by_uri.get(uri, []) + former
+        former = self._former_uris.get(uri)
+        return self._by_uri.get(uri, []) + (list(former.values()) if former else [])
 
     def at(self, address: str, port: int) -> Endpoint | None:
         """The endpoint of the slave API at an address and port."""
@@ -325,10 +346,19 @@ class Registry:
 
     def _remember(self, endpoint: Endpoint) -> None:
         """Note who has a port now, in place of who had it last."""
-        former = self._former.pop(endpoint.port, endpoint)
+        former = self._former.pop(endpoint.port, None)
+        if former is not None:
+            self._forget_former(former)
+        former = former or endpoint
         if self._last_port.get(former.key) == endpoint.port:
             del self._last_port[former.key]
         self._last_port[endpoint.key] = endpoint.port
+
+    def _forget_former(self, former: Endpoint) -> None:
+        same = self._former_uris[former.uri]
+        del same[former.port]
+        if not same:
+            del self._former_uris[former.uri]
 
     def _rename(self, endpoint: Endpoint, uri: str, node: HostPort, place: Place) -> None:
         self._forget_uri(endpoint)
@@ -352,5 +382,6 @@ class Registry:
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self._services.pop(name, None)
-        if not any(other[2] == caller_id for other in endpoint.registrations):
-            del self._by_caller[caller_id]
+        endpoint.callers[caller_id] -= 1
+        if not endpoint.callers[caller_id]:
+            del endpoint.callers[caller_id], self._by_caller[caller_id]

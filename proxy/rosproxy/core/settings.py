@@ -11,6 +11,8 @@ from rosproxy.core.ports import PortMap, PortRange
 from rosproxy.core.uris import HostPort, parse_address, parse_host_port, parse_slave_uri
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
+DataPlane = Literal["auto", "kernel", "splice", "copy"]
+"""How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
 
 
 class SettingError(ValueError):
@@ -44,6 +46,7 @@ class Settings:
     linger: float = 30.0
     master_interval: float = 2.0
     slave_control: Literal["any", "master"] = "any"
+    data_plane: DataPlane = "auto"
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
 
@@ -72,6 +75,7 @@ def parse_settings(options: Mapping[str, Any]) -> Settings:
         admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
         inside_networks=tuple(_network(text) for text in options.get("inside_network") or ()),
         slave_control=options["slave_control"],
+        data_plane=options.get("data_plane") or "auto",
         master_address=_master_address(options.get("master_address")),
         admin_token=_admin_token(options.get("admin_token")),
         **{name: _seconds(name, options[name]) for name in _TIMES},

@@ -26,6 +26,8 @@ MOST_LINES = 3
 """Lines that the topics, services or connections of one node may take, each."""
 MOST_CONNECTIONS = 8
 INDENT = "    "
+NO_PLANE = {"connections": 0, "sent_rate": 0.0, "received_rate": 0.0}
+"""What counts for a node of a proxy that tells nothing of the kernel."""
 
 
 def render(status: Status, columns: int, lines: int | None = None) -> str:
@@ -47,6 +49,8 @@ def _head(status: Status) -> Iterator[str]:
     yield f"rosproxy {clean(status['version'])}, pid {status['pid']}{up}"
     yield f"master   {_master(status['master'])}"
     yield f"ports    {_ports(status)}"
+    if plane := status.get("data_plane"):
+        yield f"topics   {_plane(plane)}"
     networks = listed(map(clean, settings["inside_networks"])) or "none"
     yield (
         f"inside   ROS_MASTER_URI=http://<this host>:{settings['master_port']}, networks {networks}"
@@ -76,6 +80,12 @@ def _ports(status: Status) -> str:
     return f"{outside}{mapped}: {ports['used']} used, {ports['free']} free{blocked}"
 
 
+def _plane(plane: Status) -> str:
+    if plane["plane"] == "kernel":
+        return f"forwarded by the kernel (--data-plane {clean(plane['mode'])})"
+    return f"relayed by the proxy ({clean(plane['plane'])}): {clean(plane['reason'])}"
+
+
 def _mirrored(ports: Sequence[Status]) -> str:
     open_ones = plural(sum(port["connections"] for port in ports), "connection")
     numbers = listed(str(port["port"]) for port in ports)
@@ -100,13 +110,16 @@ def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:
             yield from _detail("at", f"{clean(node['address'])}, outside {_outside(node)}", columns)
         if details:
             yield from _details(node, columns)
+            yield from _detail("kernel", _kernel(node, status.get("data_plane")), columns)
 
 
 def _row(node: Status) -> tuple[str, ...]:
     names = [clean(name) for name in node["nodes"]] or ["(unnamed)"]
-    connections = node["connections"]
+    plane = node.get("data_plane") or NO_PLANE
+    connections = [*node["connections"], plane]
+    count = len(node["connections"]) + plane["connections"]
     out, into = (
-        f"{size(sum(c[key] for c in connections))}/s" if connections else "-"
+        f"{size(sum(c[key] for c in connections))}/s" if count else "-"
         for key in ("sent_rate", "received_rate")
     )
     return (
@@ -114,7 +127,8 @@ def _row(node: Status) -> tuple[str, ...]:
         clean(node["address"]),
         _outside(node),
         clean(node["state"]),
-        *(str(len(node[key])) for key in ("publishes", "subscribes", "services", "connections")),
+        *(str(len(node[key])) for key in ("publishes", "subscribes", "services")),
+        str(count),
         out,
         into,
     )
@@ -138,6 +152,18 @@ def _details(node: Status, columns: int) -> Iterator[str]:
         yield from _detail("connected", _connection(connection), columns)
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
+
+
+def _kernel(node: Status, whole: Status | None) -> str:
+    """What the kernel forwards for a node; why nothing, where it does for others."""
+    plane = node.get("data_plane")
+    if plane is None or whole is None or whole["plane"] != "kernel":
+        return ""
+    used = f"{plural(plane['connections'], 'connection')} through port {plane['port']}"
+    moved = f"{size(plane['sent'])} out, {size(plane['received'])} in as IP packets"
+    if plane["plane"] == "kernel":
+        return f"{used}: {moved}"
+    return f"not used: {clean(plane['reason'])}"
 
 
 def _detail(word: str, text: str, columns: int) -> list[str]:

@@ -201,7 +201,7 @@ def outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float
     listed = set(uris)
     return any(
         endpoint.settles_at > now
-        and topic in endpoint.names(Kind.PUBLISHER)
+        and endpoint.publishes(topic)
         and addressing.advertised_uri(endpoint) not in listed
         for endpoint in addressing.registry
     )

@@ -1,9 +1,9 @@
 """The calls by which the proxy registers and unregisters at the master on behalf of nodes."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
-from rosproxy.core.addressing import Addressing, Asker
+from rosproxy.core.addressing import Addressing
 from rosproxy.core.methods import Kind
 from rosproxy.core.registry import Endpoint, Registration
 
@@ -108,14 +108,3 @@ def unregistered(
         for topic, type_ in topics.items()
         if (kind, topic, names[0]) not in endpoint.registrations
     ]
-
-
-def reached_directly(uris: Sequence[str], asker: Asker, addressing: Addressing) -> list[str]:
-    """The publishers that a subscriber reaches without the proxy, in the form that it knows them.
-
-    An inside subscriber (``asker.endpoint``) is given imported URIs.
-    """
-    if asker.endpoint is None:
-        return [uri for uri in uris if addressing.identify(uri) is None]
-    imported = addressing.import_slaves(uris, asker)
-    return [uri for uri in imported if not addressing.handed_out(uri, asker)]

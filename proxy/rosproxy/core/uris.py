@@ -8,11 +8,28 @@ restarted proxy rebuild its table from what the master holds.
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from ipaddress import ip_address
+from functools import lru_cache, wraps
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from typing import TypeVar
 from urllib.parse import quote, unquote, urlsplit
 
+_MOST_CACHED, _LONGEST_CACHED = 4096, 200
+_UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
+_T = TypeVar("_T")
 _HOST = re.compile(r"[\w.-]+|[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(%[\w.-]+)?")
+
+
+def _cached(read: Callable[[str], _T]) -> Callable[[str], _T]:
+    """Remember what short texts mean: those of a graph come with every call, and anybody's too."""
+    remembered = lru_cache(_MOST_CACHED)(read)
+
+    @wraps(read)
+    def cached(text: str) -> _T:
+        return remembered(text) if len(text) <= _LONGEST_CACHED else read(text)
+
+    return cached
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +79,11 @@ def service_uri(where: HostPort) -> str:
 
 def inside_path(node: HostPort, address: str) -> str:
     """The path that carries an inside address; see the module's text."""
-    segment = f"{quote(str(node), safe=':[]')}/"
-    return f"/{segment}" if node.host == address else f"/{segment}{quote(address, safe=':')}/"
+    segment = _quoted(str(node))
+    return f"/{segment}/" if node.host == address else f"/{segment}/{_quoted(address)}/"
 
 
+@_cached
 def parse_inside_path(uri: str) -> InsidePath | None:
     """The inside address in the path of an advertised URI, or None if it carries none.
 
@@ -81,13 +99,18 @@ def parse_inside_path(uri: str) -> InsidePath | None:
     return InsidePath(node, parts[1] if len(parts) == 2 else None)
 
 
+@_cached
+def as_ip(host: str) -> IPv4Address | IPv6Address | None:
+    """A host as an IP address; None if it is a name."""
+    try:
+        return ip_address(host)
+    except ValueError:
+        return None
+
+
 def is_address(host: str) -> bool:
     """Whether a host is an IP address rather than a name."""
-    try:
-        ip_address(host)
-    except ValueError:
-        return False
-    return True
+    return as_ip(host) is not None
 
 
 def is_loopback(host: str) -> bool:
@@ -95,18 +118,18 @@ def is_loopback(host: str) -> bool:
 
     All of them mean another machine to everybody else.
     """
-    bare = plain_address(host)
-    if is_address(bare):
-        return ip_address(bare).is_loopback or ip_address(bare).is_unspecified
+    parsed = as_ip(plain_address(host))
+    if parsed is not None:
+        return parsed.is_loopback or parsed.is_unspecified
     return f".{host}".lower().endswith(".localhost")
 
 
+@_cached
 def plain_address(address: str) -> str:
     """An IP address without an IPv4-in-IPv6 prefix (``::ffff:``) and without a zone."""
     bare = address.partition("%")[0]
-    try:
-        parsed = ip_address(bare)
-    except ValueError:
+    parsed = as_ip(bare)
+    if parsed is None:
         return bare
     mapped = getattr(parsed, "ipv4_mapped", None)
     return str(mapped or parsed)
@@ -117,13 +140,17 @@ def parse_address(text: str) -> str | None:
 
     The unspecified address, multicast and one with a zone are not.
     """
-    address = plain_address(text)
-    if "%" in text or not is_address(address):
+    parsed = as_ip(plain_address(text))
+    if "%" in text or parsed is None:
         return None
-    parsed = ip_address(address)
     return None if parsed.is_unspecified or parsed.is_multicast else str(parsed)
 
 
+def _quoted(text: str) -> str:
+    return text if _UNQUOTED.fullmatch(text) else quote(text, safe=":[]")
+
+
+@_cached
 def _authority(uri: str) -> HostPort | None:
     try:
         parts = urlsplit(uri)

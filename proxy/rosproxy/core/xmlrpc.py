@@ -10,12 +10,16 @@ Specification: http://xmlrpc.com/spec.md.
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 from xmlrpc.client import Fault, dumps
 
+from rosproxy.core import xmlrpc_plain, xmlrpc_values
+from rosproxy.core.xmlrpc_values import INTEGERS, SCALARS, text_of
+
+Value = xmlrpc_values.Value
 PARSE_ERROR = -32700
 """Fault code: not well formed (http://xmlrpc-epi.sourceforge.net/specs/rfc.fault_codes.php)."""
 INVALID_REQUEST = -32600
@@ -25,13 +29,8 @@ INVALID_PARAMS = -32602
 SYSTEM_ERROR = -32400
 """Fault code: the proxy itself could not do its part."""
 
-_SCALARS = frozenset(
-    {"string", "int", "i4", "i8", "boolean", "double", "dateTime.iso8601", "base64", "nil"}
-)
 _TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
-
-Kind = Literal["string", "int", "array", "struct", "other"]
 
 
 class XmlRpcError(ValueError):
@@ -57,51 +56,6 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
-
-
-@dataclass(slots=True)
-class Value:
-    """One ``<value>``: its kind, its place in the document and what it holds.
-
-    ``outer`` spans the whole element, ``inner`` the text of a scalar; both are byte offsets.
-    ``members`` are the names of a struct's members, in the order of ``items``. ``encoding`` is the
-    document's.
-    """
-
-    body: bytes = field(repr=False)
-    encoding: str = "utf-8"
-    kind: Kind = "string"
-    outer: tuple[int, int] = (0, 0)
-    inner: tuple[int, int] = (0, 0)
-    items: list["Value"] = field(default_factory=list)
-    members: list[str] = field(default_factory=list)
-
-    @property
-    def text(self) -> str:
-        """The text of a scalar, with entities and CDATA resolved."""
-        return _text(self.body[slice(*self.inner)], self.encoding)
-
-    @property
-    def raw(self) -> bytes:
-        """The whole element as it was sent, in UTF-8."""
-        return self.body[slice(*self.outer)].decode(self.encoding).encode()
-
-    def string(self) -> str | None:
-        """The text if this is a string, else None."""
-        return self.text if self.kind == "string" else None
-
-    def integer(self) -> int | None:
-        """The number if this is an int, else None."""
-        if self.kind != "int":
-            return None
-        try:
-            return int(self.text)
-        except ValueError:
-            return None
-
-    def member(self, name: str) -> "Value | None":
-        """The value of a struct's member, or None."""
-        return self.items[self.members.index(name)] if name in self.members else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +117,9 @@ def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Call:
     or is not a method call. Of what looks like several method names XmlRpc++ takes the first, even
     in a comment, and Python the last element: such a document is refused.
     """
+    plain = xmlrpc_plain.call(body, limits.depth, limits.elements)
+    if plain is not None:
+        return Call(*plain)
     parser = _Parser(body, limits)
     if parser.root != "methodCall" or not parser.method:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC call: no methodCall with a methodName")
@@ -185,6 +142,9 @@ def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[Value,
 
     Raises XmlRpcError as ``parse_reply`` does.
     """
+    plain = xmlrpc_plain.response(body, limits.depth, limits.elements)
+    if plain is not None:
+        return plain, False
     parser = _Parser(body, limits)
     if parser.root != "methodResponse" or len(parser.values) != 1:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
@@ -222,16 +182,6 @@ def python_value(value: Value) -> Any:
     if value.kind == "struct":
         return dict(zip(value.members, map(python_value, value.items), strict=True))
     return value.integer() if value.kind == "int" else value.text
-
-
-def _text(raw: bytes, encoding: str) -> str:
-    if b"&" not in raw and b"<" not in raw:
-        return raw.decode(encoding, "replace").replace("\r\n", "\n").replace("\r", "\n")
-    pieces: list[str] = []
-    parser = expat.ParserCreate(encoding)
-    parser.CharacterDataHandler = pieces.append
-    parser.Parse(b"<t>" + raw + b"</t>", True)
-    return "".join(pieces)
 
 
 class _Parser:
@@ -280,7 +230,7 @@ class _Parser:
         handler = _STARTS.get(name)
         if handler:
             handler(self)
-        elif name in _SCALARS:
+        elif name in SCALARS:
             self._start_scalar(name)
         elif self._path[-2:-1] == ["value"]:
             self._open[-1].kind = "other"
@@ -290,7 +240,7 @@ class _Parser:
         handler = _ENDS.get(name)
         if handler:
             handler(self)
-        elif name in _SCALARS:
+        elif name in SCALARS:
             self._end_scalar()
 
     def _start_root(self) -> None:
@@ -310,7 +260,7 @@ class _Parser:
 
     def _start_scalar(self, name: str) -> None:
         value = self._holder(name)
-        value.kind = "int" if name in ("int", "i4", "i8") else "other"
+        value.kind = "int" if name in INTEGERS else "other"
         value.kind = "string" if name == "string" else value.kind
         value.inner = (self._tag_end(), -1)
 
@@ -321,11 +271,11 @@ class _Parser:
         self._holder("struct").kind = "struct"
 
     def _end_method(self) -> None:
-        self.method = _text(self._slice(), self._encoding).strip()
+        self.method = text_of(self._slice(), self._encoding).strip()
 
     def _end_name(self) -> None:
         if self._open and self._path[-1:] == ["member"]:
-            self._open[-1].members.append(_text(self._slice(), self._encoding))
+            self._open[-1].members.append(text_of(self._slice(), self._encoding))
 
     def _end_scalar(self) -> None:
         value = self._open[-1]

@@ -99,6 +99,7 @@ def proxy_options(layout: Layout, ports: ProxyPorts, master_uri: str) -> list[st
     return [
         f"--master-uri={master_uri}",
         f"--advertise-host={layout.host}",
+        "--data-plane=splice",
         f"--master-port={ports.master}",
         f"--port-range={ports.range}",
         f"--admin-bind=127.0.0.1:{ports.admin}",

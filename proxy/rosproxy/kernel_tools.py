@@ -1,0 +1,116 @@
+"""The two programs that change and read the kernel's tables: nft and conntrack.
+
+In the image they are copies that carry the capability to do so as a file capability, for a user
+who is not root.
+"""
+
+import asyncio
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+IMAGE_FOLDER = Path("/usr/libexec/rosproxy")
+"""Where the image has them; searched before the PATH."""
+SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
+"""Where they are outside of an unprivileged user's PATH."""
+TIMEOUT = 5.0
+"""Seconds that one of them may take."""
+REMEDY = (
+    "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN) and run it without "
+    "no-new-privileges"
+)
+
+
+class ToolError(Exception):
+    """One of the programs could not do what it was asked to; the text says why."""
+
+
+class Tools:
+    """nft and conntrack, wherever they are."""
+
+    def __init__(self) -> None:
+        self._running: set[asyncio.Future[str]] = set()
+
+    async def settled(self) -> None:
+        """Wait for runs whose tasks were cancelled: what they began they finish."""
+        if self._running:
+            await asyncio.wait(self._running)
+
+    async def nft(self, *words: str, document: str = "") -> str:
+        """Run ``nft -j``, with a document on its standard input; what it prints.
+
+        Raises ToolError.
+        """
+        return await self._run("nft", "nftables", ["-j", *words], document)
+
+    async def list_flows(self, mark: str, ipv6: bool) -> str:
+        """The TCP connections with a mark (``value/mask``). Raises ToolError."""
+        return await self._conntrack("-L", mark, ipv6)
+
+    async def forget_flows(self, mark: str, ipv6: bool, state: str = "") -> None:
+        """Delete the TCP connections with a mark, of one state if given. Raises ToolError."""
+        try:
+            await self._conntrack("-D", mark, ipv6, *(["--state", state] if state else []))
+        except ToolError as error:
+            if "0 flow entries" not in str(error):
+                raise
+
+    async def _conntrack(self, verb: str, mark: str, ipv6: bool, *more: str) -> str:
+        family = ["-f", "ipv6" if ipv6 else "ipv4"]
+        words = [verb, *family, "-p", "tcp", "--mark", mark, *more]
+        return await self._run("conntrack", "conntrack", words)
+
+    async def _run(self, name: str, package: str, words: list[str], document: str = "") -> str:
+        program = _find(name)
+        if program is None:
+            raise ToolError(f"{name} is not installed where the proxy runs: install {package}")
+        loop = asyncio.get_running_loop()
+        run = loop.run_in_executor(None, _run, [program, *words], document)
+        self._running.add(run)
+        run.add_done_callback(self._ended)
+        await asyncio.wait({run})
+        return run.result()
+
+    def _ended(self, run: asyncio.Future[str]) -> None:
+        """Forget a run, and take its failure for known: its task may have been cancelled."""
+        self._running.discard(run)
+        if not run.cancelled():
+            run.exception()
+
+
+def _find(name: str) -> str | None:
+    own = IMAGE_FOLDER / name
+    if os.access(own, os.X_OK):
+        return str(own)
+    path = os.pathsep.join([os.environ.get("PATH", ""), *SYSTEM_FOLDERS])
+    return shutil.which(name, path=path)
+
+
+def _run(command: list[str], document: str) -> str:
+    try:
+        done = subprocess.run(  # noqa: S603 - a program found by its own name, no shell
+            command,
+            input=document,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=TIMEOUT,
+            check=False,
+            env={"LC_ALL": "C"},
+        )
+    except subprocess.TimeoutExpired:
+        raise ToolError(f"{command[0]} did not end in {TIMEOUT:g} s") from None
+    except PermissionError as error:
+        raise ToolError(f"{command[0]} may not run ({error.strerror}): {REMEDY}") from None
+    except OSError as error:
+        raise ToolError(f"{command[0]} can't run: {error.strerror}") from None
+    if done.returncode != 0:
+        raise ToolError(_complaint(command[0], done.stderr))
+    return done.stdout
+
+
+def _complaint(program: str, said: str) -> str:
+    text = " ".join(said.split())[:300]
+    refused = "not permitted" in text or "you must be root" in text
+    return f"{program}: {text}" + (f": {REMEDY}" if refused else "")

@@ -1,0 +1,204 @@
+"""Calls over kept connections, against peers that end them in every way."""
+
+import asyncio
+import socket
+import struct
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import aiohttp
+import pytest
+
+from rosproxy.core.uris import HostPort
+from rosproxy.http_client import HttpClient
+from tests.integration.net import MASTER, until
+
+REPLY = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
+Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+
+class Peer:
+    """A server; ``serve`` handles its connections, ``accepted`` counts them."""
+
+    def __init__(self) -> None:
+        self.serve: Serve = self.answer_always
+        self.accepted = self.open = 0
+        self.heads: list[bytes] = []
+
+    async def start(self) -> None:
+        self._server = await asyncio.start_server(self._connected, MASTER, 0)
+        self.where = HostPort(*self._server.sockets[0].getsockname()[:2])
+
+    def stop(self) -> None:
+        self._server.close()
+
+    async def request(self, reader: asyncio.StreamReader) -> None:
+        head = await reader.readuntil(b"\r\n\r\n")
+        self.heads.append(head)
+        await reader.readexactly(int(head.partition(b"Content-Length: ")[2].split()[0]))
+
+    async def answer_always(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        while True:
+            await self.request(reader)
+            writer.write(REPLY)
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.accepted, self.open = self.accepted + 1, self.open + 1
+        try:
+            await self.serve(reader, writer)
+        except (OSError, asyncio.IncompleteReadError):
+            pass
+        finally:
+            self.open -= 1
+            writer.close()
+
+
+@pytest.fixture
+async def peer() -> AsyncIterator[Peer]:
+    made = Peer()
+    await made.start()
+    yield made
+    made.stop()
+    await until(lambda: made.open == 0, "the client has closed its connections")
+
+
+@pytest.fixture
+async def client(peer: Peer) -> AsyncIterator[HttpClient]:
+    made = HttpClient({"X-Test": "1"}, 0.3, 4)
+    yield made
+    await made.close()
+
+
+async def post(client: HttpClient, peer: Peer, body: bytes = b"hello", within: float = 5) -> bytes:
+    return await client.post(peer.where, "/a/b", "robot:11311", body, within)
+
+
+async def test_calls_one_after_the_other_share_a_connection(client, peer):
+    assert [await post(client, peer) for _ in range(5)] == [b"ok"] * 5
+    assert peer.accepted == 1
+    assert peer.heads[0].startswith(b"POST /a/b HTTP/1.1\r\nHost: robot:11311\r\n")
+    for line in (b"Content-Type: text/xml", b"X-Test: 1", b"Content-Length: 5"):
+        assert line in peer.heads[0].split(b"\r\n")
+
+
+async def test_a_connection_that_is_not_used_is_closed(client, peer):
+    await post(client, peer)
+    assert peer.open == 1
+    await until(lambda: peer.open == 0, "the idle connection is closed")
+
+
+async def test_no_more_calls_are_under_way_than_allowed(client, peer):
+    async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            await peer.request(reader)
+            await asyncio.sleep(0.05)
+            writer.write(REPLY)
+
+    peer.serve = slowly
+    assert await asyncio.gather(*(post(client, peer) for _ in range(12))) == [b"ok"] * 12
+    assert peer.accepted == 4
+
+
+@pytest.mark.parametrize("reset", [False, True], ids=["closed", "reset"])
+@pytest.mark.parametrize("when", ["between", "in the call"])
+async def test_a_kept_connection_that_ends_costs_one_more_try(client, peer, reset, when):
+    async def once(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(REPLY)
+        if when == "in the call":
+            await reader.readexactly(1)
+        if reset:
+            sock = writer.get_extra_info("socket")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            writer.transport.abort()
+
+    peer.serve = once
+    assert [await post(client, peer) for _ in range(3)] == [b"ok"] * 3
+    assert peer.accepted == 3
+
+
+async def test_who_has_gone_refuses_in_spite_of_a_kept_connection(client, peer):
+    async def once(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(REPLY)
+        await reader.readexactly(1)
+
+    peer.serve = once
+    await post(client, peer)
+    peer.stop()
+    with pytest.raises(ConnectionRefusedError):
+        await post(client, peer)
+
+
+async def test_a_new_connection_that_is_closed_is_not_tried_again(client, peer):
+    async def hang_up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+
+    peer.serve = hang_up
+    with pytest.raises(aiohttp.ServerDisconnectedError):
+        await post(client, peer)
+    assert peer.accepted == 1
+
+
+async def test_a_call_that_timed_out_leaves_no_connection(client, peer):
+    async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read()
+
+    peer.serve = silent
+    with pytest.raises(TimeoutError):
+        await post(client, peer, within=0.1)
+    await until(lambda: peer.open == 0, "the connection is closed")
+    peer.serve = peer.answer_always
+    assert await post(client, peer) == b"ok"
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [b"nonsense\r\n\r\n", b"HTTP/1.1 302 F\r\nLocation: /\r\nContent-Length: 0\r\n\r\n"],
+    ids=["no HTTP", "a redirect"],
+)
+async def test_what_is_no_reply_is_told_as_such(client, peer, reply):
+    async def odd(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        writer.write(reply)
+
+    peer.serve = odd
+    with pytest.raises(ValueError, match="HTTP"):
+        await post(client, peer)
+
+
+async def test_a_reply_beyond_the_bound_is_refused(client, peer, monkeypatch):
+    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
+
+    async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            await peer.request(reader)
+            size = 100_000 + (len(peer.heads) > 1)
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + b"x" * size)
+
+    peer.serve = long
+    assert len(await post(client, peer)) == 100_000
+    with pytest.raises(ValueError, match="100000 bytes"):
+        await post(client, peer)
+
+
+@pytest.mark.parametrize("size", [10, 300_000])
+async def test_bodies_of_any_size_arrive(client, peer, size):
+    assert await post(client, peer, b"x" * size) == b"ok"
+    assert f"Content-Length: {size}".encode() in peer.heads[0]
+
+
+@pytest.mark.parametrize("bad", ["/a b", "/a\r\nX: y", ""])
+async def test_nothing_else_than_a_path_gets_into_a_header(client, peer, bad):
+    with pytest.raises(ValueError, match="can't be asked for"):
+        await client.post(peer.where, bad, "robot", b"", 1)
+    assert peer.accepted == 0
+
+
+async def test_a_closed_client_calls_nobody(client, peer):
+    await post(client, peer)
+    await client.close()
+    await until(lambda: peer.open == 0, "its connections are closed")
+    with pytest.raises(ConnectionAbortedError):
+        await post(client, peer)

@@ -1,0 +1,76 @@
+"""Recovery of many nodes: what is asked once for all must not be asked once for each."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from tests.integration.http_fake import Answer, Request
+from tests.integration.net import refuses, until, where
+from tests.integration.node import Node
+from tests.integration.proxy import Proxy
+
+NODES = 7
+
+
+@pytest.fixture
+async def nodes(make_node: Any) -> list[Node]:
+    return [await make_node(f"/n{number}") for number in range(NODES)]
+
+
+async def populate(proxy: Proxy, nodes: list[Node]) -> None:
+    for node in nodes:
+        await node.publish(proxy.master, f"{node.name}/out")
+
+
+def slow_down(node: Node, seconds: float) -> None:
+    """Have all answers of a node take so long."""
+    respond = node.slave._respond
+
+    async def slowly(request: Request) -> Answer:
+        await asyncio.sleep(seconds)
+        return await respond(request)
+
+    node.slave._respond = slowly
+
+
+def all_served(proxy: Proxy) -> bool:
+    registry = proxy.app.context.registry
+    return len(registry) == NODES and all(endpoint.trusted for endpoint in registry)
+
+
+async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
+    proxy = await make_proxy(probe_interval=60, probe_timeout=3)
+    await populate(proxy, nodes)
+    for node in nodes:
+        node.calls.clear()
+        slow_down(node, 0.6)  # the keeper looks at them meanwhile
+    await proxy.restart()
+    await until(lambda: all_served(proxy), "all are served")
+    await asyncio.sleep(0.5)  # two looks of the keeper
+    for node in nodes:
+        assert [method for method, _ in node.calls].count("getPublications") == 1
+
+
+async def test_nodes_that_answer_late_are_announced_together(make_proxy, master, nodes):
+    """The whole graph is read for it: for each node, that would be the square of their number."""
+    proxy = await make_proxy(master_interval=60, cleanup_after=60, probe_timeout=0.3)
+    await populate(proxy, nodes)
+    for node in nodes:
+        node.hang = True
+    await proxy.restart()
+    for node in nodes:
+        uri = master.book.nodes[node.name]
+        assert await refuses(where(uri))
+    await asyncio.sleep(0.5)
+    master.delay, before = 0.1, len(master.named("getSystemState"))
+    for node in nodes:
+        node.hang = False
+    await until(lambda: all_served(proxy), "all are served")
+
+    def announced() -> bool:
+        calls = master.named("registerPublisher")
+        return {f"{node.name}/out" for node in nodes} <= {call[1] for call in calls[NODES:]}
+
+    await until(announced, "all are announced")
+    assert len(master.named("getSystemState")) - before < NODES

@@ -1,0 +1,105 @@
+"""What the tests of the kernel plane look at: the proxy's status, and the kernel's own tables."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from tests.ros.lab import Lab
+from tests.ros.processes import Process, wait_until
+from tests.ros.topology import OUT_HOST
+
+TABLE = "rosproxy-11311"
+MARKS = f"{11311 << 16}/0xffff0000"
+LIMIT = 15.0
+"""Seconds."""
+
+
+def status(lab: Lab) -> dict[str, Any]:
+    """The proxy's status."""
+    return json.loads(lab.rosproxy("status", "--json").output)
+
+
+def node_status(lab: Lab, name: str) -> dict[str, Any]:
+    """What the status says of one node."""
+    found = (node for node in status(lab)["nodes"] if f"/{name}" in node["nodes"])
+    return next(found, {"data_plane": {}, "connections": []})
+
+
+def plane_of(lab: Lab, name: str) -> dict[str, Any]:
+    """What the status says of how a node's topics are forwarded."""
+    return node_status(lab, name)["data_plane"]
+
+
+def in_proxy(lab: Lab, *argv: str) -> str:
+    """What a program prints on the proxy's machine."""
+    return lab.run("px", *argv).output
+
+
+def flows(lab: Lab) -> str:
+    """The connections that the kernel forwards for the proxy."""
+    return in_proxy(lab, "conntrack", "-L", "-p", "tcp", "--mark", MARKS)
+
+
+def tables(lab: Lab) -> str:
+    """All tables on the proxy's machine."""
+    return in_proxy(lab, "nft", "list", "tables")
+
+
+def forwarded_ports(lab: Lab) -> list[int]:
+    """The ports that the kernel forwards."""
+    text = in_proxy(lab, "nft", "list", "map", "inet", TABLE, "ports")
+    return [int(port) for port in re.findall(r"(\d+) : \d+", text)]
+
+
+def wait_forwarded(lab: Lab, name: str) -> dict[str, Any]:
+    """Waits until the kernel forwards a node's topics and has counted some; what it says then."""
+
+    def is_forwarded() -> bool:
+        plane = plane_of(lab, name)
+        return plane.get("plane") == "kernel" and plane["connections"] > 0 and plane["sent"] > 0
+
+    wait_until(f"{name} is forwarded by the kernel", is_forwarded, LIMIT)
+    return plane_of(lab, name)
+
+
+def wait_more(receiver: Process, count: int = 10) -> None:
+    """Waits until a subscriber has got more messages than it had."""
+    receiver.wait_for_count("^got ", count, LIMIT, since=receiver.mark())
+
+
+def numbers(receiver: Process) -> list[int]:
+    """The numbers of the messages that a subscriber has got, in the order in which it got them."""
+    return [int(number) for number in re.findall(r"^got \S+ (\d+) ", receiver.output(), re.M)]
+
+
+def refuses(lab: Lab, port: int) -> bool:
+    """Whether a port of the host refuses connections from outside at once."""
+    import socket
+
+    with lab.place("out").entered():
+        try:
+            socket.create_connection((OUT_HOST, port), timeout=2).close()
+        except ConnectionRefusedError:
+            return True
+    return False
+
+
+@contextlib.contextmanager
+def other_proxy(lab: Lab, prefix: tuple[str, ...] = (), path: str = "") -> Iterator[None]:
+    """Runs the proxy in another way; afterwards it is as it was."""
+    assert lab.proxy is not None
+    before = lab.proxy_prefix, lab.proxy_path
+    lab.proxy.stop()
+    lab.proxy_prefix, lab.proxy_path = prefix, path or lab.proxy_path
+    lab.ensure_running()
+    try:
+        yield
+        lab.check_proxy()
+    finally:
+        lab.proxy_prefix, lab.proxy_path = before
+        lab.proxy.stop()
+        lab.ensure_running()
