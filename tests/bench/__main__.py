@@ -32,7 +32,7 @@ class Section(NamedTuple):
 
 
 SECTIONS = {
-    "streams": Section("connections", 3),
+    "streams": Section("connections", 5),
     "control": Section("nodes", 5),
     "nodes": Section("nodes", 1),
     "ros": Section("bytes", 3),

@@ -27,10 +27,12 @@ LATEST = 0.7
 def run(book: Book, rounds: int, quick: bool) -> None:
     sizes = SIZES[:3] if quick else SIZES
     with all_ways(book) as ways:
-        for _ in range(rounds):
+        for number in range(rounds):
+            first = number % len(ways)  # whoever follows a busy one may suffer
+            turns = ways[first:] + ways[:first]
             for size in sizes:
-                in_turn(book, ways, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
-                in_turn(book, ways, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
+                in_turn(book, turns, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
+                in_turn(book, turns, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
     memory(book, 1 if quick else min(rounds, MEMORY_ROUNDS), quick)
 
 
