@@ -7,7 +7,10 @@ import os
 import shutil
 from pathlib import Path
 
-_PROGRAMS = ("roscore", "rostopic", "rosbag", "g++", "pkg-config", "ip", "nft", "unshare")
+_PROGRAMS = (
+    *("roscore", "rostopic", "rosbag", "g++", "pkg-config"),
+    *("ip", "nft", "conntrack", "setcap", "unshare"),
+)
 _FILES = (
     "/usr/include/ros/ros.h",
     "/usr/include/actionlib/TwoIntsAction.h",
