@@ -1,4 +1,4 @@
-# shellcheck shell=sh
+#!/bin/sh
 # Sourced by scripts that install Debian packages: what is missing, and having it installed.
 
 _is_installed() {
