@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
+
+_Way = TypeVar("_Way")
 
 DIRECT = "direct"
 """The path that the others are compared with: without anything in between."""
@@ -116,3 +119,9 @@ class Book:
             key = row["section"], row["row"], row["path"], row["size"]
             book._values[key] = row["values"]
         return book
+
+
+def in_turn(ways: Sequence[_Way], number: int) -> list[_Way]:
+    """The ways in the order of a round: each begins once, as whoever follows a busy one suffers."""
+    first = number % len(ways)
+    return [*ways[first:], *ways[:first]]

@@ -19,6 +19,8 @@ SIZES, QUICK_SIZES = (1, 10, 100, 1000), (1, 10, 100)
 OPTIONS = ("--port-range", "41000-43999", "--log-level", "info", "--cleanup-after", "5")
 FIRST_SLAVE = 50000
 IDLE_SECONDS, QUICK_IDLE_SECONDS = 10.0, 6.0  # probes come every 5 s
+LEAST_NODES = 100
+"""Of fewer, what the process takes and gives back by itself is more than what they take."""
 PATIENCE = 120.0
 PATH = "rosproxy"
 
@@ -50,7 +52,8 @@ def measure(book: Book, machines: World, size: int, idle: float) -> None:
         nodes = crowd(machines, proxy.master, size)
         book.add("registration, s", PATH, seconds_of(nodes), size)
         book.add("CPU when idle, ms/s", PATH, busy(proxy.pid, idle) * 1000, size)
-        book.add("memory per node, KiB", PATH, (resident(proxy.pid) - before) / size, size)
+        if size >= LEAST_NODES:
+            book.add("memory per node, KiB", PATH, (resident(proxy.pid) - before) / size, size)
         proxy.process.kill()
     started = time.perf_counter()
     with machines.proxy("auto", *OPTIONS) as proxy:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.bench.book import DIRECT, Book, loss, percentile
+from tests.bench.book import DIRECT, Book, in_turn, loss, percentile
 from tests.bench.compiled import compiled
 from tests.bench.ways import KERNEL, PLANES, SPLICE, tcpros_address
 from tests.bench.world import INSIDE, MASTER, PROXY, World, world
@@ -72,9 +72,9 @@ class Site(NamedTuple):
 def run(book: Book, rounds: int, quick: bool) -> None:
     with ExitStack() as stack:
         sites = [stack.enter_context(site(name)) for name in (DIRECT, KERNEL, SPLICE)]
-        for _ in range(rounds):
+        for number in range(rounds):
             for kind, pair in itertools.product(KINDS, PAIRS):
-                for one in sites:
+                for one in in_turn(sites, number):
                     measure(book, one, kind, pair, QUICK_SECONDS if quick else SECONDS)
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from tests.bench.book import Book, percentile, smallest_share
+from tests.bench.book import Book, in_turn, percentile, smallest_share
 from tests.bench.compiled import compiled
 from tests.bench.ways import PEERS, PLANES, Way, all_ways
 from tests.bench.world import cpu_seconds, cpu_seconds_of, family, machine_cpu_seconds, resident
@@ -19,6 +19,8 @@ STREAM_SECONDS, PING_SECONDS, QUICK_SECONDS = 0.8, 0.3, 0.3
 MESSAGE = 1024
 STALL_SECONDS = 1.0
 MEMORY_ROUNDS = 2
+LEAST_CONNECTIONS = 10
+"""Of fewer, what the process takes and gives back by itself is more than what they take."""
 GIB = 2**30
 LATEST = 0.7
 """The part of a measurement that has to lie between two readings of CPU time."""
@@ -28,18 +30,17 @@ def run(book: Book, rounds: int, quick: bool) -> None:
     sizes = SIZES[:3] if quick else SIZES
     with all_ways(book) as ways:
         for number in range(rounds):
-            first = number % len(ways)  # whoever follows a busy one may suffer
-            turns = ways[first:] + ways[:first]
+            turns = in_turn(ways, number)
             for size in sizes:
-                in_turn(book, turns, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
-                in_turn(book, turns, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
+                each(book, turns, size, stream, QUICK_SECONDS if quick else STREAM_SECONDS)
+                each(book, turns, size, ping, QUICK_SECONDS if quick else PING_SECONDS)
     memory(book, 1 if quick else min(rounds, MEMORY_ROUNDS), quick)
 
 
 Measure = Callable[[Book, Way, int, float], None]
 
 
-def in_turn(book: Book, ways: list[Way], size: int, measure: Measure, seconds: float) -> None:
+def each(book: Book, ways: list[Way], size: int, measure: Measure, seconds: float) -> None:
     """One measurement of each way; a way that fails it is named, and the others go on."""
     for way in ways:
         try:
@@ -152,7 +153,8 @@ def connections(book: Book, way: Way, sizes: tuple[int, ...]) -> None:
         with wire(way, "hold", size, "/echo") as process:
             expect(process, "connected")
             added = resident(way.pid or 0) - before
-        book.add("memory of a connection, KiB", way.name, added / size, size)
+        if size >= LEAST_CONNECTIONS:
+            book.add("memory of a connection, KiB", way.name, added / size, size)
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.bench import report
-from tests.bench.book import DIRECT, Book, loss, percentile, ratio, smallest_share
+from tests.bench.book import DIRECT, Book, in_turn, loss, percentile, ratio, smallest_share
 from tests.bench.streams import Spent, per_second
 from tests.bench.world import processors
 
@@ -148,3 +148,8 @@ def test_a_page_without_marks_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="results"):
         report.paste(page, tmp_path)
     assert page.read_text() == "text"
+
+
+def test_each_way_begins_a_round_once() -> None:
+    orders = [in_turn("abc", number) for number in range(4)]
+    assert orders == [["a", "b", "c"], ["b", "c", "a"], ["c", "a", "b"], ["a", "b", "c"]]
