@@ -95,7 +95,7 @@ LAYERS = (
     Layer("integration"),
     Layer("ros", 1, ("scripts/install-ros.sh",), debian_root_obstacle),
     Layer("docker", 2, ("scripts/install-docker.sh",), debian_root_obstacle),
-    Layer("chart", 2, ("scripts/install-kubernetes.sh",), debian_root_obstacle),
+    Layer("chart", 1, ("scripts/install-kubernetes.sh",), debian_root_obstacle),
     Layer(
         "kubernetes",
         2,
