@@ -168,7 +168,7 @@ class KernelPlane:
     def tally(self) -> KernelTally:
         """What the metrics say of it."""
         registry = self._context.registry
-        connections = sum(sum(endpoint.fast_peers.values()) for endpoint in registry)
+        connections = sum(endpoint.fast_connections for endpoint in registry)
         return KernelTally(self.usable, connections, self._traffic)
 
     def status(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class KernelPlane:
             "plane": self._user_plane if reason else "kernel",
             "port": None if port is None else self._context.settings.ports.advertised(port),
             "reason": reason,
-            "connections": sum(endpoint.fast_peers.values()),
+            "connections": endpoint.fast_connections,
             "sent": account.sent,
             "received": account.received,
             "sent_rate": round(account.rates[0], 1),

@@ -150,9 +150,9 @@ class StateCollector(Collector):
     def collect(self) -> Iterable[Metric]:
         """All state metrics."""
         pool = self._registry.pool
-        fast = fast_ports.held(self._registry)
+        left, fast = fast_ports.left(self._registry), fast_ports.held(self._registry)
         yield _gauge("leases_used", "Ports held by inside nodes.", len(self._registry))
-        yield _gauge("leases_free", "Ports left for inside nodes.", pool.free + fast)
+        yield _gauge("leases_free", "Ports left for inside nodes.", left)
         yield _gauge("fast_ports", "Of the ports left, those that serve topics meanwhile.", fast)
         yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
         yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())

@@ -84,7 +84,7 @@ def _ports(context: Context) -> dict[str, Any]:
         "listen": str(ports.listen),
         "advertise": str(ports.advertise),
         "used": len(context.registry),
-        "free": pool.free + fast_ports.held(context.registry),
+        "free": fast_ports.left(context.registry),
         "blocked": pool.blocked,
     }
 

@@ -49,7 +49,7 @@ def to_give_back(registry: Registry) -> Endpoint | None:
     Those go on all the same: the kernel keeps forwarding what it has begun to forward.
     """
     holders = [endpoint for endpoint in registry if endpoint.fast_port is not None]
-    return min(holders, key=lambda e: sum(e.fast_peers.values()), default=None)
+    return min(holders, key=lambda e: e.fast_connections, default=None)
 
 
 def why_none(registry: Registry, endpoint: Endpoint) -> str:
@@ -65,3 +65,8 @@ def why_none(registry: Registry, endpoint: Endpoint) -> str:
 def held(registry: Registry) -> int:
     """How many ports are fast ports now."""
     return sum(endpoint.fast_port is not None for endpoint in registry)
+
+
+def left(registry: Registry) -> int:
+    """How many ports are left for nodes: those that are free, and fast ports."""
+    return registry.pool.free + held(registry)

@@ -92,7 +92,7 @@ class Table:
         commands += [self._set(name) for name in _SETS]
         commands += self._chains()
         commands += self._counting({*counted, *forwards})
-        return _document(commands + self._adding(forwards))
+        return _document(commands + self._elements("add", forwards))
 
     def changed(self, change: Changes) -> str:
         """Forwards taken out and put in."""
@@ -100,7 +100,7 @@ class Table:
             [
                 *self._elements("delete", change.removed),
                 *self._counting(change.added),
-                *self._adding(change.added),
+                *self._elements("add", change.added),
             ]
         )
 
@@ -142,9 +142,6 @@ class Table:
         out, into = _counted(sent), _counted(received)
         ports = {mark: self.marks.port(mark) for mark in out | into}
         return {p: (out.get(m, 0), into.get(m, 0)) for m, p in ports.items() if p is not None}
-
-    def _adding(self, forwards: Forwards) -> list[Json]:
-        return self._elements("add", forwards)
 
     def _elements(self, verb: str, forwards: Forwards) -> list[Json]:
         wanted = {name: {} for name in _MAPS}  # type: dict[str, dict[int, Json]]

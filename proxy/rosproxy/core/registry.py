@@ -137,6 +137,11 @@ class Endpoint:
         return bool(self.connections or self.fast_peers)
 
     @property
+    def fast_connections(self) -> int:
+        """How many connections the kernel forwards now."""
+        return sum(self.fast_peers.values())
+
+    @property
     def idle(self) -> bool:
         """Whether nothing is registered, nobody is connected and no call is under way."""
         return not (self.registrations or self.connected or self.pending)

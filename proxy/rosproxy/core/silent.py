@@ -142,7 +142,7 @@ def _not_forwarded(
     for one in group:
         hosts.setdefault(frozenset(addresses.get(one.caller_id, ())), []).append(one)
     if not any(host & endpoint.fast_peers.keys() for host in hosts):
-        return _short_of(sum(endpoint.fast_peers.values()), group, rows)
+        return _short_of(endpoint.fast_connections, group, rows)
     return [
         one
         for host, mine in hosts.items()
