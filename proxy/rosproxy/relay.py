@@ -28,6 +28,16 @@ LARGE_PIPES = 16
 """Pipes of that size at the same time; with more streams the CPU is busy, and each turn shorter."""
 SHARED_PIPE = 256 * 1024
 """Bytes that each further pipe should hold: an unprivileged user has 64 MiB for all of them."""
+CROWD = 128
+"""Directions that move many bytes at the same time before they have to share memory."""
+SHARED_RECEIVE = 128 * 1024
+SHARED_SEND = 208 * 1024
+"""Bytes of a socket's buffers in a crowd, of which Linux makes twice as much.
+
+Left alone each grows to several MiB; a thousand of them reach the limit of all TCP connections of
+the machine (tcp_mem), from where on Linux drops packets and sends by the page. The larger one is
+what Linux grants to anyone (wmem_max).
+"""
 LEAST_PIPE = 64 * 1024
 """A pipe that holds fewer bytes is not spliced through."""
 BLOCK_SIZE = 128 * 1024
@@ -197,6 +207,7 @@ class _Pump:
     ) -> None:
         self._source, self._target, self._count = source, target, count
         self._may_splice = may_splice and hasattr(os, "splice")
+        self._shares = False
 
     def run(self) -> None:
         while self._copy() and self._bulk():
@@ -217,10 +228,20 @@ class _Pump:
 
         The pipe is held no longer than that: pipes are scarce for an unprivileged user.
         """
-        if not self._may_splice:
-            return self._copy_blocks()
-        with _PIPES.borrow() as pipe:
-            return self._splice(*pipe) if pipe else self._copy_blocks()
+        with _CROWD.joined(self) as size:
+            if not self._may_splice:
+                return self._copy_blocks()
+            with _pipe(PIPE_SIZE if size <= LARGE_PIPES else SHARED_PIPE) as pipe:
+                return self._splice(*pipe) if pipe else self._copy_blocks()
+
+    def share_memory(self) -> None:
+        """Bound what the kernel holds for this direction, for as long as it is open."""
+        if self._shares:
+            return
+        self._shares = True
+        with contextlib.suppress(OSError):  # closed in the meantime: another thread asks
+            self._source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SHARED_RECEIVE)
+            self._target.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SHARED_SEND)
 
     def _splice(self, read_end: int, write_end: int) -> bool:
         source, target = self._source.fileno(), self._target.fileno()
@@ -243,44 +264,55 @@ class _Pump:
         return False
 
 
-class _Pipes:
-    """The pipes of all relays."""
+@contextlib.contextmanager
+def _pipe(size: int) -> Iterator[tuple[int, int] | None]:
+    """A pipe that is worth splicing through, or None.
 
-    def __init__(self) -> None:
-        self._lock, self._held = threading.Lock(), 0
-
-    @contextlib.contextmanager
-    def borrow(self) -> Iterator[tuple[int, int] | None]:
-        """A pipe that is worth splicing through, or None.
-
-        An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they
-        hold two pages each, and copying is faster.
-        """
-        try:
-            ends = os.pipe()
-        except OSError as error:  # no file descriptor left
-            log.debug("no pipe: %s", error)
-            yield None
-            return
-        size = self._take()
-        try:
-            with contextlib.suppress(OSError):
-                fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, size)
-            yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
-        finally:
-            self._give_back(*ends)
-
-    def _take(self) -> int:
-        """The size of one more pipe."""
-        with self._lock:
-            self._held += 1
-            return PIPE_SIZE if self._held <= LARGE_PIPES else SHARED_PIPE
-
-    def _give_back(self, *ends: int) -> None:
-        with self._lock:
-            self._held -= 1
+    An unprivileged user has pages for some pipes (pipe-user-pages-soft); beyond that they hold
+    two pages each, and copying is faster.
+    """
+    try:
+        ends = os.pipe()
+    except OSError as error:  # no file descriptor left
+        log.debug("no pipe: %s", error)
+        yield None
+        return
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.fcntl(ends[1], fcntl.F_SETPIPE_SZ, size)
+        yield ends if fcntl.fcntl(ends[1], fcntl.F_GETPIPE_SZ) >= LEAST_PIPE else None
+    finally:
         for end in ends:
             os.close(end)
 
 
-_PIPES = _Pipes()
+class _Crowd:
+    """The directions that move many bytes at the moment."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pumps: set[_Pump] = set()
+
+    @contextlib.contextmanager
+    def joined(self, pump: _Pump) -> Iterator[int]:
+        """How many there are with this one; in a crowd all of them share memory."""
+        with self._lock:
+            self._pumps.add(pump)
+            size = len(self._pumps)
+            sharing = self._sharing(pump)
+        try:
+            for one in sharing:
+                one.share_memory()
+            yield size
+        finally:
+            with self._lock:
+                self._pumps.discard(pump)
+
+    def _sharing(self, new: _Pump) -> list[_Pump]:
+        """Who has to share from now on: all when the crowd comes about, then each new one."""
+        if len(self._pumps) <= CROWD:
+            return []
+        return list(self._pumps) if len(self._pumps) == CROWD + 1 else [new]
+
+
+_CROWD = _Crowd()

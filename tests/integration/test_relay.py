@@ -343,6 +343,51 @@ async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
     assert set(sizes) == {relay.PIPE_SIZE, relay.SHARED_PIPE}
 
 
+@pytest.mark.parametrize("plane", ["splice", "copy"])
+async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
+    make_proxy, node, monkeypatch, plane
+):
+    """At 1,000 saturated streams Linux dropped packets, and some streams got nothing."""
+    monkeypatch.setattr(relay, "CROWD", 1)
+    proxy = await make_proxy(data_plane=plane)
+    await node.publish(proxy.master)
+    async with AsyncExitStack() as stack:
+        streams = [await stack.enter_async_context(relayed(node, proxy.lease(node)))]
+        floods = [asyncio.create_task(flood(streams[0]))]
+        await until(lambda: buffers(proxy) != set(), "a stream runs")
+        assert buffers(proxy) != {SHARED}
+        streams.append(await stack.enter_async_context(relayed(node, proxy.lease(node))))
+        floods.append(asyncio.create_task(flood(streams[1])))
+        await until(lambda: buffers(proxy) == {SHARED}, "both share")
+        assert await asyncio.gather(*floods) == [FLOOD, FLOOD]
+    await quiet(proxy)
+
+
+SHARED = (2 * relay.SHARED_RECEIVE, 2 * relay.SHARED_SEND)
+"""Linux doubles what is asked for."""
+FLOOD = 100_000_000
+
+
+async def flood(ends: Ends) -> int:
+    """Many bytes from inside; how many arrive outside, where nobody hurries."""
+    sending = asyncio.create_task(ends.inside.send(bytes(FLOOD)))
+    await asyncio.sleep(1)
+    size = len(await ends.outside.exactly(FLOOD))
+    await sending
+    return size
+
+
+def buffers(proxy: Any) -> set[tuple[int, int]]:
+    """The sizes of the buffers towards outside of all relays, as (receive, send)."""
+    return {
+        (
+            one.inside.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF),
+            one.outside.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF),
+        )
+        for one in proxy.app._tcpros.relays
+    }
+
+
 async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):
     """An unprivileged user's pipes shrink to two pages; splicing through them would crawl."""
     monkeypatch.setattr(relay, "LEAST_PIPE", 2 * relay.PIPE_SIZE)
