@@ -170,6 +170,8 @@ async def _answer(handler: ResponseHandler) -> bytes:
 
 async def read_bounded(stream: aiohttp.StreamReader) -> bytes:
     """All of a body. Raises ValueError if it is longer than MAX_BODY."""
+    if stream.is_eof() and stream.total_bytes <= MAX_BODY:
+        return stream.read_nowait()
     parts, size = list[bytes](), 0
     while not stream.at_eof():
         part = stream.read_nowait() if stream.is_eof() else await stream.readany()

@@ -27,12 +27,15 @@ class Value:
     inner: tuple[int, int] = (0, 0)
     items: list["Value"] = field(default_factory=list)
     members: list[str] = field(default_factory=list)
+    _text: str | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def text(self) -> str:
         """The text of a scalar, with entities and CDATA resolved."""
-        start, end = self.inner
-        return text_of(self.body[start:end], self.encoding)
+        if self._text is None:
+            start, end = self.inner
+            self._text = text_of(self.body[start:end], self.encoding)
+        return self._text
 
     @property
     def raw(self) -> bytes:
