@@ -9,6 +9,7 @@ from tests.docker.nodes import LIBRARIES, Log
 from tests.kubernetes.pods import Namespace, Pod, namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import RosProxy, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 NODES = ("node1", "node2")
 PLACES = [(library, on) for library in LIBRARIES for on in NODES]
@@ -35,6 +36,7 @@ def world(_release: None, robot: Robot) -> Iterator[World]:
     """Everything at once, so that it is waited for once."""
     with namespace() as net:
         made = World(rosproxy(net.name, master={"uri": robot.master_uri}))
+        wait_for_service(net)
         for library, on in PLACES:
             _start(made, net, robot, library, on)
         yield made
@@ -53,7 +55,7 @@ def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> 
     robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/for_{mark}", "--word", "robot")
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "far", on=other)
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "near", on=on)
-    patience = ("--count", "5", "--patience", "60")
+    patience = ("--count", "5", "--patience", str(START))
     made.replies[place] = robot.node(
         f"caller_{mark}", library, "call", "--service", f"/serve_{mark}", *patience
     )
@@ -65,24 +67,24 @@ def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> 
 
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_robot_hears_a_pod(library: str, on: str, world: World) -> None:
-    world.heard[library, on].wait_for("inside", seconds=90)
+    world.heard[library, on].wait_for("inside", seconds=START)
 
 
 @pytest.mark.parametrize("word", ["robot", "far", "near"])
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_pod_hears(word: str, library: str, on: str, world: World) -> None:
     """The robot, a pod of the other node, a pod of its own node."""
-    world.ears[library, on].log.wait_for(word, seconds=60)
+    world.ears[library, on].log.wait_for(word, seconds=START)
 
 
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_robot_calls_a_pod(library: str, on: str, world: World) -> None:
-    world.replies[library, on].wait_for("ask", 5, seconds=60, verb="reply")
+    world.replies[library, on].wait_for("ask", 5, seconds=START, verb="reply")
 
 
 @pytest.mark.parametrize(("library", "on"), PLACES)
 def test_pod_calls_the_robot(library: str, on: str, world: World) -> None:
-    world.callers[library, on].log.wait_for("ask", 5, seconds=60, verb="reply")
+    world.callers[library, on].log.wait_for("ask", 5, seconds=START, verb="reply")
 
 
 def test_master_knows_pods_by_their_own_node(world: World, robot: Robot) -> None:

@@ -15,6 +15,9 @@ from tests.kubernetes.pods import Namespace, Pod, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import PROXY_OF
 
+START = 120
+"""Seconds that pods and the robot's nodes get to start and to find each other, all at once."""
+
 
 @dataclass(frozen=True)
 class Flow:
@@ -53,7 +56,7 @@ class Flow:
 @contextmanager
 def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Iterator[Flow]:
     """Twenty messages a second both ways, and as many calls."""
-    wait_until(lambda: _is_known(net.name), 60, f"kube-proxy knows the Service in {net.name}")
+    wait_for_service(net)
     mark = unique("flow").replace("-", "_")
     out, back, service = f"/out_{mark}", f"/in_{mark}", f"/serve_{mark}"
     talker = net.node(library, "pub", "--topic", out, "--word", "inside", on=on)
@@ -62,15 +65,20 @@ def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Itera
     names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
     outward = robot.node(names[0], library, "sub", "--topic", out)
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
-    call = ("call", "--service", service, "--count", "100000", "--patience", "60")
+    call = ("call", "--service", service, "--count", "100000", "--patience", str(START))
     replies = robot.node(names[2], library, *call)
     try:
         found = Flow(talker, listener, server, outward, replies)
-        found.wait(seconds=60)
+        found.wait(seconds=START)
         yield found
     finally:
         for name in names:
             robot.end(name)
+
+
+def wait_for_service(net: Namespace) -> None:
+    """Wait until a pod that starts finds the proxy: what connects before is not answered."""
+    wait_until(lambda: _is_known(net.name), 60, f"kube-proxy knows the Service in {net.name}")
 
 
 def _is_known(namespace: str) -> bool:
