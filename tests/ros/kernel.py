@@ -18,6 +18,16 @@ LIMIT = 15.0
 """Seconds."""
 
 
+def talk(lab: Lab, library: str = "rospy", sink: str = "rospy") -> tuple[str, Process, Process]:
+    """A publisher inside and a subscriber outside, connected: name and processes."""
+    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    sender = lab.node(library, "c1", "pub", name=name, topic=topic, rate=50)
+    lab.wait_registered(name)
+    receiver = lab.node(sink, "out", "sub", topic=topic)
+    receiver.wait_for_count("^got ", 5, LIMIT)
+    return name, sender, receiver
+
+
 def status(lab: Lab) -> dict[str, Any]:
     """The proxy's status."""
     return json.loads(lab.rosproxy("status", "--json").output)
@@ -39,9 +49,9 @@ def in_proxy(lab: Lab, *argv: str) -> str:
     return lab.run("px", *argv).output
 
 
-def flows(lab: Lab) -> str:
+def flows(lab: Lab, family: str = "ipv4") -> str:
     """The connections that the kernel forwards for the proxy."""
-    return in_proxy(lab, "conntrack", "-L", "-p", "tcp", "--mark", MARKS)
+    return in_proxy(lab, "conntrack", "-L", "-f", family, "-p", "tcp", "--mark", MARKS)
 
 
 def tables(lab: Lab) -> str:
@@ -76,16 +86,28 @@ def numbers(receiver: Process) -> list[int]:
     return [int(number) for number in re.findall(r"^got \S+ (\d+) ", receiver.output(), re.M)]
 
 
-def refuses(lab: Lab, port: int) -> bool:
+def refuses(lab: Lab, port: int, host: str = OUT_HOST) -> bool:
     """Whether a port of the host refuses connections from outside at once."""
     import socket
 
     with lab.place("out").entered():
         try:
-            socket.create_connection((OUT_HOST, port), timeout=2).close()
+            socket.create_connection((host, port), timeout=2).close()
         except ConnectionRefusedError:
             return True
     return False
+
+
+@contextlib.contextmanager
+def dropping(lab: Lab) -> Iterator[None]:
+    """A filter that the proxy can't know of drops what the kernel forwards."""
+    block = "table inet block { chain forward { type filter hook forward priority 10; "
+    block += "ct status dnat ct state new drop; }; }"
+    in_proxy(lab, "nft", block)
+    try:
+        yield
+    finally:
+        in_proxy(lab, "nft", "delete", "table", "inet", "block")
 
 
 @contextlib.contextmanager

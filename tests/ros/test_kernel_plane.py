@@ -14,9 +14,9 @@ import pytest
 
 from tests.ros import kernel
 from tests.ros.combinations import LIBRARIES, each_library, each_pair
-from tests.ros.kernel import LIMIT
+from tests.ros.kernel import LIMIT, talk
 from tests.ros.lab import SYSTEM_PATH, Lab
-from tests.ros.processes import Process, wait_until
+from tests.ros.processes import wait_until
 from tests.ros.topology import SHARED
 
 pytestmark = pytest.mark.boundary
@@ -24,16 +24,6 @@ pytestmark = pytest.mark.boundary
 PLAN = replace(SHARED, name="w", forwarding=True)
 PROXY_OPTIONS = ("--probe-interval", "0.5", "--linger", "1")
 PRIVILEGE = "net_admin"
-
-
-def talk(lab: Lab, library: str = "rospy", sink: str = "rospy") -> tuple[str, Process, Process]:
-    """A publisher inside and a subscriber outside, connected: name and processes."""
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
-    sender = lab.node(library, "c1", "pub", name=name, topic=topic, rate=50)
-    lab.wait_registered(name)
-    receiver = lab.node(sink, "out", "sub", topic=topic)
-    receiver.wait_for_count("^got ", 5, LIMIT)
-    return name, sender, receiver
 
 
 @each_pair("publisher", "subscriber")
@@ -124,19 +114,13 @@ def test_a_table_that_somebody_removed_is_made_again(lab: Lab) -> None:
 
 
 def test_a_node_that_does_not_answer_the_kernel_is_served_by_the_proxy(lab: Lab) -> None:
-    """A filter that the proxy can't know of drops what the kernel forwards."""
-    block = "table inet block { chain forward { type filter hook forward priority 10; "
-    block += "ct status dnat ct state new drop; }; }"
     topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
     lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
     lab.wait_registered(name)
-    kernel.in_proxy(lab, "nft", block)
-    try:
+    with kernel.dropping(lab):
         receiver = lab.node("roscpp", "out", "sub", topic=topic)
         receiver.wait_for_count("^got ", 5, 2 * LIMIT)
         seen = kernel.node_status(lab, name)
-    finally:
-        kernel.in_proxy(lab, "nft", "delete", "table", "inet", "block")
     assert seen["data_plane"]["plane"] == "splice"
     assert "nothing came back" in seen["data_plane"]["reason"]
     assert topic in [connection["name"] for connection in seen["connections"]]

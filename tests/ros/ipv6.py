@@ -1,0 +1,80 @@
+"""Machines that have IPv6 and nothing else: the proxy's machine itself is the boundary.
+
+    out (roscore, outside nodes) -- px -- c1
+
+Neither end has a route to the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from tests.ros.lab import Lab
+from tests.ros.topology import (
+    ADVERTISED_NAME,
+    MASTER_PORT,
+    SHARED,
+    Place,
+    Topology,
+    _ip,
+    _run,
+)
+
+PLAN = replace(SHARED, name="v", networks=(("c1",),), forwarding=True)
+ADDRESSES = {"out": "fd77::2", "c1": "fd30::11"}
+PROXY_ADDRESSES = {"out": "fd77::1", "c1": "fd30::1"}
+
+
+class Topology6(Topology):
+    """The machines with IPv6."""
+
+    def __init__(self) -> None:
+        super().__init__(PLAN)
+        del self.places["host"]
+
+    def build(self) -> None:
+        """Lays out every namespace, link and hosts file."""
+        for place in self.places.values():
+            _ip("netns", "add", place.namespace)
+            _ip("-n", place.namespace, "link", "set", "lo", "up")
+        for role in ADDRESSES:
+            self._join(role)
+        enter = ("ip", "netns", "exec", self.places["px"].namespace)
+        _run(*enter, "sysctl", "-q", "-w", "net.ipv6.conf.all.forwarding=1")
+        for place in self.places.values():
+            self._write_names(place)
+
+    def _join(self, role: str) -> None:
+        place, proxy = self.places[role], self.places["px"]
+        peer = ("peer", "name", "eth0", "netns", place.namespace)
+        _ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
+        _address(place, "eth0", ADDRESSES[role])
+        _address(proxy, f"{role}0", PROXY_ADDRESSES[role])
+
+    def _known_names(self, place: Place) -> Iterator[tuple[str, str]]:
+        yield place.address, place.hostname
+        if place.role in ("out", "px"):
+            yield ADDRESSES["out"], "robot"
+            yield PROXY_ADDRESSES["out"], ADVERTISED_NAME
+        if place.role == "c1":
+            yield PROXY_ADDRESSES["c1"], "rosproxy"
+
+
+class Lab6(Lab):
+    """A lab whose nodes and roscore speak IPv6."""
+
+    def environment(self, role: str) -> dict[str, str]:
+        """All that a ROS program on this machine gets."""
+        return super().environment(role) | {"ROS_IPV6": "on"}
+
+    def master_address(self, role: str) -> tuple[str, int]:
+        """Where a machine finds its master."""
+        return (PROXY_ADDRESSES if role == "c1" else ADDRESSES)[role], MASTER_PORT
+
+
+def _address(place: Place, device: str, address: str) -> None:
+    # Without duplicate address detection it can be used at once.
+    _ip("-n", place.namespace, "addr", "add", f"{address}/64", "dev", device, "nodad")
+    _ip("-n", place.namespace, "link", "set", device, "up")
+    place.addresses.append(address)
