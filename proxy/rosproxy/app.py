@@ -148,7 +148,7 @@ class App:
         return self._watch.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
-        return await probe_range(self.context)
+        return await probe_range(self.context, self._leases)
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""

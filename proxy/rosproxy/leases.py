@@ -2,7 +2,8 @@
 
 import logging
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
 from rosproxy.acceptor import Acceptor
@@ -131,6 +132,23 @@ class Leases:
         self._plane.tell(endpoint)
         return None
 
+    @asynccontextmanager
+    async def lent(self, order: Iterable[int]) -> AsyncIterator[int | None]:
+        """A port that no node needs meanwhile; None if there is none.
+
+        It is the first in an order that is free, else a fast port: whose that was gets it again
+        when a subscriber next asks.
+        """
+        pool = self._context.registry.pool
+        port = next(filter(pool.claim, order), None) or self._claim_fast_port()
+        try:
+            if port is not None:
+                await self._plane.cleared(port)
+            yield port
+        finally:
+            if port is not None:
+                pool.give_back(port)
+
     def end(self, endpoint: Endpoint) -> None:
         """End a lease: close its port and forget its endpoint."""
         registry = self._context.registry
@@ -209,19 +227,30 @@ class Leases:
 
     def _make_room(self) -> bool:
         """Take a port back that is needed least, if there is one: a fast port, or an idle lease."""
-        registry = self._context.registry
-        holder = fast_ports.to_give_back(registry)
-        if holder is not None:
-            self._refuse(holder.fast_port)
-            log.info("%s: port %s is needed as a lease", holder.label, holder.fast_port)
-            fast_ports.give_back(registry, holder)
-            self._plane.wake(holder)
-            self._on_short(holder)
+        if self._give_fast_port_back() is not None:
             return True
-        oldest = registry.reclaimable()
+        oldest = self._context.registry.reclaimable()
         if oldest is not None:
             self.end(oldest)
         return oldest is not None
+
+    def _claim_fast_port(self) -> int | None:
+        port = self._give_fast_port_back()
+        return port if port is not None and self._context.registry.pool.claim(port) else None
+
+    def _give_fast_port_back(self) -> int | None:
+        """Give back the fast port that is needed least, and tell which it was; None: none left."""
+        registry = self._context.registry
+        holder = fast_ports.to_give_back(registry)
+        if holder is None:
+            return None
+        port = holder.fast_port
+        self._refuse(port)
+        log.info("%s: port %s is needed otherwise", holder.label, port)
+        fast_ports.give_back(registry, holder)
+        self._plane.wake(holder)
+        self._on_short(holder)
+        return port
 
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""

@@ -19,6 +19,7 @@ from rosproxy.acceptor import Acceptor
 from rosproxy.context import Context
 from rosproxy.core import xmlrpc
 from rosproxy.core.uris import HostPort, slave_uri
+from rosproxy.leases import Leases
 from rosproxy.names import resolve
 from rosproxy.upstream import CALLER_ID, Unreachable
 
@@ -62,8 +63,8 @@ class _Trial:
         return self.masters.encode() in seen or self.mine.encode() in seen
 
 
-async def probe_range(context: Context) -> dict[str, Any]:
-    """Try the lowest and the highest free port of the range.
+async def probe_range(context: Context, leases: Leases) -> dict[str, Any]:
+    """Try the lowest and the highest free port of the range; where none is free, one fast port.
 
     ``probes`` holds for each its ``port``, the ``advertised`` address and two outcomes.
     ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
@@ -76,13 +77,10 @@ async def probe_range(context: Context) -> dict[str, Any]:
     pool, ports = context.registry.pool, context.settings.ports.listen.ports()
     probes: list[dict[str, Any]] = []
     for order in (ports, reversed(ports)):
-        port = next(filter(pool.claim, order), None)
-        if port is None:
-            break
-        try:
+        async with leases.lent(order) as port:
+            if port is None:
+                break
             probes.append(await _try(context, _Trial(port, context.addressing.outside(port))))
-        finally:
-            pool.give_back(port)
         if probes[0]["from_master"] == "missed" or pool.free == 1:
             break
     return {"probes": probes}

@@ -4,11 +4,12 @@ from typing import Any
 
 import pytest
 
-from rosproxy import kernel_plane
+from rosproxy import kernel_plane, kernel_targets
 from rosproxy.core import kernel_plane as decisions
 from rosproxy.core.kernel_plane import World
-from rosproxy.kernel_plane import KernelPlane
+from rosproxy.kernel_targets import KernelTargets
 from rosproxy.kernel_tools import Tools
+from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import NODE, OTHER_NODE, THIRD_NODE, Where, refuses, rpc, until
 from tests.integration.node import greet, topic_header
@@ -26,8 +27,8 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
 
     monkeypatch.setattr(kernel_plane, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(kernel_plane, "forwarding", World)
-    monkeypatch.setattr(KernelPlane, "_is_own", lambda plane, address: False)
+    monkeypatch.setattr(kernel_targets, "forwarding", World)
+    monkeypatch.setattr(KernelTargets, "_is_own", lambda targets, address: False)
     monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
     return made
 
@@ -104,6 +105,26 @@ async def test_fast_ports_go_before_a_node_is_refused(make_proxy, make_node, ker
     for node in nodes:
         assert await ask(proxy, node) == proxy.lease(node)
         assert (await greet(proxy.lease(node), topic_header()))["callerid"] == node.name
+
+
+async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
+    make_proxy, make_node, kernel, monkeypatch
+):
+    """They counted as taken: nothing was tried."""
+    monkeypatch.setattr("rosproxy.range_probe.MASTER_WAIT", 0.3)
+    proxy = await make_proxy(data_plane="auto", ports=4)
+    nodes = [await make_node("/a"), await make_node("/b", OTHER_NODE)]
+    for node in nodes:
+        await node.publish(proxy.master)
+        await ask(proxy, node)
+    lost, kept = kernel.forwards
+    told = await tell(proxy, "/probe")
+    assert [(p["port"], p["from_proxy"]) for p in told["probes"]] == [(lost, "ok")]
+    assert set(kernel.forwards) == {kept}
+    assert proxy.app.status()["ports"]["free"] == 2
+    for node in nodes:
+        assert (await ask(proxy, node))[1] == proxy.lease(node)[1] + 2
+    assert set(kernel.forwards) == {lost, kept}
 
 
 async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node, kernel, caplog):

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy import kernel_plane
+from rosproxy import kernel_plane, kernel_targets
 from rosproxy.context import Context, make_context
 from rosproxy.core import fast_ports
 from rosproxy.core.kernel_plane import World
@@ -75,7 +75,7 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> None:
         return None
 
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(kernel_plane, "forwarding", World)
+    monkeypatch.setattr(kernel_targets, "forwarding", World)
 
 
 @pytest.fixture
