@@ -16,6 +16,7 @@ they pass then: each of those is a bug to be found, in a test or in what it test
 
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -200,6 +201,8 @@ def chosen(names: list[str]) -> list[Layer]:
 
 
 def main() -> int:
+    # In the background a shell has it ignored, and programs under test inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     outcomes = run_all(chosen(sys.argv[1:]))
     print(summary(outcomes))
     return 0 if all(outcome.good for outcome in outcomes) else 1

@@ -17,8 +17,8 @@ from tests.ros.topology import (
     SHARED,
     Place,
     Topology,
-    _ip,
-    _run,
+    ip,
+    run_command,
 )
 
 PLAN = replace(SHARED, name="v", networks=(("c1",),), forwarding=True)
@@ -36,19 +36,19 @@ class Topology6(Topology):
     def build(self) -> None:
         """Lays out every namespace, link and hosts file."""
         for place in self.places.values():
-            _ip("netns", "add", place.namespace)
-            _ip("-n", place.namespace, "link", "set", "lo", "up")
+            ip("netns", "add", place.namespace)
+            ip("-n", place.namespace, "link", "set", "lo", "up")
         for role in ADDRESSES:
             self._join(role)
         enter = ("ip", "netns", "exec", self.places["px"].namespace)
-        _run(*enter, "sysctl", "-q", "-w", "net.ipv6.conf.all.forwarding=1")
+        run_command(*enter, "sysctl", "-q", "-w", "net.ipv6.conf.all.forwarding=1")
         for place in self.places.values():
             self._write_names(place)
 
     def _join(self, role: str) -> None:
         place, proxy = self.places[role], self.places["px"]
         peer = ("peer", "name", "eth0", "netns", place.namespace)
-        _ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
+        ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
         _address(place, "eth0", ADDRESSES[role])
         _address(proxy, f"{role}0", PROXY_ADDRESSES[role])
 
@@ -75,6 +75,6 @@ class Lab6(Lab):
 
 def _address(place: Place, device: str, address: str) -> None:
     # Without duplicate address detection it can be used at once.
-    _ip("-n", place.namespace, "addr", "add", f"{address}/64", "dev", device, "nodad")
-    _ip("-n", place.namespace, "link", "set", device, "up")
+    ip("-n", place.namespace, "addr", "add", f"{address}/64", "dev", device, "nodad")
+    ip("-n", place.namespace, "link", "set", device, "up")
     place.addresses.append(address)

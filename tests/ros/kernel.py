@@ -98,6 +98,17 @@ def refuses(lab: Lab, port: int, host: str = OUT_HOST) -> bool:
     return False
 
 
+def status_of_unanswered(lab: Lab) -> tuple[str, dict[str, Any]]:
+    """A topic that a subscriber gets though nothing comes back through the kernel; its node."""
+    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
+    lab.wait_registered(name)
+    with dropping(lab):
+        receiver = lab.node("roscpp", "out", "sub", topic=topic)
+        receiver.wait_for_count("^got ", 5, 2 * LIMIT)
+        return topic, node_status(lab, name)
+
+
 @contextlib.contextmanager
 def dropping(lab: Lab) -> Iterator[None]:
     """A filter that the proxy can't know of drops what the kernel forwards."""

@@ -114,13 +114,7 @@ def test_a_table_that_somebody_removed_is_made_again(lab: Lab) -> None:
 
 
 def test_a_node_that_does_not_answer_the_kernel_is_served_by_the_proxy(lab: Lab) -> None:
-    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
-    lab.node("roscpp", "c1", "pub", name=name, topic=topic, rate=50)
-    lab.wait_registered(name)
-    with kernel.dropping(lab):
-        receiver = lab.node("roscpp", "out", "sub", topic=topic)
-        receiver.wait_for_count("^got ", 5, 2 * LIMIT)
-        seen = kernel.node_status(lab, name)
+    topic, seen = kernel.status_of_unanswered(lab)
     assert seen["data_plane"]["plane"] == "splice"
     assert "nothing came back" in seen["data_plane"]["reason"]
     assert topic in [connection["name"] for connection in seen["connections"]]

@@ -132,8 +132,8 @@ class Topology:
     def build(self) -> None:
         """Lays out every namespace, link, route, rule and hosts file."""
         for place in self.places.values():
-            _ip("netns", "add", place.namespace)
-            _ip("-n", place.namespace, "link", "set", "lo", "up")
+            ip("netns", "add", place.namespace)
+            ip("-n", place.namespace, "link", "set", "lo", "up")
         self._join_outside()
         for number, members in enumerate(self.plan.networks, start=1):
             self._join_inside(number, members)
@@ -152,7 +152,7 @@ class Topology:
         self._link("out", "eth0", "out0", f"{OUT_NODE}/24")
         self._on_host("addr", "add", f"{OUT_HOST}/24", "dev", "out0")
         # A route to inside exists on purpose: what stops outside is the host's policy.
-        _ip("-n", self.places["out"].namespace, "route", "add", "default", "via", OUT_HOST)
+        ip("-n", self.places["out"].namespace, "route", "add", "default", "via", OUT_HOST)
         self.places["host"].addresses.append(OUT_HOST)
 
     def _join_inside(self, number: int, members: tuple[str, ...]) -> None:
@@ -168,19 +168,19 @@ class Topology:
             self._on_host("link", "set", port, "master", bridge)
             if device == "eth0":
                 gateway = ("default", "via", f"{subnet}.1")
-                _ip("-n", self.places[role].namespace, "route", "add", *gateway)
+                ip("-n", self.places[role].namespace, "route", "add", *gateway)
 
     def _link(self, role: str, device: str, host_device: str, address: str) -> None:
         place = self.places[role]
         peer = ("peer", "name", device, "netns", place.namespace)
         self._on_host("link", "add", host_device, "type", "veth", *peer)
         self._on_host("link", "set", host_device, "up")
-        _ip("-n", place.namespace, "addr", "add", address, "dev", device)
-        _ip("-n", place.namespace, "link", "set", device, "up")
+        ip("-n", place.namespace, "addr", "add", address, "dev", device)
+        ip("-n", place.namespace, "link", "set", device, "up")
         place.addresses.append(address.partition("/")[0])
 
     def _on_host(self, *arguments: str) -> None:
-        _ip("-n", self.places["host"].namespace, *arguments)
+        ip("-n", self.places["host"].namespace, *arguments)
 
     def _load_rules(self) -> None:
         host = self.places["host"].namespace
@@ -188,16 +188,16 @@ class Topology:
         self._forward("px", self.plan.forwarding or os.environ.get("ROS_TESTS_KERNEL") == "1")
         if not self.plan.flat:
             rules = _rules(self.plan, self.places["px"].address)
-            _run("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
+            run_command("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
     def _forward(self, role: str, forwards: bool) -> None:
         enter = ("ip", "netns", "exec", self.places[role].namespace)
-        _run(*enter, "sysctl", "-q", "-w", f"net.ipv4.ip_forward={forwards:d}")
+        run_command(*enter, "sysctl", "-q", "-w", f"net.ipv4.ip_forward={forwards:d}")
 
     def _keep_ports_free(self) -> None:
         """Keeps the proxy's own connections off the ports that nodes on the robot may have."""
         enter = ("ip", "netns", "exec", self.places["px"].namespace)
-        _run(*enter, "sysctl", "-q", "-w", "net.ipv4.ip_local_port_range=1024 11000")
+        run_command(*enter, "sysctl", "-q", "-w", "net.ipv4.ip_local_port_range=1024 11000")
 
     def _write_names(self, place: Place) -> None:
         folder = _NETNS_ETC / place.namespace
@@ -254,7 +254,7 @@ def _rules(plan: Plan, proxy: str) -> str:
 
 def remove_leftovers() -> None:
     """Takes away the namespaces of runs whose process is gone, killed before it could."""
-    listed = _run("ip", "netns", "list")
+    listed = run_command("ip", "netns", "list")
     for namespace in re.findall(rf"^({_PREFIX}\d+\w-\w+)", listed, re.MULTILINE):
         pid = int(re.findall(r"\d+", namespace)[0])
         if not Path(f"/proc/{pid}").exists():
@@ -264,13 +264,13 @@ def remove_leftovers() -> None:
 def _remove_namespace(namespace: str) -> None:
     if Path(f"/run/netns/{namespace}").exists():
         _kill_all(namespace)
-        _ip("netns", "del", namespace)
+        ip("netns", "del", namespace)
     shutil.rmtree(_NETNS_ETC / namespace, ignore_errors=True)
 
 
 def _kill_all(namespace: str) -> None:
     deadline = time.monotonic() + 5
-    while pids := _run("ip", "netns", "pids", namespace).split():
+    while pids := run_command("ip", "netns", "pids", namespace).split():
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(int(pid), signal.SIGKILL)
@@ -284,11 +284,13 @@ def _set_network(descriptor: int) -> None:
         raise OSError(ctypes.get_errno(), "setns")
 
 
-def _ip(*arguments: str) -> None:
-    _run("ip", *arguments)
+def ip(*arguments: str) -> None:
+    """Runs ip(8)."""
+    run_command("ip", *arguments)
 
 
-def _run(*argv: str, text: str | None = None) -> str:
+def run_command(*argv: str, text: str | None = None) -> str:
+    """What a program prints; RuntimeError if it fails."""
     done = subprocess.run(argv, input=text, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(argv)}: {done.stderr.strip()[:500]}")
