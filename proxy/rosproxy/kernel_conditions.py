@@ -52,8 +52,8 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
     world = forwarding()
     if not (world.ipv4 or world.ipv6):
         yield (
-            "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it "
-            "(sysctls: net.ipv4.ip_forward: 1)"
+            "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
+            "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"
         )
     if "filter" in _read(_LEGACY_TABLES).split():
         yield (

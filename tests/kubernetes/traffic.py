@@ -15,8 +15,11 @@ from tests.kubernetes.pods import Namespace, Pod, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import PROXY_OF
 
-START = 120
-"""Seconds that pods and the robot's nodes get to start and to find each other, all at once."""
+START = 180
+"""Seconds that pods and the robot's nodes get to start and to find each other, all at once.
+
+A SYN that passes while kube-proxy changes from refusing to translating is sent again for 127 s.
+"""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,9 @@ class Options:
 
 
 def say(*words: object) -> None:
-    print(*words, flush=True)
+    # At once: callbacks of several threads would otherwise mix their lines.
+    sys.stdout.write(" ".join(map(str, words)) + "\n")
+    sys.stdout.flush()
 
 
 def spin() -> None:
