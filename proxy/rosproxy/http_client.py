@@ -148,11 +148,13 @@ class HttpClient:
 def _send(handler: ResponseHandler, head: bytes, body: bytes) -> None:
     if handler.transport is None:
         raise aiohttp.ServerDisconnectedError
-    if len(body) < SEPARATE_BODY:
-        handler.transport.write(head + body)
-    else:
-        handler.transport.write(head)
-        handler.transport.write(body)
+    for piece in pieces(head, body):
+        handler.transport.write(piece)
+
+
+def pieces(head: bytes, body: bytes) -> tuple[bytes, ...]:
+    """What to write one after the other: both at once, unless that would copy a long body."""
+    return (head + body,) if len(body) < SEPARATE_BODY else (head, body)
 
 
 async def _answer(handler: ResponseHandler) -> bytes:
@@ -170,8 +172,6 @@ async def _answer(handler: ResponseHandler) -> bytes:
 
 async def read_bounded(stream: aiohttp.StreamReader) -> bytes:
     """All of a body. Raises ValueError if it is longer than MAX_BODY."""
-    if stream.is_eof() and stream.total_bytes <= MAX_BODY:
-        return stream.read_nowait()
     parts, size = list[bytes](), 0
     while not stream.at_eof():
         part = stream.read_nowait() if stream.is_eof() else await stream.readany()

@@ -63,7 +63,7 @@ class KernelForwards:
 
     def wake(self, endpoint: Endpoint | None = None) -> None:
         """Say that an endpoint has changed, or any."""
-        if endpoint is not None and self._usable:
+        if endpoint is not None and self._targets.usable:
             self._changed.add(endpoint)
         else:
             self._all = True
@@ -99,7 +99,7 @@ class KernelForwards:
         """Wait a moment until a port is not forwarded any more."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SYNC_PATIENCE):
-                while self._usable and port in self._table.forwards:
+                while self._targets.usable and port in self._table.forwards:
                     await self._done.wait()
 
     async def look(self) -> tuple[Counters, list[Flow]] | None:
@@ -134,13 +134,9 @@ class KernelForwards:
         await self._sync()
         await self._table.forget(ports)
 
-    @property
-    def _usable(self) -> bool:
-        return self._targets.why_not is None
-
     def _leads(self, endpoint: Endpoint, tcpros_port: int) -> bool:
         where, port = HostPort(endpoint.place.address, tcpros_port), endpoint.fast_port
-        return self._usable and port is not None and self._table.forwards.get(port) == where
+        return self._targets.usable and port is not None and self._table.forwards.get(port) == where
 
     def _has_ipv6(self) -> bool:
         return any(":" in endpoint.place.address for endpoint in self._book.owners.values())
@@ -150,7 +146,7 @@ class KernelForwards:
             self._wake.clear()
             self._book.note_owners(self._context.registry)
             self._targets.keep(self._book.owners)
-            if self._usable:
+            if self._targets.usable:
                 await self._change()
             done, self._done = self._done, asyncio.Event()
             done.set()

@@ -47,7 +47,7 @@ class KernelPlane:
     @property
     def usable(self) -> bool:
         """Whether the kernel may forward at all."""
-        return self._targets.why_not is None
+        return self._targets.usable
 
     async def start(self) -> None:
         """Make the table if that is possible; to be called before any port listens.

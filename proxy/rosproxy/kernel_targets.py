@@ -27,6 +27,11 @@ class KernelTargets:
         self._own_until = 0.0
         self.why_not: str | None = "the proxy has not started yet"
 
+    @property
+    def usable(self) -> bool:
+        """Whether the kernel may forward at all."""
+        return self.why_not is None
+
     def refresh(self) -> None:
         """Take in what this network namespace forwards now, and at times its own addresses."""
         self._world = forwarding()
