@@ -17,8 +17,9 @@ from tests.ros.topology import (
     SHARED,
     Place,
     Topology,
+    give,
     ip,
-    run_command,
+    sysctl,
 )
 
 PLAN = replace(SHARED, name="v", networks=(("c1",),), forwarding=True)
@@ -33,24 +34,18 @@ class Topology6(Topology):
         super().__init__(PLAN)
         del self.places["host"]
 
-    def build(self) -> None:
-        """Lays out every namespace, link and hosts file."""
-        for place in self.places.values():
-            ip("netns", "add", place.namespace)
-            ip("-n", place.namespace, "link", "set", "lo", "up")
+    def _connect(self) -> None:
         for role in ADDRESSES:
             self._join(role)
-        enter = ("ip", "netns", "exec", self.places["px"].namespace)
-        run_command(*enter, "sysctl", "-q", "-w", "net.ipv6.conf.all.forwarding=1")
-        for place in self.places.values():
-            self._write_names(place)
+        sysctl(self.places["px"], "net.ipv6.conf.all.forwarding=1")
 
     def _join(self, role: str) -> None:
         place, proxy = self.places[role], self.places["px"]
         peer = ("peer", "name", "eth0", "netns", place.namespace)
         ip("-n", proxy.namespace, "link", "add", f"{role}0", "type", "veth", *peer)
-        _address(place, "eth0", ADDRESSES[role])
-        _address(proxy, f"{role}0", PROXY_ADDRESSES[role])
+        # Without duplicate address detection they can be used at once.
+        give(place, "eth0", f"{ADDRESSES[role]}/64", "nodad")
+        give(proxy, f"{role}0", f"{PROXY_ADDRESSES[role]}/64", "nodad")
 
     def _known_names(self, place: Place) -> Iterator[tuple[str, str]]:
         yield place.address, place.hostname
@@ -71,10 +66,3 @@ class Lab6(Lab):
     def master_address(self, role: str) -> tuple[str, int]:
         """Where a machine finds its master."""
         return (PROXY_ADDRESSES if role == "c1" else ADDRESSES)[role], MASTER_PORT
-
-
-def _address(place: Place, device: str, address: str) -> None:
-    # Without duplicate address detection it can be used at once.
-    ip("-n", place.namespace, "addr", "add", f"{address}/64", "dev", device, "nodad")
-    ip("-n", place.namespace, "link", "set", device, "up")
-    place.addresses.append(address)

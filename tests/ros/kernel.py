@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import signal
 from collections.abc import Iterator
 from typing import Any
 
@@ -96,6 +97,34 @@ def refuses(lab: Lab, port: int, host: str = OUT_HOST) -> bool:
         except ConnectionRefusedError:
             return True
     return False
+
+
+def outlive_a_kill(lab: Lab, library: str) -> str:
+    """A topic that goes on while the proxy is dead and after, on its port; its node's name."""
+    name, _, receiver = talk(lab, library, library)
+    before = wait_forwarded(lab, name)
+    assert lab.proxy is not None
+    lab.proxy.kill()
+    wait_more(receiver, 30)
+    lab.start_proxy()
+    wait_more(receiver, 30)
+    assert wait_forwarded(lab, name)["port"] == before["port"]
+    wait_more(receiver, 30)
+    return name
+
+
+def end_without_a_trace(lab: Lab, family: str = "ipv4") -> None:
+    """A proxy that is stopped leaves nothing in the kernel; its successor forwards again."""
+    name, _, receiver = talk(lab)
+    wait_forwarded(lab, name)
+    assert lab.proxy is not None
+    assert TABLE in tables(lab)
+    lab.proxy.stop(signal.SIGTERM)
+    assert "rosproxy" not in tables(lab)
+    assert "mark=" not in flows(lab, family)
+    lab.start_proxy()
+    wait_more(receiver)
+    wait_forwarded(lab, name)
 
 
 def status_of_unanswered(lab: Lab) -> tuple[str, dict[str, Any]]:

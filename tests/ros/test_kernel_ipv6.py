@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator
 
 import pytest
@@ -56,27 +55,12 @@ def test_the_kernel_forwards_a_topic(lab: Lab, publisher: str, subscriber: str) 
 
 @each_library
 def test_messages_go_on_while_the_proxy_is_dead_and_after(lab: Lab, library: str) -> None:
-    name, _, receiver = talk(lab, library, library)
-    before = kernel.wait_forwarded(lab, name)
-    assert lab.proxy is not None
-    lab.proxy.kill()
-    kernel.wait_more(receiver, 30)
-    lab.start_proxy()
-    kernel.wait_more(receiver, 30)
-    assert kernel.wait_forwarded(lab, name)["port"] == before["port"]
+    name = kernel.outlive_a_kill(lab, library)
     assert kernel.node_status(lab, name)["connections"] == []
 
 
 def test_a_graceful_stop_leaves_nothing_in_the_kernel(lab: Lab) -> None:
-    name, _, receiver = talk(lab)
-    kernel.wait_forwarded(lab, name)
-    assert lab.proxy is not None
-    lab.proxy.stop(signal.SIGTERM)
-    assert "rosproxy" not in kernel.tables(lab)
-    assert "mark=" not in flows(lab)
-    lab.start_proxy()
-    kernel.wait_more(receiver)
-    kernel.wait_forwarded(lab, name)
+    kernel.end_without_a_trace(lab, "ipv6")
 
 
 def test_the_port_of_a_killed_node_refuses(lab: Lab) -> None:

@@ -53,32 +53,14 @@ def test_an_inside_node_in_no_common_network_is_forwarded_too(lab: Lab) -> None:
 
 @each_library
 def test_messages_go_on_while_the_proxy_is_dead_and_after(lab: Lab, library: str) -> None:
-    name, _, receiver = talk(lab, library, library)
-    before = kernel.wait_forwarded(lab, name)
-    assert lab.proxy is not None
-    lab.proxy.kill()
-    kernel.wait_more(receiver, 30)
-    lab.start_proxy()
-    kernel.wait_more(receiver, 30)
-    after = kernel.wait_forwarded(lab, name)
-    assert after["port"] == before["port"]
-    kernel.wait_more(receiver, 30)
+    name = kernel.outlive_a_kill(lab, library)
     late = lab.node(library, "out", "sub", topic=kernel.node_status(lab, name)["publishes"][1])
     late.wait_for_count("^got ", 5, LIMIT)
     assert kernel.node_status(lab, name)["connections"] == []
 
 
 def test_a_graceful_stop_leaves_nothing_in_the_kernel(lab: Lab) -> None:
-    name, _, receiver = talk(lab)
-    kernel.wait_forwarded(lab, name)
-    assert lab.proxy is not None
-    assert kernel.TABLE in kernel.tables(lab)
-    lab.proxy.stop(signal.SIGTERM)
-    assert "rosproxy" not in kernel.tables(lab)
-    assert "mark=" not in kernel.flows(lab)
-    lab.start_proxy()
-    kernel.wait_more(receiver)
-    kernel.wait_forwarded(lab, name)
+    kernel.end_without_a_trace(lab)
 
 
 @each_library

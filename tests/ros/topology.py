@@ -134,12 +134,7 @@ class Topology:
         for place in self.places.values():
             ip("netns", "add", place.namespace)
             ip("-n", place.namespace, "link", "set", "lo", "up")
-        self._join_outside()
-        for number, members in enumerate(self.plan.networks, start=1):
-            self._join_inside(number, members)
-        self._load_rules()
-        if self.plan.alias:
-            self._keep_ports_free()
+        self._connect()
         for place in self.places.values():
             self._write_names(place)
 
@@ -147,6 +142,14 @@ class Topology:
         """Kills what still runs in the namespaces and deletes them."""
         for place in self.places.values():
             _remove_namespace(place.namespace)
+
+    def _connect(self) -> None:
+        self._join_outside()
+        for number, members in enumerate(self.plan.networks, start=1):
+            self._join_inside(number, members)
+        self._load_rules()
+        if self.plan.alias:
+            self._keep_ports_free()
 
     def _join_outside(self) -> None:
         self._link("out", "eth0", "out0", f"{OUT_NODE}/24")
@@ -175,9 +178,7 @@ class Topology:
         peer = ("peer", "name", device, "netns", place.namespace)
         self._on_host("link", "add", host_device, "type", "veth", *peer)
         self._on_host("link", "set", host_device, "up")
-        ip("-n", place.namespace, "addr", "add", address, "dev", device)
-        ip("-n", place.namespace, "link", "set", device, "up")
-        place.addresses.append(address.partition("/")[0])
+        give(place, device, address)
 
     def _on_host(self, *arguments: str) -> None:
         ip("-n", self.places["host"].namespace, *arguments)
@@ -191,13 +192,11 @@ class Topology:
             run_command("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
     def _forward(self, role: str, forwards: bool) -> None:
-        enter = ("ip", "netns", "exec", self.places[role].namespace)
-        run_command(*enter, "sysctl", "-q", "-w", f"net.ipv4.ip_forward={forwards:d}")
+        sysctl(self.places[role], f"net.ipv4.ip_forward={forwards:d}")
 
     def _keep_ports_free(self) -> None:
         """Keeps the proxy's own connections off the ports that nodes on the robot may have."""
-        enter = ("ip", "netns", "exec", self.places["px"].namespace)
-        run_command(*enter, "sysctl", "-q", "-w", "net.ipv4.ip_local_port_range=1024 11000")
+        sysctl(self.places["px"], "net.ipv4.ip_local_port_range=1024 11000")
 
     def _write_names(self, place: Place) -> None:
         folder = _NETNS_ETC / place.namespace
@@ -287,6 +286,18 @@ def _set_network(descriptor: int) -> None:
 def ip(*arguments: str) -> None:
     """Runs ip(8)."""
     run_command("ip", *arguments)
+
+
+def give(place: Place, device: str, address: str, *flags: str) -> None:
+    """Gives a device that is set up an address, with the length of its network's prefix."""
+    ip("-n", place.namespace, "addr", "add", address, "dev", device, *flags)
+    ip("-n", place.namespace, "link", "set", device, "up")
+    place.addresses.append(address.partition("/")[0])
+
+
+def sysctl(place: Place, setting: str) -> None:
+    """Sets one of a namespace's parameters, as ``name=value``."""
+    run_command("ip", "netns", "exec", place.namespace, "sysctl", "-q", "-w", setting)
 
 
 def run_command(*argv: str, text: str | None = None) -> str:
