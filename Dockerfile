@@ -34,7 +34,7 @@ ARG EXTRAS=""
 # proxy. What is left of them is the name of a program.
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
       ".${EXTRAS:+[$EXTRAS]}" \
-    && rm /opt/rosproxy/bin/rosproxy-controller
+    && rm /opt/rosproxy/bin/rosproxy-operator
 
 
 FROM base AS proxy
@@ -87,7 +87,7 @@ ENV PATH=/opt/rosproxy/bin:$PATH
 # (examples/docker), or puts a socket proxy between. In Kubernetes the command is `kubernetes`.
 USER 10001:10001
 WORKDIR /
-HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy-controller", "health"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy-operator", "health"]
 STOPSIGNAL SIGTERM
-ENTRYPOINT ["rosproxy-controller"]
+ENTRYPOINT ["rosproxy-operator"]
 CMD ["docker"]

@@ -1,4 +1,4 @@
-"""The command line ``rosproxy-controller``."""
+"""The command line ``rosproxy-operator``."""
 
 import importlib.util
 import logging
@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli import Commands as ProxyCommands
-from rosproxy.cli import log_options
+from rosproxy.cli.main import Commands as ProxyCommands
+from rosproxy.cli.main import log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
@@ -19,13 +19,13 @@ DEFAULT_ADMIN = "http://127.0.0.1:11313"
 class Commands(ProxyCommands):
     """Commands whose usage errors begin with this program's name."""
 
-    program = "rosproxy-controller"
+    program = "rosproxy-operator"
 
 
 @click.group(
     cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
 )
-@click.version_option(__version__, prog_name="rosproxy-controller")
+@click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
     """Sets up rosproxy by itself for the containers of a host or the pods of a cluster."""
 
@@ -115,8 +115,8 @@ def docker(
     environment variable: ROSPROXY_ and its name (ROSPROXY_PORTS); the master's is also
     ROS_MASTER_URI.
     """
-    from rosproxy import logs
-    from rosproxy.core.settings import SettingError
+    from rosproxy.settings import SettingError
+    from rosproxy.telemetry import logs
     from rosproxy_operator.settings import parse_docker_settings
 
     _need("docker", "docker")
@@ -137,7 +137,7 @@ def _need(library: str, extra: str) -> None:
     """Say how to install a library that one kind of controller needs, if it is not there."""
     if importlib.util.find_spec(library) is None:
         click.echo(
-            f"rosproxy-controller: the Python package {library} is not installed here: "
+            f"rosproxy-operator: the Python package {library} is not installed here: "
             f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')",
             err=True,
         )
@@ -145,7 +145,7 @@ def _need(library: str, extra: str) -> None:
 
 
 def _run(settings: Any, once: bool) -> None:
-    from rosproxy.core.settings import SettingError
+    from rosproxy.settings import SettingError
     from rosproxy_operator.docker.run import run, run_once
 
     if not once:
@@ -156,7 +156,7 @@ def _run(settings: Any, once: bool) -> None:
         return
     problems = _or_exit(lambda: run_once(settings))
     for problem in problems:
-        click.echo(f"rosproxy-controller: {problem.subject}: {problem.text}", err=True)
+        click.echo(f"rosproxy-operator: {problem.subject}: {problem.text}", err=True)
     sys.exit(1 if problems else 0)
 
 
@@ -266,7 +266,7 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     The cluster is the one that this runs in, else the one that KUBECONFIG names. Every option has
     an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
     """
-    from rosproxy.core.settings import SettingError
+    from rosproxy.settings import SettingError
     from rosproxy_operator.settings import parse_kubernetes_settings
 
     for library in ("kubernetes", "kopf", "cryptography"):
@@ -279,8 +279,8 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
 
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
-    from rosproxy import logs
-    from rosproxy.core.settings import SettingError
+    from rosproxy.settings import SettingError
+    from rosproxy.telemetry import logs
     from rosproxy_operator.kubernetes.errors import ApiError
     from rosproxy_operator.kubernetes.kopf_log import quieten
     from rosproxy_operator.kubernetes.run import run
@@ -292,21 +292,21 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     except SettingError as error:
         raise click.UsageError(str(error)) from None
     except ApiError as error:
-        click.echo(f"rosproxy-controller: {error}", err=True)
+        click.echo(f"rosproxy-operator: {error}", err=True)
         sys.exit(1)
 
 
 @main.command()
 def health() -> None:
     """Exit with 0 if the controller is alive, with 1 if not; for container health checks."""
-    from rosproxy.admin_client import AdminClient, AdminError, default_url
+    from rosproxy.cli.admin_client import AdminClient, AdminError, default_url
 
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else DEFAULT_ADMIN
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
         reason = str(error) if "HTTP" in str(error) else f"no controller answers at {url}"
-        click.echo(f"rosproxy-controller: {reason}", err=True)
+        click.echo(f"rosproxy-operator: {reason}", err=True)
         sys.exit(1)
 
 
@@ -317,5 +317,5 @@ def _or_exit(work: Callable[[], Any]) -> Any:
     try:
         return work()
     except EngineError as error:
-        click.echo(f"rosproxy-controller: {error}", err=True)
+        click.echo(f"rosproxy-operator: {error}", err=True)
         sys.exit(1)

@@ -6,17 +6,12 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 from typing import Any
 
-from rosproxy.core.settings import (
-    SettingError,
-    parse_admin,
-    parse_host,
-    parse_range,
-    parse_seconds,
-)
-from rosproxy.core.uris import HostPort, is_loopback, parse_host_port, parse_slave_uri
-from rosproxy_operator.core.docker.settings import MOST_PORTS, PlanSettings
-from rosproxy_operator.core.kubernetes.model import Name
-from rosproxy_operator.core.kubernetes.settings import ClusterSettings
+from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.settings import SettingError, parse_admin, parse_host, parse_range, parse_seconds
+from rosproxy_operator.docker.planner.settings import MOST_PORTS, PlanSettings
+from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 CLUSTER_ADMIN = HostPort("0.0.0.0", 11313)
@@ -29,7 +24,7 @@ _NAME = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-"
 
 @dataclass(frozen=True, slots=True)
 class DockerSettings:
-    """Everything that ``rosproxy-controller docker`` can be told.
+    """Everything that ``rosproxy-operator docker`` can be told.
 
     ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
     serves its own health.
@@ -58,7 +53,7 @@ class WebhookSettings:
 
 @dataclass(frozen=True, slots=True)
 class KubernetesSettings:
-    """Everything that ``rosproxy-controller kubernetes`` can be told.
+    """Everything that ``rosproxy-operator kubernetes`` can be told.
 
     ``namespaces`` are those that are looked after, all if there are none. ``resync`` is in seconds:
     how long it waits at most between two looks. ``admin`` is where it serves its own health and

@@ -1,5 +1,5 @@
 """``python -m rosproxy``."""
 
-from rosproxy.cli import main
+from rosproxy.cli.main import main
 
 main(prog_name="rosproxy")

@@ -5,33 +5,33 @@ import logging
 import socket
 from typing import Any
 
-from rosproxy import limits, listeners
-from rosproxy.acceptor import Acceptor, first_bytes
-from rosproxy.admin import Admin
-from rosproxy.containers import Containers, Parts
-from rosproxy.context import make_context
-from rosproxy.core.admin_bodies import read_master_address
-from rosproxy.core.registry import Endpoint
-from rosproxy.core.settings import SettingError, Settings
-from rosproxy.core.tcpros import speaks_http
-from rosproxy.core.uris import HostPort
-from rosproxy.http_server import Service, XmlRpcServer
-from rosproxy.keeper import TICK, Keeper
-from rosproxy.kernel_plane import KernelPlane
-from rosproxy.leases import Leases
-from rosproxy.master_service import MasterService, PublishedMaster
-from rosproxy.master_watch import MasterWatch
-from rosproxy.metrics import StateCollector
-from rosproxy.mirror import TIDY_INTERVAL, Mirror
-from rosproxy.node_client import NodeClient
-from rosproxy.publisher_updates import PublisherUpdates
-from rosproxy.range_probe import probe_range
-from rosproxy.silent import SILENT_TICK, Silent
-from rosproxy.slave_service import SlaveService
-from rosproxy.status import describe
-from rosproxy.strays import Strays
-from rosproxy.tcpros_service import RATE_INTERVAL, TcprosService
-from rosproxy.upkeep import Upkeep
+from rosproxy.admin.range_probe import probe_range
+from rosproxy.admin.requests import read_master_address
+from rosproxy.admin.server import AdminServer
+from rosproxy.admin.status import describe
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.net import limits, listeners
+from rosproxy.net.acceptor import Acceptor, first_bytes
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_server import Service, XmlRpcServer
+from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.context import make_context
+from rosproxy.ros1.protocol.tcpros import speaks_http
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.servers.master import MasterApi, PublishedMaster
+from rosproxy.ros1.servers.slave import SlaveApi
+from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
+from rosproxy.ros1.upkeep.adoption.adopter import Adopter
+from rosproxy.ros1.upkeep.containers.events import ContainerEvents, Parts
+from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
+from rosproxy.ros1.upkeep.prober import TICK, Prober
+from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscription.publisher_updates import PublisherUpdates
+from rosproxy.ros1.upkeep.resubscription.resubscriber import SILENT_TICK, Resubscriber
+from rosproxy.settings import SettingError, Settings
+from rosproxy.telemetry.metrics import StateCollector
 
 log = logging.getLogger(__name__)
 
@@ -46,11 +46,11 @@ class App:
         self.settings = settings
         self.context = context = make_context(settings)
         nodes = NodeClient(context.upstream, settings.probe_timeout)
-        self._tcpros = TcprosService(context, nodes)
+        self._tcpros = TcprosServer(context, nodes)
         self._plane = KernelPlane(context)
-        self._mirror = Mirror(context)
+        self._mirror = Alias(context)
         updates = PublisherUpdates(context, self._mirror)
-        silent = Silent(context, updates, self._tcpros.topic_connections, self._plane.look)
+        silent = Resubscriber(context, updates, self._tcpros.topic_connections, self._plane.look)
         self._leases = Leases(
             context,
             nodes,
@@ -59,12 +59,12 @@ class App:
             self._close_port,
             lambda endpoint: silent.watch([endpoint]),
         )
-        self._upkeep = Upkeep(context, nodes, updates, silent)
-        self._keeper = Keeper(context, self._leases, nodes, self._upkeep)
-        self._watch = MasterWatch(context, self._keeper, self._upkeep, self._plane)
-        self._strays = Strays(context, self._leases, nodes, self._upkeep)
+        self._upkeep = Registrar(context, nodes, updates, silent)
+        self._keeper = Prober(context, self._leases, nodes, self._upkeep)
+        self._watch = MasterMonitor(context, self._keeper, self._upkeep, self._plane)
+        self._strays = Adopter(context, self._leases, nodes, self._upkeep)
         self._slaves = XmlRpcServer(
-            SlaveService(context, self._leases, self._mirror, self._strays.spared),
+            SlaveApi(context, self._leases, self._mirror, self._strays.spared),
             "rosproxy: slave API of a ROS node behind it\n",
         )
         self._servers = [self._slaves]
@@ -77,7 +77,7 @@ class App:
         self._reserve_range()
         await self._plane.start()
         settings = self.settings
-        master = MasterService(
+        master = MasterApi(
             self.context, self._leases, self._mirror, self._watch.recovered, self._strays.heed
         )
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
@@ -115,7 +115,7 @@ class App:
         """The state as JSON."""
         return describe(self.context, self._watch, self._tcpros, self._mirror, self._plane)
 
-    def _make_admin(self, nodes: NodeClient) -> Admin:
+    def _make_admin(self, nodes: NodeClient) -> AdminServer:
         parts = Parts(
             self.context,
             self._leases,
@@ -125,14 +125,14 @@ class App:
             self._watch.recovered,
             self._cut,
         )
-        containers = Containers(parts)
+        containers = ContainerEvents(parts)
         actions = {
             "/probe": self._probe,
             "/containers": containers.hear,
             "/master-address": self._set_master_address,
             "/retire": containers.retire,
         }
-        return Admin(
+        return AdminServer(
             self.context.metrics.registry,
             self.status,
             self._unready,

@@ -6,11 +6,18 @@ from typing import Any
 import pytest
 from scripts.chart_docs import custom_resource
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes import names
-from rosproxy_operator.core.kubernetes.model import Answer, Name, NodeState, Pod, ProxyPod, Service
-from rosproxy_operator.core.kubernetes.parse_rosproxy import MOST_NAME, MOST_PORTS, rosproxy
-from rosproxy_operator.core.kubernetes.statuses import status_of
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner import names
+from rosproxy_operator.kubernetes.planner.model import (
+    Answer,
+    Name,
+    NodeState,
+    Pod,
+    ProxyPod,
+    Service,
+)
+from rosproxy_operator.kubernetes.planner.spec import MOST_NAME, MOST_PORTS, rosproxy
+from rosproxy_operator.kubernetes.planner.status import status_of
 from tests.chart.chart import Json
 
 DEFINITION = custom_resource()

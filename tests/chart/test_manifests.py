@@ -8,7 +8,7 @@ import pytest
 from scripts import chart_docs
 
 from rosproxy import __version__
-from rosproxy_operator.core.kubernetes import names
+from rosproxy_operator.kubernetes.planner import names
 from tests.chart.chart import CHART, ROOT, Json, objects, of_kind, parse
 
 INSTALL = ROOT / "manifests/install.yaml"

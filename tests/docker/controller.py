@@ -13,7 +13,7 @@ from typing import Any
 
 from tests.docker.engine import docker, inspect, wait_until
 
-PROGRAM = Path(sys.executable).with_name("rosproxy-controller")
+PROGRAM = Path(sys.executable).with_name("rosproxy-operator")
 MANAGED = "label=io.rosproxy.managed=true"
 UPLINK = "0-rosproxy"
 WINDOW = range(12000, 13000)
@@ -105,7 +105,7 @@ class Controller:
 
     def command(self, *words: str, check: bool = True) -> str:
         """Run another command of the controller's program with the same settings."""
-        return docker("exec", self.container, "rosproxy-controller", "docker", *self.options,
+        return docker("exec", self.container, "rosproxy-operator", "docker", *self.options,
                       *words, check=check)  # fmt: skip
 
     def status(self) -> dict[str, Any]:
@@ -182,7 +182,7 @@ class Process:
         )  # fmt: skip
         text = self.process.communicate(timeout=seconds)[0].decode().strip()
         code = self.process.returncode
-        assert code == 0 or not check, f"rosproxy-controller {' '.join(words)}: exit {code}\n{text}"
+        assert code == 0 or not check, f"rosproxy-operator {' '.join(words)}: exit {code}\n{text}"
         return text
 
     def send(self, number: int) -> None:

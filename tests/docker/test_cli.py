@@ -64,16 +64,16 @@ def test_health_and_metrics(controller: Controller, net: Inside) -> None:
 
 def test_controller_image_is_healthy_by_its_own_check(controller: Controller) -> None:
     docker("exec", controller.container, "env", f"ROSPROXY_ADMIN_BIND={ADMIN[7:]}",
-           "rosproxy-controller", "health")  # fmt: skip
+           "rosproxy-operator", "health")  # fmt: skip
 
     with pytest.raises(AssertionError, match="exit 1"):
-        docker("exec", controller.container, "rosproxy-controller", "health")
+        docker("exec", controller.container, "rosproxy-operator", "health")
 
 
 def test_controller_image(controller_image: str) -> None:
     config = inspect(controller_image)["Config"]
     assert config["User"] == "10001:10001"
-    assert config["Entrypoint"] == ["rosproxy-controller"]
+    assert config["Entrypoint"] == ["rosproxy-operator"]
     assert config["Cmd"] == ["docker"]
     assert not config.get("ExposedPorts")
     assert "health" in " ".join(config["Healthcheck"]["Test"])

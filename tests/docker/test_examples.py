@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import rosproxy_operator.docker.engine
+import rosproxy_operator.docker.client
 from tests.docker.controller import UPLINK, remove_proxies, the_proxy
 from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
 from tests.docker.robot import Robot
@@ -83,9 +83,7 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
     with example(EXAMPLES, named, images, tmp_path) as found:
         works_both_ways(found, named)
 
-        status = found.compose(
-            "exec", "-T", "controller", "rosproxy-controller", "docker", "status"
-        )
+        status = found.compose("exec", "-T", "controller", "rosproxy-operator", "docker", "status")
         assert the_proxy().name in status
         assert "talker" in status
         assert "listener" in status
@@ -119,7 +117,7 @@ def test_example_behind_a_socket_proxy(
 def test_socket_proxy_allows_what_the_controller_calls() -> None:
     """And the documentation lists the same."""
     listed = r"^ {4}(GET|POST|DELETE) (/\S+)$"
-    calls = re.findall(listed, str(rosproxy_operator.docker.engine.__doc__), re.MULTILINE)
+    calls = re.findall(listed, str(rosproxy_operator.docker.client.__doc__), re.MULTILINE)
     text = (SOCKET_PROXY / "haproxy.cfg").read_text()
     allowed = re.findall(r"acl (get|post|delete)_path path -m reg \^(/\S+)\$", text)
 

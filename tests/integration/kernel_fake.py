@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from rosproxy.kernel_tools import ToolError, Tools
+from rosproxy.forwarding.kernel.tools import ToolError, Tools
 
 PAIRS = ("marks", "hosts4", "hosts6", "ports")
 

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from rosproxy.core.tcpros import decode_header, encode_header
 from rosproxy.demo.wire import STRING
+from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 from tests.integration.http_fake import Answer, End, HttpFake, Request, settle, value
 from tests.integration.net import NODE, Where, Wire, bracketed, connect, rpc, where
 

@@ -5,8 +5,8 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rosproxy.app import App
-from rosproxy.core.registry import Endpoint
-from rosproxy.core.settings import Settings, parse_settings
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.settings import Settings, parse_settings
 from tests.integration.net import HOST, PROXY, Where, free_ports, where
 from tests.integration.node import Node
 

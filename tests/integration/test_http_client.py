@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 import aiohttp
 import pytest
 
-from rosproxy.core.uris import HostPort
-from rosproxy.http_client import HttpClient
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_client import HttpClient
 from tests.integration.net import MASTER, until
 
 REPLY = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
@@ -169,7 +169,7 @@ async def test_what_is_no_reply_is_told_as_such(client, peer, reply):
 
 
 async def test_a_reply_beyond_the_bound_is_refused(client, peer, monkeypatch):
-    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
 
     async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.core.methods import MASTER_METHODS
-from rosproxy.core.uris import HostPort
-from rosproxy.upstream import Unreachable
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
 from tests.integration.net import HOST, NODE, Where, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
@@ -78,7 +78,7 @@ async def test_requests_in_tiny_slices(door):
 
 
 async def test_a_header_that_never_ends_costs_a_time_out(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.http_server.HEADER_TIMEOUT", 0.1)
+    monkeypatch.setattr("rosproxy.net.http_server.HEADER_TIMEOUT", 0.1)
     async with connect(door.address) as mute, connect(door.address) as kept:
         await mute.send(b"POST / HTTP/1.1\r\nX: ")
         await kept.send(post(CALL))
@@ -161,7 +161,7 @@ async def test_a_body_that_is_not_what_its_encoding_says_is_refused(door):
 
 
 async def test_a_body_above_the_limit_is_413(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
     for body, headers in [
         (b" " * 100_001, []),
         (b" " * 100_001, [f"Content-Length: {10**15}"]),
@@ -173,7 +173,7 @@ async def test_a_body_above_the_limit_is_413(door, monkeypatch):
 
 
 async def test_a_connection_is_usable_after_413(door, monkeypatch):
-    monkeypatch.setattr("rosproxy.http_client.MAX_BODY", 100_000)
+    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
     async with connect(door.address) as wire:
         await wire.send(post(b" " * 150_000))
         assert (await wire.reply()).status == 413

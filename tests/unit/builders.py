@@ -8,13 +8,15 @@ from ipaddress import ip_network
 from typing import Any
 from xml.sax.saxutils import escape
 
-from rosproxy.core import master_api
-from rosproxy.core.addressing import Addressing, Asker
-from rosproxy.core.master_api import Admission, Noted, Refusal
-from rosproxy.core.methods import Kind
-from rosproxy.core.ports import PortMap, PortRange
-from rosproxy.core.registry import Endpoint, Place, Registration, Registry
-from rosproxy.core.uris import HostPort, parse_slave_uri, slave_uri
+from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.master_api import Admission, Noted, Refusal
 
 HOST = "robot-host"
 PROXY = "10.0.0.1"

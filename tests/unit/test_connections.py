@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rosproxy.http_server import Connections
+from rosproxy.net.http_server import Connections
 
 
 class Handler:

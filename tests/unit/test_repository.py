@@ -31,7 +31,7 @@ def functions(path: Path) -> dict[str, int]:
 
 
 def run_options() -> list[click.Option]:
-    from rosproxy.cli import main
+    from rosproxy.cli.main import main
 
     command = main.commands["run"]
     return [option for option in command.params if isinstance(option, click.Option)]
@@ -79,8 +79,8 @@ def test_scripts_can_be_run() -> None:
 
 def test_docker_page_names_every_option_label_and_metric() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.core.docker.values import LABELS
-    from rosproxy_operator.metrics import Metrics
+    from rosproxy_operator.common.metrics import Metrics
+    from rosproxy_operator.docker.planner.label_values import LABELS
 
     text = (ROOT / "docs/docker.md").read_text()
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
@@ -90,10 +90,10 @@ def test_docker_page_names_every_option_label_and_metric() -> None:
 
 
 def test_docker_page_lists_the_engine_calls() -> None:
-    from rosproxy_operator.docker import engine
+    from rosproxy_operator.docker import client
 
-    assert engine.__doc__ is not None
-    calls = re.findall(r"^    ((?:GET|POST|DELETE) \S+)$", engine.__doc__, re.M)
+    assert client.__doc__ is not None
+    calls = re.findall(r"^    ((?:GET|POST|DELETE) \S+)$", client.__doc__, re.M)
     page = (ROOT / "docs/docker.md").read_text().splitlines()
     assert calls
     assert [line.strip() for line in page if line.strip() in calls] == calls
@@ -101,8 +101,8 @@ def test_docker_page_lists_the_engine_calls() -> None:
 
 def test_kubernetes_page_names_every_option_label_and_metric() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.core.kubernetes import names
-    from rosproxy_operator.metrics import ClusterMetrics
+    from rosproxy_operator.common.metrics import ClusterMetrics
+    from rosproxy_operator.kubernetes.planner import names
 
     text = (ROOT / "docs/kubernetes.md").read_text()
     options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.core.ports import PortMap, PortRange
-from rosproxy.core.settings import SettingError, parse_settings
-from rosproxy.core.uris import HostPort
+from rosproxy.leases.ports import PortMap, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.settings import SettingError, parse_settings
 
 GIVEN: dict[str, Any] = {
     # as the command line gives them, with its defaults

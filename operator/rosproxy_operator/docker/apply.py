@@ -9,8 +9,13 @@ import logging
 import secrets
 from collections.abc import Iterator
 
-from rosproxy.core.uris import HostPort
-from rosproxy_operator.core.docker.actions import (
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.docker.client import DockerClient, Json
+from rosproxy_operator.docker.errors import Conflict, EngineError, Gone
+from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
@@ -24,20 +29,15 @@ from rosproxy_operator.core.docker.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.docker.fingerprint import (
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     container_config,
     master,
     read_own,
     sandbox_config,
 )
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.docker.engine import Engine, Json
-from rosproxy_operator.docker.errors import Conflict, EngineError, Gone
-from rosproxy_operator.docker.observe import Look, Way
-from rosproxy_operator.masters import Masters
-from rosproxy_operator.proxies import Proxies, ProxyError
-from rosproxy_operator.threads import in_thread
+from rosproxy_operator.docker.snapshot import Look, Way
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,11 @@ class Applier:
     """Carries out actions, each in a thread."""
 
     def __init__(
-        self, engine: Engine, settings: PlanSettings, proxies: Proxies, masters: Masters
+        self,
+        engine: DockerClient,
+        settings: PlanSettings,
+        proxies: ProxyClient,
+        masters: MasterResolver,
     ) -> None:
         self._engine, self._settings = engine, settings
         self._proxies, self._masters = proxies, masters

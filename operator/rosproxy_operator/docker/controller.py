@@ -5,29 +5,26 @@ import contextlib
 import logging
 import time
 
-from rosproxy.tasks import Tasks
-from rosproxy_operator.core.docker.actions import Create
-from rosproxy_operator.core.docker.fingerprint import master, proxy_name
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import (
-    Proxy,
-    Sandbox,
-)
-from rosproxy_operator.core.docker.plan import Group, Plan, plan
-from rosproxy_operator.core.problem import Problem
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.metrics import Metrics
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.proxy_client import ProxyClient
+from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
 from rosproxy_operator.docker.apply import Applier
+from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.details import Inspector
-from rosproxy_operator.docker.engine import Engine
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.events import Events
-from rosproxy_operator.docker.observe import Look, Observer
+from rosproxy_operator.docker.executor import Executor
+from rosproxy_operator.docker.planner.actions import Create
+from rosproxy_operator.docker.planner.model import Proxy, Sandbox
+from rosproxy_operator.docker.planner.plan import Group, Plan, plan
+from rosproxy_operator.docker.planner.specs import master, proxy_name
+from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.proxy_sync import ProxySync
 from rosproxy_operator.docker.sense import sense, unresolved
-from rosproxy_operator.docker.teller import Teller
-from rosproxy_operator.docker.work import Work
-from rosproxy_operator.masters import AGAIN_UNRESOLVED, Masters
-from rosproxy_operator.metrics import Metrics
-from rosproxy_operator.problems import ProblemLog
-from rosproxy_operator.proxies import Proxies
+from rosproxy_operator.docker.snapshot import Look, Observer
 from rosproxy_operator.settings import DockerSettings
 
 log = logging.getLogger(__name__)
@@ -43,22 +40,22 @@ LONGEST_LOOK = 60.0
 """Seconds after which a look that has not ended means that the controller hangs."""
 
 
-class Controller:
+class DockerController:
     """A controller of one engine. `run` it in an event loop."""
 
     def __init__(self, settings: DockerSettings, metrics: Metrics) -> None:
         self._settings, self._metrics = settings, metrics
         self._again = asyncio.Event()
         self._tasks = Tasks()
-        engine = Engine()
-        self._proxies = Proxies()
-        self._masters = Masters(self._wake)
+        engine = DockerClient()
+        self._proxies = ProxyClient()
+        self._masters = MasterResolver(self._wake)
         self._inspector = Inspector(engine, self._wake)
         self._observer = Observer(engine, settings.plan, self._inspector)
         self._applier = Applier(engine, settings.plan, self._proxies, self._masters)
-        self._work = Work(self._tasks, self._wake, self._port_taken, metrics.count)
+        self._work = Executor(self._tasks, self._wake, self._port_taken, metrics.count)
         uplink = settings.plan.uplink
-        self._teller = Teller(self._tasks, self._proxies, self._masters, uplink, self._wake)
+        self._teller = ProxySync(self._tasks, self._proxies, self._masters, uplink, self._wake)
         self._events = Events(engine, self._happened)
         self._timer: asyncio.TimerHandle | None = None
         self._memory = Memory()

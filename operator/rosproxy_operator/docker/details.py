@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosproxy_operator.core.docker.fingerprint import TOKEN_VARIABLE
-from rosproxy_operator.docker.engine import Engine, Json
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.docker.client import DockerClient, Json
 from rosproxy_operator.docker.errors import EngineError, Gone
-from rosproxy_operator.threads import in_thread
+from rosproxy_operator.docker.planner.specs import TOKEN_VARIABLE
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ def signature(row: Json) -> tuple[tuple[str, str], ...]:
 class Inspector:
     """Keeps the details of all containers. ``late`` is called when some come after a look."""
 
-    def __init__(self, engine: Engine, late: Callable[[], None]) -> None:
+    def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
         self._engine, self._late = engine, late
         self._known: dict[str, tuple[Any, Details]] = {}
         self._asking: dict[str, asyncio.Task[None]] = {}

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from rosproxy_operator.docker.engine import Engine
+from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
 
 FILTERS = {
@@ -29,7 +29,7 @@ class Events:
     happened before that was missed.
     """
 
-    def __init__(self, engine: Engine, happened: Callable[[], None]) -> None:
+    def __init__(self, engine: DockerClient, happened: Callable[[], None]) -> None:
         self._engine, self._happened = engine, happened
 
     def start(self) -> None:

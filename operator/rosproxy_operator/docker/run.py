@@ -7,15 +7,15 @@ import signal
 import time
 
 from rosproxy import __version__
-from rosproxy.console import WATCH_INTERVAL, draw, size, write
-from rosproxy_operator.core.docker.report import plan_text, render
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.problem import Problem
-from rosproxy_operator.docker.controller import Controller
+from rosproxy.cli.terminal import WATCH_INTERVAL, draw, size, write
+from rosproxy_operator.common.health import Health
+from rosproxy_operator.common.metrics import Metrics
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.report import plan_text, render
+from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.status import Survey, describe, survey
-from rosproxy_operator.health import Health
-from rosproxy_operator.metrics import Metrics
 from rosproxy_operator.settings import DockerSettings
 
 log = logging.getLogger(__name__)
@@ -75,10 +75,10 @@ async def _run(settings: DockerSettings) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = Metrics()
-    controller = Controller(settings, metrics)
+    controller = DockerController(settings, metrics)
     health = Health(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
-    log.info("rosproxy-controller %s: health and metrics at http://%s", __version__, settings.admin)
+    log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, settings.admin)
     running = asyncio.create_task(controller.run())
     stopping = asyncio.create_task(stopped.wait())
     await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
@@ -89,4 +89,4 @@ async def _run(settings: DockerSettings) -> None:
 
 
 async def _run_once(settings: DockerSettings) -> list[Problem]:
-    return await Controller(settings, Metrics()).run_once(ONCE)
+    return await DockerController(settings, Metrics()).run_once(ONCE)

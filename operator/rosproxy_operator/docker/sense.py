@@ -2,22 +2,20 @@
 
 from dataclasses import replace
 
-from rosproxy.core.uris import is_address, parse_slave_uri
-from rosproxy_operator import host
-from rosproxy_operator.core.docker.labels import masters as master_uris
-from rosproxy_operator.core.docker.model import (
-    STARTED,
-    Observed,
-)
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.problem import Problem
+from rosproxy.net.addresses import is_address
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.resolver import THIS_HOST, MasterResolver
+from rosproxy_operator.docker import host
 from rosproxy_operator.docker.details import PATIENCE
-from rosproxy_operator.docker.observe import Look, Observer
-from rosproxy_operator.masters import THIS_HOST, Masters
+from rosproxy_operator.docker.planner.labels import masters as master_uris
+from rosproxy_operator.docker.planner.model import STARTED, Observed
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.snapshot import Look, Observer
 
 
 async def sense(
-    observer: Observer, masters: Masters, settings: PlanSettings, patience: float = PATIENCE
+    observer: Observer, masters: MasterResolver, settings: PlanSettings, patience: float = PATIENCE
 ) -> Look:
     """Look at the engine, resolve the masters' hosts, and find this host's address towards them.
 
@@ -45,7 +43,7 @@ def master_hosts(observed: Observed, settings: PlanSettings) -> list[str]:
     return sorted({where.host.lower() for where in found if where})
 
 
-def unresolved(look: Look, masters: Masters, settings: PlanSettings) -> list[Problem]:
+def unresolved(look: Look, masters: MasterResolver, settings: PlanSettings) -> list[Problem]:
     """The masters whose hosts can't be resolved, and what to do about it."""
     return [
         Problem(

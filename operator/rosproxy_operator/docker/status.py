@@ -7,27 +7,22 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from rosproxy import __version__
-from rosproxy.core.uris import HostPort, parse_host_port
-from rosproxy_operator.core.docker.actions import Action
-from rosproxy_operator.core.docker.fingerprint import proxy_name, sandbox_name
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import (
-    Container,
-    Key,
-    Proxy,
-    Sandbox,
-)
-from rosproxy_operator.core.docker.plan import Plan, plan
-from rosproxy_operator.core.docker.report import line
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.problem import Problem
+from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.details import Inspector
-from rosproxy_operator.docker.engine import Engine
-from rosproxy_operator.docker.observe import Look, Observer
+from rosproxy_operator.docker.planner.actions import Action
+from rosproxy_operator.docker.planner.model import Container, Key, Proxy, Sandbox
+from rosproxy_operator.docker.planner.plan import Plan, plan
+from rosproxy_operator.docker.planner.report import line
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
+from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.proxy_sync import silence
 from rosproxy_operator.docker.sense import sense, unresolved
-from rosproxy_operator.docker.teller import silence
-from rosproxy_operator.masters import Masters
-from rosproxy_operator.proxies import Json, Proxies, ProxyError
+from rosproxy_operator.docker.snapshot import Look, Observer
 
 Own = TypeVar("Own", Proxy, Sandbox)
 PATIENCE = 3.0
@@ -53,7 +48,7 @@ class Survey:
 
 async def survey(settings: PlanSettings) -> Survey:
     """Look at the engine and ask all proxies. Raises EngineError."""
-    engine, masters, proxies = Engine(), Masters(_nothing), Proxies()
+    engine, masters, proxies = DockerClient(), MasterResolver(_nothing), ProxyClient()
     observer = Observer(engine, settings, Inspector(engine, _nothing))
     try:
         look = await sense(observer, masters, settings, PATIENCE)
@@ -74,7 +69,7 @@ async def survey(settings: PlanSettings) -> Survey:
 
 
 def describe(found: Survey, settings: PlanSettings) -> Json:
-    """A survey as JSON: what `rosproxy_operator.core.docker.report.render` shows."""
+    """A survey as JSON: what `rosproxy_operator.docker.planner.report.render` shows."""
     observed = found.look.observed
     keys = {wish.id: wish.key for wish in found.plan.wishes if wish.key in observed.keys}
     listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
@@ -174,7 +169,7 @@ def _meant(container: Container, found: Survey) -> bool:
     return any(problem.subject == f"container {container.name}" for problem in found.problems)
 
 
-async def _ask(proxies: Proxies, where: HostPort) -> Json | ProxyError:
+async def _ask(proxies: ProxyClient, where: HostPort) -> Json | ProxyError:
     try:
         return await proxies.status(where)
     except ProxyError as error:

@@ -28,14 +28,9 @@ from kubernetes.config import ConfigException, load_incluster_config, load_kube_
 from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
-from rosproxy_operator.core.kubernetes.model import Json, Name
-from rosproxy_operator.core.kubernetes.names import (
-    GROUP,
-    OWN_SELECTOR,
-    PLURAL,
-    VERSION,
-)
 from rosproxy_operator.kubernetes.errors import ApiError, Kind, refusal, unreachable
+from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.planner.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
 
 Found = dict[str, Any]
 Timeout = tuple[float, float]
@@ -61,7 +56,7 @@ class Api:
         configuration = _configuration()
         self.server = str(configuration.host)
         self._client = ApiClient(configuration)
-        self._client.user_agent = f"rosproxy-controller/{__version__}"
+        self._client.user_agent = f"rosproxy-operator/{__version__}"
         self._versions: dict[str, str] = {}
 
     def close(self) -> None:

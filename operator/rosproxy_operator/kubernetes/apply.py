@@ -9,8 +9,14 @@ import logging
 import secrets
 from collections.abc import Callable, Iterable
 
-from rosproxy.tasks import Tasks
-from rosproxy_operator.core.kubernetes.actions import (
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api import WITHIN, Api, Timeout
+from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.events import emit
+from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
     CreateService,
@@ -20,16 +26,10 @@ from rosproxy_operator.core.kubernetes.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.core.kubernetes.manifests import with_token, without_cluster_ip
-from rosproxy_operator.core.kubernetes.model import Failure, Json, Name, Observed
-from rosproxy_operator.core.kubernetes.names import CONTAINER, KIND, is_own
-from rosproxy_operator.core.problem import Problem
-from rosproxy_operator.kubernetes.api import WITHIN, Api, Timeout
-from rosproxy_operator.kubernetes.converse import address_of
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
-from rosproxy_operator.kubernetes.happen import emit
-from rosproxy_operator.proxies import Proxies, ProxyError
-from rosproxy_operator.threads import in_thread
+from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
+from rosproxy_operator.kubernetes.planner.model import Failure, Json, Name, Observed
+from rosproxy_operator.kubernetes.planner.names import CONTAINER, KIND, is_own
+from rosproxy_operator.kubernetes.proxy_sync import address_of
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class Applier:
     ``counted`` is called with each action and its outcome (ok, failed).
     """
 
-    def __init__(self, api: Api, proxies: Proxies, tasks: Tasks, counted: Count) -> None:
+    def __init__(self, api: Api, proxies: ProxyClient, tasks: Tasks, counted: Count) -> None:
         self._api, self._proxies, self._tasks, self._counted = api, proxies, tasks, counted
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()

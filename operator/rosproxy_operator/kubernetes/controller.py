@@ -6,21 +6,21 @@ import logging
 import time
 from collections.abc import Callable
 
-from rosproxy.tasks import Tasks
-from rosproxy_operator.core.kubernetes.memory import Memory
-from rosproxy_operator.core.kubernetes.model import Observed, ProxyPod
-from rosproxy_operator.core.kubernetes.plan import Plan, plan
-from rosproxy_operator.core.problem import Problem
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.apply import Applier
-from rosproxy_operator.kubernetes.concern import Concern
-from rosproxy_operator.kubernetes.converse import Conversations
 from rosproxy_operator.kubernetes.errors import ApiError, Kind
-from rosproxy_operator.kubernetes.happen import stamp
-from rosproxy_operator.kubernetes.observe import Cluster, Observer
-from rosproxy_operator.metrics import ClusterMetrics
-from rosproxy_operator.problems import ProblemLog
-from rosproxy_operator.proxies import Proxies
+from rosproxy_operator.kubernetes.event_filter import EventFilter
+from rosproxy_operator.kubernetes.events import stamp
+from rosproxy_operator.kubernetes.planner.model import Observed, ProxyPod
+from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.proxy_sync import ProxySync
+from rosproxy_operator.kubernetes.snapshot import Cluster, Observer
 from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ LONGEST_BEAT = 20.0
 """Seconds after which an event loop that does nothing hangs."""
 
 
-class Controller:
+class KubernetesController:
     """A controller of one cluster. `run` it in an event loop.
 
     `wake`, `concern` and `dead` may be called from other threads, all else only from that loop.
@@ -49,11 +49,11 @@ class Controller:
         self._again = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._tasks = Tasks()
-        self._proxies = Proxies()
+        self._proxies = ProxyClient()
         self._observer = Observer(api)
         self._applier = Applier(api, self._proxies, self._tasks, metrics.count)
-        self._conversations = Conversations(self._tasks, self._proxies, self._again.set)
-        self.concern = Concern()
+        self._conversations = ProxySync(self._tasks, self._proxies, self._again.set)
+        self.concern = EventFilter()
         self.appeared: Callable[[], None] = lambda: None
         self._missing = False
         self._timer: asyncio.TimerHandle | None = None

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import kopf
 
-from rosproxy_operator.core.kubernetes.names import GROUP, INJECT, PLURAL, VERSION
-from rosproxy_operator.kubernetes.concern import Concern
-from rosproxy_operator.kubernetes.wire import Wirer
+from rosproxy_operator.kubernetes.event_filter import EventFilter
+from rosproxy_operator.kubernetes.planner.names import GROUP, INJECT, PLURAL, VERSION
+from rosproxy_operator.kubernetes.webhook.injector import Injector
 
 WIRE = "wire"
 """The handler's id, and so the path of the webhook."""
@@ -19,7 +19,7 @@ WIRE = "wire"
 class Wakeable(Protocol):
     """What events and probes are told to."""
 
-    concern: Concern
+    concern: EventFilter
 
     def wake(self) -> None:
         """Let it look again soon."""
@@ -34,7 +34,7 @@ class Dead(Exception):
 
 def registry(
     controller: Wakeable,
-    wirer: Wirer | None,
+    wirer: Injector | None,
     configure: Callable[[kopf.OperatorSettings], None],
 ) -> kopf.OperatorRegistry:
     """All handlers. Without a ``wirer`` there is no webhook; ``configure`` is called at start."""
@@ -86,7 +86,7 @@ def _events(handlers: kopf.OperatorRegistry, controller: Wakeable) -> None:
     on(concern.service, "", "v1", "services")
 
 
-def _webhook(handlers: kopf.OperatorRegistry, wirer: Wirer) -> None:
+def _webhook(handlers: kopf.OperatorRegistry, wirer: Injector) -> None:
     @kopf.on.mutate(
         "",
         "v1",

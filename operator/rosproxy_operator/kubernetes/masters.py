@@ -3,9 +3,9 @@
 from collections.abc import Collection
 from ipaddress import ip_address
 
-from rosproxy_operator.core.kubernetes.model import Name
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.planner.model import Name
 
 
 def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str]:

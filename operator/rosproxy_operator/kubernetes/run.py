@@ -5,14 +5,14 @@ import logging
 import signal
 
 from rosproxy import __version__
-from rosproxy_operator.health import Health
+from rosproxy_operator.common.health import Health
+from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.controller import Controller
-from rosproxy_operator.kubernetes.keeper import Keeper, source
+from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.watch import Watch
-from rosproxy_operator.kubernetes.webhook import WebhookServer
-from rosproxy_operator.kubernetes.wire import Wirer
-from rosproxy_operator.metrics import ClusterMetrics
+from rosproxy_operator.kubernetes.webhook.injector import Injector
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
+from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
@@ -31,17 +31,19 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = ClusterMetrics()
-    controller = Controller(settings, api, metrics)
+    controller = KubernetesController(settings, api, metrics)
     health = Health(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
     log.info(
-        "rosproxy-controller %s: looking after %s at %s; health and metrics at http://%s",
+        "rosproxy-operator %s: looking after %s at %s; health and metrics at http://%s",
         __version__,
         ", ".join(settings.namespaces) or "all namespaces",
         api.server,
         settings.admin,
     )
-    keeper = Keeper(source(api, settings.webhook), metrics) if settings.webhook else None
+    keeper = (
+        CertificateRotation(source(api, settings.webhook), metrics) if settings.webhook else None
+    )
     watch = _watch(settings, controller, api, keeper, metrics)
     controller.appeared = watch.restart
     running = [controller.run(), stopped.wait(), *([keeper.run()] if keeper else [])]
@@ -58,12 +60,12 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
 
 def _watch(
     settings: KubernetesSettings,
-    controller: Controller,
+    controller: KubernetesController,
     api: Api,
-    keeper: Keeper | None,
+    keeper: CertificateRotation | None,
     metrics: ClusterMetrics,
 ) -> Watch:
     if settings.webhook is None or keeper is None:
         return Watch(settings, controller, None, None, metrics)
     server = WebhookServer(settings.webhook.bind, keeper)
-    return Watch(settings, controller, Wirer(api, metrics), server, metrics)
+    return Watch(settings, controller, Injector(api, metrics), server, metrics)

@@ -15,10 +15,10 @@ from typing import Any, cast
 
 import kopf
 
+from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.handlers import Wakeable, registry
-from rosproxy_operator.kubernetes.webhook import WebhookServer
-from rosproxy_operator.kubernetes.wire import Wirer
-from rosproxy_operator.metrics import ClusterMetrics
+from rosproxy_operator.kubernetes.webhook.injector import Injector
+from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class Watch:
         self,
         settings: KubernetesSettings,
         controller: Wakeable,
-        wirer: Wirer | None,
+        wirer: Injector | None,
         server: WebhookServer | None,
         metrics: ClusterMetrics,
     ) -> None:
@@ -128,7 +128,7 @@ class Watch:
             registry=registry(self._controller, self._wirer, self.configure),
             standalone=True,
             # kopf would ask for the user's name otherwise, and an image's user has none.
-            identity=cast(Any, "rosproxy-controller"),
+            identity=cast(Any, "rosproxy-operator"),
             liveness_endpoint=f"http://{self._settings.liveness}/healthz",
             clusterwide=not namespaces,
             namespaces=namespaces,

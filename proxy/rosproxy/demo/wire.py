@@ -7,7 +7,7 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rosproxy.core.tcpros import HeaderError, decode_header, encode_header, header_length
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 
 _LENGTH = struct.Struct("<I")
 MAX_BLOCK = 1 << 20

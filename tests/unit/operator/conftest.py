@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rosproxy_operator.kubernetes.api import Api
-from tests.unit.operator.api_server import ApiServer, serving
+from tests.unit.operator.kubernetes.api_server import ApiServer, serving
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import logging
 
 import pytest
 
-from rosproxy_operator.core.problem import Problem
-from rosproxy_operator.problems import ProblemLog
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem_log import ProblemLog
 
 FATAL = Problem("container talker", "no master is known")
 WARNING = Problem("container talker", "label x is unknown", fatal=False)

@@ -4,17 +4,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.docker.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.core.docker.fingerprint import (
-    fingerprint,
-    master,
-    own_labels,
-    proxy_name,
-    sandbox_fingerprint,
-    sandbox_name,
-)
-from rosproxy_operator.core.docker.model import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
     Host,
@@ -24,7 +16,15 @@ from rosproxy_operator.core.docker.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
+    fingerprint,
+    master,
+    own_labels,
+    proxy_name,
+    sandbox_fingerprint,
+    sandbox_name,
+)
 
 ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"

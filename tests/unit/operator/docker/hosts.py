@@ -7,10 +7,16 @@ import contextlib
 from collections.abc import Sequence
 from typing import TypeVar
 
-from rosproxy.core.ports import PortRange
-from rosproxy.core.settings import DataPlane
-from rosproxy_operator.core.docker.actions import Action, CreateSandbox, Start
-from rosproxy_operator.core.docker.fingerprint import (
+from rosproxy.leases.ports import PortRange
+from rosproxy.settings import DataPlane
+from rosproxy_operator.common.allocation import overlap
+from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
+from rosproxy_operator.docker.planner.data_planes import chosen
+from rosproxy_operator.docker.planner.labels import read_wishes
+from rosproxy_operator.docker.planner.model import STARTED, Key, Wish
+from rosproxy_operator.docker.planner.plan import Plan
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
     Own,
@@ -20,13 +26,7 @@ from rosproxy_operator.core.docker.fingerprint import (
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.docker.labels import read_wishes
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import STARTED, Key, Wish
-from rosproxy_operator.core.docker.plan import Plan
-from rosproxy_operator.core.docker.planes import chosen
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.ports import overlap
+from rosproxy_operator.docker.planner.state import Memory
 from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engine, Failed, Refused
 
 HERE = "192.0.2.10"

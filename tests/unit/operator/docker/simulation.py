@@ -4,8 +4,8 @@ import itertools
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.docker.actions import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
@@ -18,15 +18,7 @@ from rosproxy_operator.core.docker.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.docker.fingerprint import (
-    ROLE_PROXY,
-    ROLE_SANDBOX,
-    Own,
-    own_labels,
-    read_own,
-)
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import (
+from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
     Container,
@@ -36,8 +28,16 @@ from rosproxy_operator.core.docker.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.core.docker.plan import Plan, plan
-from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.docker.planner.plan import Plan, plan
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
+    ROLE_PROXY,
+    ROLE_SANDBOX,
+    Own,
+    own_labels,
+    read_own,
+)
+from rosproxy_operator.docker.planner.state import Memory
 
 SERVING = {"running", "paused", "restarting"}
 

@@ -4,27 +4,27 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy.core.settings import DataPlane
-from rosproxy_operator.core.docker.actions import (
+from rosproxy.settings import DataPlane
+from rosproxy_operator.docker.planner.actions import (
     Action,
     Create,
     CreateSandbox,
     ProxySpec,
     SandboxSpec,
 )
-from rosproxy_operator.core.docker.fingerprint import (
+from rosproxy_operator.docker.planner.labels import read_wishes
+from rosproxy_operator.docker.planner.model import Container, Proxy, Sandbox
+from rosproxy_operator.docker.planner.plan import Plan, plan
+from rosproxy_operator.docker.planner.report import line
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
     container_config,
     fingerprint,
     proxy_name,
     sandbox_config,
     sandbox_fingerprint,
 )
-from rosproxy_operator.core.docker.labels import read_wishes
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import Container, Proxy, Sandbox
-from rosproxy_operator.core.docker.plan import Plan, plan
-from rosproxy_operator.core.docker.report import line
-from rosproxy_operator.core.docker.settings import PlanSettings
+from rosproxy_operator.docker.planner.state import Memory
 from tests.unit.operator.docker.builders import (
     ENABLED,
     IMAGE,

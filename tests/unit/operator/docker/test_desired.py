@@ -5,20 +5,14 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.core.docker.aliases import assign
-from rosproxy_operator.core.docker.desired import desire
-from rosproxy_operator.core.docker.fingerprint import proxy_name
-from rosproxy_operator.core.docker.labels import read_wishes
-from rosproxy_operator.core.docker.memory import Memory, noticed
-from rosproxy_operator.core.docker.model import (
-    Container,
-    Desired,
-    Key,
-    Network,
-    Observed,
-)
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.aliases import assign
+from rosproxy_operator.docker.planner.desired import desire
+from rosproxy_operator.docker.planner.labels import read_wishes
+from rosproxy_operator.docker.planner.model import Container, Desired, Key, Network, Observed
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import proxy_name
+from rosproxy_operator.docker.planner.state import Memory, noticed
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,

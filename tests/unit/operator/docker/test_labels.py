@@ -6,14 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.core.docker.labels import masters, read_wishes
-from rosproxy_operator.core.docker.model import (
-    Container,
-    Key,
-    Wish,
-)
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.labels import masters, read_wishes
+from rosproxy_operator.docker.planner.model import Container, Key, Wish
+from rosproxy_operator.docker.planner.settings import PlanSettings
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,

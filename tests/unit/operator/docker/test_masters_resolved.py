@@ -2,8 +2,8 @@
 
 import pytest
 
-from rosproxy_operator import masters as module
-from rosproxy_operator.masters import Masters
+from rosproxy_operator.common import resolver as module
+from rosproxy_operator.common.resolver import MasterResolver
 
 
 class Names:
@@ -33,17 +33,17 @@ def changes() -> list[int]:
 
 
 @pytest.fixture
-def masters(changes: list[int]) -> Masters:
-    return Masters(lambda: changes.append(1))
+def masters(changes: list[int]) -> MasterResolver:
+    return MasterResolver(lambda: changes.append(1))
 
 
-async def test_an_address_needs_no_name_server(masters: Masters, names: Names) -> None:
+async def test_an_address_needs_no_name_server(masters: MasterResolver, names: Names) -> None:
     await masters.learn(["192.0.2.7"], {}, [])
     assert masters.address("192.0.2.7") == "192.0.2.7"
     assert names.asked == []
 
 
-async def test_a_name_is_asked_for_when_it_is_new(masters: Masters, names: Names) -> None:
+async def test_a_name_is_asked_for_when_it_is_new(masters: MasterResolver, names: Names) -> None:
     names.known["robot"] = ["192.0.2.7"]
     for _ in range(2):
         await masters.learn(["robot"], {}, [])
@@ -52,7 +52,7 @@ async def test_a_name_is_asked_for_when_it_is_new(masters: Masters, names: Names
 
 
 async def test_the_last_good_address_is_kept(
-    masters: Masters, names: Names, changes: list[int]
+    masters: MasterResolver, names: Names, changes: list[int]
 ) -> None:
     names.known["robot"] = ["192.0.2.7"]
     await masters.learn(["robot"], {}, [])
@@ -62,7 +62,7 @@ async def test_the_last_good_address_is_kept(
     assert changes == []
 
 
-async def test_a_change_is_told(masters: Masters, names: Names, changes: list[int]) -> None:
+async def test_a_change_is_told(masters: MasterResolver, names: Names, changes: list[int]) -> None:
     names.known["robot"] = ["192.0.2.7", "192.0.2.8"]
     await masters.learn(["robot"], {}, [])
     names.known["robot"].reverse()  # the one in use is still good
@@ -73,14 +73,16 @@ async def test_a_change_is_told(masters: Masters, names: Names, changes: list[in
     assert (masters.address("robot"), changes) == ("192.0.2.9", [1])
 
 
-async def test_neither_loopback_nor_a_proxy_is_a_master(masters: Masters, names: Names) -> None:
+async def test_neither_loopback_nor_a_proxy_is_a_master(
+    masters: MasterResolver, names: Names
+) -> None:
     names.known["robot"] = ["127.0.1.1", "172.18.0.2", "192.0.2.7"]
     await masters.learn(["robot"], {}, ["172.18.0.2"])
     assert masters.address("robot") == "192.0.2.7"
 
 
 async def test_what_the_engine_knows_helps_where_no_name_server_does(
-    masters: Masters, names: Names
+    masters: MasterResolver, names: Names
 ) -> None:
     await masters.learn(["roscore", "robot"], {"roscore": "172.18.0.5"}, [])
     assert masters.address("roscore") == "172.18.0.5"
@@ -88,7 +90,7 @@ async def test_what_the_engine_knows_helps_where_no_name_server_does(
 
 
 async def test_names_that_nobody_uses_any_more_are_forgotten(
-    masters: Masters, names: Names
+    masters: MasterResolver, names: Names
 ) -> None:
     names.known["robot"] = ["192.0.2.7"]
     await masters.learn(["robot"], {}, [])

@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.docker.actions import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.moves import Move
+from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
@@ -22,17 +23,16 @@ from rosproxy_operator.core.docker.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.docker.fingerprint import (
+from rosproxy_operator.docker.planner.model import Key, Network, Observed
+from rosproxy_operator.docker.planner.plan import Plan, plan
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import (
     fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.core.docker.memory import Memory
-from rosproxy_operator.core.docker.model import Key, Network, Observed
-from rosproxy_operator.core.docker.plan import Plan, plan
-from rosproxy_operator.core.docker.settings import PlanSettings
-from rosproxy_operator.core.moves import Move
+from rosproxy_operator.docker.planner.state import Memory
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,

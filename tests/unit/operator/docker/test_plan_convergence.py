@@ -9,8 +9,8 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.core.docker.model import Container
-from rosproxy_operator.core.docker.plan import plan
+from rosproxy_operator.docker.planner.model import Container
+from rosproxy_operator.docker.planner.plan import plan
 from tests.unit.operator.docker.builders import container
 from tests.unit.operator.docker.hosts import SETTINGS, Hosts
 

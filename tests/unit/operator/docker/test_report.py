@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.core.text import width
-from rosproxy_operator.core.docker.actions import (
+from rosproxy.telemetry.text import width
+from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
@@ -20,7 +20,7 @@ from rosproxy_operator.core.docker.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.core.docker.report import line, plan_text, render
+from rosproxy_operator.docker.planner.report import line, plan_text, render
 from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {
@@ -103,7 +103,7 @@ def test_a_plan_is_its_lines() -> None:
 
 def test_the_whole_status() -> None:
     assert render(STATUS, 100).splitlines() == [
-        "rosproxy-controller 1.0: 2 containers, 1 proxy, uplink network 0-rosproxy",
+        "rosproxy-operator 1.0: 2 containers, 1 proxy, uplink network 0-rosproxy",
         "",
         "PROXY                  STATE    MASTER              OUTSIDE     PORTS",
         "rosproxy-robot-eefee4  running  http://robot:11311  192.0.2.10  11400-11431 2 used",
@@ -152,7 +152,7 @@ def test_a_bound_on_lines(lines: int) -> None:
     text = render(status, 100, lines).splitlines()
     assert len(text) <= lines
     if lines < 100:
-        assert "more: rosproxy-controller docker status" in text[-1]
+        assert "more: rosproxy-operator docker status" in text[-1]
 
 
 NASTY = st.text(st.sampled_from("ab\x1b[2J\u202e\n\r\t漢 "), max_size=40)

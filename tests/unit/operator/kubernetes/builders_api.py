@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes.model import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner.model import (
     Answer,
     Master,
     Name,
@@ -15,7 +15,7 @@ from rosproxy_operator.core.kubernetes.model import (
     Spec,
     Stuck,
 )
-from rosproxy_operator.core.kubernetes.names import own_labels, proxy_name, service_name
+from rosproxy_operator.kubernetes.planner.names import own_labels, proxy_name, service_name
 
 Obj = dict[str, Any]
 

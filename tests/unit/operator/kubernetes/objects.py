@@ -5,12 +5,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes import manifests, names, parse
-from rosproxy_operator.core.kubernetes.actions import Action, Emit, PatchStatus
-from rosproxy_operator.core.kubernetes.manifests import Site, Upstream
-from rosproxy_operator.core.kubernetes.memory import Memory
-from rosproxy_operator.core.kubernetes.model import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner import manifests, names, objects
+from rosproxy_operator.kubernetes.planner.actions import Action, Emit, PatchStatus
+from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
+from rosproxy_operator.kubernetes.planner.model import (
     Finding,
     Master,
     Name,
@@ -23,8 +22,9 @@ from rosproxy_operator.core.kubernetes.model import (
     Spec,
     Stuck,
 )
-from rosproxy_operator.core.kubernetes.plan import Plan, plan
-from rosproxy_operator.core.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.state import Memory
 
 SETTINGS = ClusterSettings(image="rosproxy:1")
 STAMP = "2026-01-01T00:00:00Z"
@@ -86,7 +86,7 @@ def proxy(
     )
     body["metadata"]["uid"] = f"uid-proxy-{of.id.name}-{on.name}"
     running = phase == "Running" and stuck is None
-    found = parse.proxy_pod({**body, "status": {"phase": "Pending" if stuck else phase}})
+    found = objects.proxy_pod({**body, "status": {"phase": "Pending" if stuck else phase}})
     assert found is not None
     where = {"node": "" if stuck else on.name, "ip": "10.244.1.200" if running else ""}
     own = replace(found.pod, **where | changes)

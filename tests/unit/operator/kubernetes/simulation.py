@@ -9,8 +9,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from rosproxy_operator.core.kubernetes import names, parse, parse_rosproxy
-from rosproxy_operator.core.kubernetes.actions import (
+from rosproxy_operator.kubernetes.planner import names
+from rosproxy_operator.kubernetes.planner import objects as parse
+from rosproxy_operator.kubernetes.planner import spec as parse_rosproxy
+from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
     CreateService,
@@ -20,11 +22,11 @@ from rosproxy_operator.core.kubernetes.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.core.kubernetes.manifests import with_token, without_cluster_ip
-from rosproxy_operator.core.kubernetes.memory import Memory
-from rosproxy_operator.core.kubernetes.model import Answer, Failure, Name, Observed
-from rosproxy_operator.core.kubernetes.plan import Plan, plan
-from rosproxy_operator.core.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
+from rosproxy_operator.kubernetes.planner.model import Answer, Failure, Name, Observed
+from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.state import Memory
 
 NAMESPACE = "ros"
 BAD_IMAGE = "no-such-image"

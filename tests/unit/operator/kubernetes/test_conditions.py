@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy_operator.core.kubernetes.model import (
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.kubernetes.planner.model import (
     Answer,
     Failure,
     Finding,
@@ -13,9 +14,8 @@ from rosproxy_operator.core.kubernetes.model import (
     Reference,
     Stuck,
 )
-from rosproxy_operator.core.kubernetes.parse_answer import no_answer
-from rosproxy_operator.core.kubernetes.statuses import findings
-from rosproxy_operator.core.problem import Problem
+from rosproxy_operator.kubernetes.planner.proxy_status import no_answer
+from rosproxy_operator.kubernetes.planner.status import findings
 from tests.unit.operator.kubernetes.builders_api import answer, proxy, rosproxy, state, stuck_proxy
 from tests.unit.operator.kubernetes.status_cases import judged, message, status
 

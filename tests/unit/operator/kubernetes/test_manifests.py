@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from rosproxy.core.ports import PortRange
-from rosproxy.core.settings import Settings, parse_settings
-from rosproxy_operator.core.kubernetes import manifests, parse
-from rosproxy_operator.core.kubernetes.manifests import Site, Upstream
-from rosproxy_operator.core.kubernetes.model import Json, Master
+from rosproxy.leases.ports import PortRange
+from rosproxy.settings import Settings, parse_settings
+from rosproxy_operator.kubernetes.planner import manifests, objects
+from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
+from rosproxy_operator.kubernetes.planner.model import Json, Master
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
 
@@ -175,7 +175,7 @@ def test_the_master_in_the_cluster_counts_too() -> None:
 
 def test_a_pod_is_read_back_as_it_was_made() -> None:
     made = manifests.with_token(body(), "t0ken-t0ken")
-    found = parse.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
+    found = objects.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
     assert found is not None
     assert (found.of, found.owner, found.on) == (rosproxy().id, "uid-robot", "one")
     assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "t0ken-t0ken")
@@ -239,7 +239,7 @@ def test_a_service_leads_to_the_proxy_on_the_callers_own_node() -> None:
 
 def test_a_service_is_read_back_as_it_was_made() -> None:
     made = manifests.service(rosproxy(), "10.96.1.1")
-    found = parse.service({**made, "metadata": {**made["metadata"], "uid": "u"}})
+    found = objects.service({**made, "metadata": {**made["metadata"], "uid": "u"}})
     assert found is not None
     assert (found.of, found.owner, found.cluster_ip) == (rosproxy().id, "uid-robot", "10.96.1.1")
     assert found.fingerprint == manifests.fingerprint_of(manifests.service(rosproxy()))

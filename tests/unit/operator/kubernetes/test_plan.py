@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes import names
-from rosproxy_operator.core.kubernetes.actions import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner import names
+from rosproxy_operator.kubernetes.planner.actions import (
     CreateProxy,
     CreateService,
     DeleteProxy,
@@ -15,14 +15,14 @@ from rosproxy_operator.core.kubernetes.actions import (
     Emit,
     SetImage,
 )
-from rosproxy_operator.core.kubernetes.model import (
+from rosproxy_operator.kubernetes.planner.model import (
     Advertise,
     InvalidRosProxy,
     Master,
     Name,
     Observed,
 )
-from rosproxy_operator.core.kubernetes.plan import Plan
+from rosproxy_operator.kubernetes.planner.plan import Plan
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,

@@ -6,9 +6,9 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes.conditions import LONGEST
-from rosproxy_operator.core.kubernetes.model import (
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner.conditions import LONGEST
+from rosproxy_operator.kubernetes.planner.model import (
     Answer,
     InvalidRosProxy,
     NodeState,
@@ -16,7 +16,7 @@ from rosproxy_operator.core.kubernetes.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.core.kubernetes.statuses import (
+from rosproxy_operator.kubernetes.planner.status import (
     MOST_NAMES,
     MOST_NODES,
     invalid_finding,

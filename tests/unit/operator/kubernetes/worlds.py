@@ -3,13 +3,14 @@
 import copy
 from collections.abc import Iterator
 
-from rosproxy.core.ports import PortRange
-from rosproxy_operator.core.kubernetes import names, parse, parse_rosproxy
-from rosproxy_operator.core.kubernetes.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.core.kubernetes.memory import Place
-from rosproxy_operator.core.kubernetes.model import Finding, Name, ProxyPod
-from rosproxy_operator.core.kubernetes.plan import Plan
-from rosproxy_operator.core.kubernetes.select import chosen, on_node
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner import names, objects
+from rosproxy_operator.kubernetes.planner import spec as parse_rosproxy
+from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
+from rosproxy_operator.kubernetes.planner.model import Finding, Name, ProxyPod
+from rosproxy_operator.kubernetes.planner.plan import Plan
+from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.planner.state import Place
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     SETTINGS,
@@ -62,7 +63,7 @@ class World:
 
     def proxies(self) -> Iterator[tuple[Object, ProxyPod]]:
         for pod in self.own():
-            found = parse.proxy_pod(pod)
+            found = objects.proxy_pod(pod)
             assert found is not None
             yield pod, found
 
@@ -109,7 +110,7 @@ class World:
             seen = self.controller.old or self.cluster.state
             there = [pod for pod in seen.pods.values() if node_of(pod) == place.node]
             others = (pod for pod in there if not ended(pod) and not is_own(pod))
-            taken = {port for pod in others for port in parse.pod(pod).host_ports}
+            taken = {port for pod in others for port in objects.pod(pod).host_ports}
             assert not taken.intersection(range(first, last + 1)), "held by others"
         if before is not None and place not in self.may_move:
             count = self.cluster.state.rosproxies[action.of]["spec"]["ports"]
@@ -136,7 +137,7 @@ class World:
                 if place.node in (node_of(pod), meta(pod).get("annotations", {}).get(names.NODE))
                 and name_of(pod) != names.proxy_id(place.of, place.node)
             ]
-            taken = {port for pod in others for port in parse.pod(pod).host_ports}
+            taken = {port for pod in others for port in objects.pod(pod).host_ports}
             refused = {port for node, port in self.controller.memory.taken if node == place.node}
             if any(port in ports for port in taken | refused):
                 self.may_move.add(place)
@@ -160,7 +161,9 @@ class World:
         assert len(there) == len(set(there)), "one proxy for each RosProxy on a node"
         for node in self.nodes:
             pods = [p for p in self.cluster.state.pods.values() if node_of(p) == node]
-            ports = [port for p in pods if not ended(p) for port in sorted(parse.pod(p).host_ports)]
+            ports = [
+                port for p in pods if not ended(p) for port in sorted(objects.pod(p).host_ports)
+            ]
             assert len(ports) == len(set(ports))
 
     def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
@@ -186,10 +189,16 @@ class World:
         state = self.cluster.state
         rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
         wanted = set()
-        for pod in map(parse.pod, state.pods.values()):
+        for pod in map(objects.pod, state.pods.values()):
             of = chosen(pod, rosproxies).rosproxy
             node = state.nodes.get(pod.node)
-            if of and node and not pod.ended and not pod.deleting and on_node(of, parse.node(node)):
+            if (
+                of
+                and node
+                and not pod.ended
+                and not pod.deleting
+                and on_node(of, objects.node(node))
+            ):
                 wanted.add(Place(of.id, pod.node))
         unready = {node for node in self.nodes if not self.cluster.is_ready(node)}
         self.check_proxies(found, {place for place in wanted if place.node not in unready}, unready)

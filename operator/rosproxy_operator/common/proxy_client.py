@@ -1,0 +1,101 @@
+"""Asking and telling running proxies, over their admin endpoints."""
+
+import errno
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import aiohttp
+
+from rosproxy.net.addresses import HostPort
+
+Json = dict[str, Any]
+WITHIN = 3.0
+"""Seconds that a proxy has to answer."""
+WITHIN_MASTER = 40.0
+"""The same where it asks its master first, which may hang for 30 s."""
+
+
+class ProxyError(Exception):
+    """A proxy did not do what it was asked.
+
+    ``away`` if nothing at all is there: no route, or no answer. ``later`` if it is well, but needs
+    its master, which can't be asked now.
+    """
+
+    def __init__(self, message: str, away: bool = False, later: bool = False) -> None:
+        super().__init__(message)
+        self.away, self.later = away, later
+
+
+class ProxyClient:
+    """Calls the admin endpoints of proxies. Every call raises ProxyError."""
+
+    def __init__(self) -> None:
+        self._session: aiohttp.ClientSession | None = None
+
+    async def status(self, where: HostPort) -> Json:
+        """What a proxy's ``/status`` says."""
+        return await self._ask("GET", where, "/status")
+
+    async def master_address(self, where: HostPort, token: str, address: str) -> None:
+        """Tell where the master's host is now."""
+        await self._ask("POST", where, "/master-address", token, {"address": address})
+
+    async def containers(self, where: HostPort, token: str, body: Mapping[str, Any]) -> Json:
+        """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
+        return await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
+
+    async def retire(self, where: HostPort, token: str) -> Json:
+        """Let it unregister everything it holds at the master."""
+        return await self._ask("POST", where, "/retire", token, {}, WITHIN_MASTER)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        if self._session is not None:
+            await self._session.close()
+
+    async def _ask(
+        self,
+        method: str,
+        where: HostPort,
+        path: str,
+        token: str = "",
+        body: Mapping[str, Any] | None = None,
+        within: float = WITHIN,
+    ) -> Json:
+        if self._session is None:
+            self._session = aiohttp.ClientSession()
+        limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        url = f"http://{where}{path}"
+        try:
+            async with self._session.request(
+                method, url, json=body, headers=headers, timeout=limits
+            ) as reply:
+                return _read(reply.status, await reply.text(), f"{method} {url}")
+        except TimeoutError:
+            raise ProxyError(f"{where} does not answer", away=True) from None
+        except (OSError, aiohttp.ClientError) as error:
+            raise _no_answer(where, error) from None
+
+
+def _read(status: int, text: str, what: str) -> Json:
+    if status != 200:
+        message = f"{what} answers HTTP {status}: {text.strip()[:200]}"
+        raise ProxyError(message, later=status == 503)
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise ProxyError(f"{what} does not answer as a rosproxy does")
+    return found
+
+
+def _no_answer(where: HostPort, error: Exception) -> ProxyError:
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.ECONNREFUSED:
+        return ProxyError(f"{where} refuses connections")
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return ProxyError(f"{where} can't be reached ({reason})", away=number is not None)

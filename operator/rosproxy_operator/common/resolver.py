@@ -1,0 +1,72 @@
+"""Where the masters are: their hosts' addresses, as this host resolves them."""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Mapping
+
+from rosproxy.net.addresses import is_address, is_loopback, plain_address
+from rosproxy.net.resolver import resolve
+
+AGAIN = 15.0
+"""Seconds after which a name is resolved anew."""
+AGAIN_UNRESOLVED = 3.0
+"""The same for a name that could not be resolved."""
+THIS_HOST = "host.docker.internal"
+"""How containers call the host that they run on."""
+
+
+class MasterResolver:
+    """The addresses of masters' hosts. The last good one is kept while a name server fails.
+
+    ``changed`` is called when an address has changed. The host of every method is a name or an
+    address, in lower case.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._good: dict[str, str] = {}
+        self._asked: dict[str, float] = {}
+        self._known: Mapping[str, str] = {}
+        self._never: frozenset[str] = frozenset()
+
+    def address(self, host: str) -> str:
+        """The address of a host; empty if it could not be resolved yet."""
+        if is_address(host):
+            return plain_address(host)
+        return self._good.get(host) or self._known.get(host, "")
+
+    async def learn(
+        self, hosts: Iterable[str], known: Mapping[str, str], never: Iterable[str]
+    ) -> None:
+        """Resolve those hosts that are new and forget those that are not named any more.
+
+        ``known`` are addresses for hosts that can't be resolved, ``never`` those that can't be a
+        master's: the proxies' own, which answer to their masters' names.
+        """
+        self._known, self._never = known, frozenset(never)
+        wanted = {host for host in hosts if not is_address(host)}
+        self._asked = {host: self._asked.get(host, 0.0) for host in wanted}
+        self._good = {host: self._good[host] for host in wanted if host in self._good}
+        await self._ask([host for host, when in self._asked.items() if not when])
+
+    async def refresh(self) -> None:
+        """Resolve anew what is due."""
+        now, before = time.monotonic(), dict(self._good)
+        await self._ask(
+            [host for host, when in self._asked.items() if now >= when + self._age(host)]
+        )
+        if self._good != before:
+            self._changed()
+
+    def _age(self, host: str) -> float:
+        return AGAIN if host in self._good else AGAIN_UNRESOLVED
+
+    async def _ask(self, hosts: list[str]) -> None:
+        found = await asyncio.gather(*map(resolve, hosts))
+        for host, addresses in zip(hosts, found, strict=True):
+            if host not in self._asked:  # forgotten meanwhile
+                continue
+            self._asked[host] = time.monotonic()
+            usable = [a for a in addresses if not is_loopback(a) and a not in self._never]
+            if usable and self._good.get(host) not in usable:
+                self._good[host] = usable[0]

@@ -1,1 +1,0 @@
-"""What the controllers decide: pure functions over dataclasses."""

@@ -1,0 +1,212 @@
+"""Work under way: the groups of a plan, each key's apart from the others'.
+
+A key's work may take a minute (the engine publishes a thousand ports) or fail for ever; meanwhile
+looks go on and the other keys are served.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.errors import EngineError, PortTaken
+from rosproxy_operator.docker.planner.actions import Action, Connect, Disconnect
+from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.docker.planner.plan import Group
+from rosproxy_operator.docker.planner.report import line
+from rosproxy_operator.docker.planner.specs import proxy_name
+
+log = logging.getLogger(__name__)
+
+BACK_OFF = (1.0, 2.0, 5.0, 15.0, 60.0)
+"""Seconds until the same actions are tried again that have failed; the last is repeated."""
+
+QUIET = 120.0
+"""Seconds without a failure after which the same one is worth a line in the log again."""
+
+CarryOut = Callable[[Action], Awaitable[None]]
+
+
+@dataclass(slots=True)
+class _Failure:
+    """What failed for a key, how often in a row, when to try again, and what to tell."""
+
+    actions: tuple[Action, ...]
+    count: int
+    again: float
+    problem: Problem
+
+
+class Executor:
+    """Carries groups of actions out, those of one key one after the other.
+
+    ``finished`` is called when a key's work is over, ``port_taken`` with a container's name and the
+    port (None if unknown) when it could not be started for that, ``counted`` with each action and
+    its outcome (ok, failed, taken).
+    """
+
+    def __init__(
+        self,
+        tasks: Tasks,
+        finished: Callable[[], None],
+        port_taken: Callable[[str, int | None], None],
+        counted: Callable[[Action, str], None],
+    ) -> None:
+        self._tasks, self._finished = tasks, finished
+        self._port_taken, self._counted = port_taken, counted
+        self._busy: dict[Key | None, asyncio.Task[None]] = {}
+        self._failures: dict[Key | None, _Failure] = {}
+        self._over: dict[Key | None, float] = {}
+        self._refused: dict[Action, tuple[str, float]] = {}
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is under way."""
+        return bool(self._busy)
+
+    @property
+    def subjects(self) -> frozenset[str]:
+        """What is being worked on, as problems name it."""
+        return frozenset(map(_subject, self._busy))
+
+    @property
+    def problems(self) -> list[Problem]:
+        """What has failed and was not put right yet."""
+        return [failure.problem for failure in self._failures.values()]
+
+    @property
+    def again_in(self) -> float | None:
+        """Seconds until something that has failed may be tried again; None if nothing has."""
+        times = [f.again for key, f in self._failures.items() if key not in self._busy]
+        return max(min(times) - time.monotonic(), 0.0) if times else None
+
+    def start(self, groups: Iterable[Group], carry_out: CarryOut, seen: float) -> None:
+        """Begin what is not under way and did not fail just now, and return.
+
+        ``seen`` is when the look began (monotonic) that the groups were planned from: it may not
+        have seen what work did that was over only after that.
+        """
+        self._forget_refusals()
+        groups = [group for group in groups if self._over.get(group.key, 0.0) < seen]
+        by_key: dict[Key | None, list[Group]] = {}
+        for group in groups:
+            by_key.setdefault(group.key, []).append(group)
+        self._failures = {
+            key: each
+            for key, each in self._failures.items()
+            if key in by_key or self._over.get(key, 0.0) >= seen
+        }
+        first = by_key.pop(None, [])
+        if first:
+            self._start(None, first, carry_out)
+        uplink = self._busy.get(None)
+        for key, some in by_key.items():
+            self._start(key, some, carry_out, uplink)
+
+    def _start(
+        self,
+        key: Key | None,
+        groups: list[Group],
+        carry_out: CarryOut,
+        after: "asyncio.Task[None] | None" = None,
+    ) -> None:
+        failure = self._failures.get(key)
+        actions = tuple(action for group in groups for action in group.actions)
+        waiting = failure and failure.actions == actions and time.monotonic() < failure.again
+        if key in self._busy or waiting or not actions:
+            return
+        name = f"work for {key.master_uri if key else 'the uplink'}"
+        work = self._run(key, groups, actions, carry_out, after)
+        self._busy[key] = self._tasks.spawn(work, name)
+
+    async def _run(
+        self,
+        key: Key | None,
+        groups: list[Group],
+        actions: tuple[Action, ...],
+        carry_out: CarryOut,
+        after: "asyncio.Task[None] | None",
+    ) -> None:
+        try:
+            if after is not None:
+                await asyncio.wait([after])
+            problem = await self._all(key, groups, carry_out)
+            if problem is None:
+                self._failures.pop(key, None)
+            else:
+                self._failed(key, actions, problem)
+        finally:
+            del self._busy[key]
+            self._over[key] = time.monotonic()
+            self._finished()
+
+    async def _all(
+        self, key: Key | None, groups: Iterable[Group], carry_out: CarryOut
+    ) -> Problem | None:
+        """Carry out all groups; the first thing that went wrong."""
+        try:
+            problems = [await self._group(group, carry_out) for group in groups]
+        except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
+            log.exception("work for %s failed", key)
+            return Problem(_subject(key), f"the controller failed: {error!r}")
+        return next((problem for problem in problems if problem), None)
+
+    def _failed(self, key: Key | None, actions: tuple[Action, ...], problem: Problem) -> None:
+        before = self._failures.get(key)
+        count = before.count + 1 if before and before.actions == actions else 1
+        pause = BACK_OFF[min(count, len(BACK_OFF)) - 1]
+        self._failures[key] = _Failure(actions, count, time.monotonic() + pause, problem)
+
+    async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
+        """Carry a group out as far as possible; what went wrong.
+
+        A network that can't be joined or left does not keep a proxy from serving the others.
+        """
+        problem: Problem | None = None
+        for action in group.actions:
+            try:
+                await self._one(action, carry_out)
+            except PortTaken as error:
+                self._refuse(action, error)
+                self._port_taken(getattr(action, "name", ""), error.port)
+                return problem
+            except EngineError as error:
+                self._refuse(action, error)
+                problem = Problem(_subject(group.key), f"{line(action)}: {error}")
+                if not isinstance(action, Connect | Disconnect):
+                    break
+        return problem
+
+    async def _one(self, action: Action, carry_out: CarryOut) -> None:
+        again = action in self._refused
+        log.log(logging.DEBUG if again else logging.INFO, "%s", line(action))
+        outcome = "failed"
+        started = time.monotonic()
+        try:
+            await carry_out(action)
+            outcome = "ok"
+            self._refused.pop(action, None)
+        except PortTaken:
+            outcome = "taken"
+            raise
+        finally:
+            self._counted(action, outcome)
+            log.debug("%s: %s in %.3f s", line(action), outcome, time.monotonic() - started)
+
+    def _refuse(self, action: Action, error: EngineError) -> None:
+        """Log why an action failed, once while it is tried again and again."""
+        reason = type(error).__name__ if isinstance(error, PortTaken) else str(error)
+        again = self._refused.get(action, ("", 0.0))[0] == reason
+        log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", line(action), error)
+        self._refused[action] = reason, time.monotonic()
+
+    def _forget_refusals(self) -> None:
+        long_ago = time.monotonic() - QUIET
+        self._refused = {a: each for a, each in self._refused.items() if each[1] > long_ago}
+
+
+def _subject(key: Key | None) -> str:
+    return f"proxy {proxy_name(key)}" if key else "uplink"

@@ -1,0 +1,77 @@
+"""What the operating system knows of this host's ports and addresses."""
+
+import errno
+import socket
+from collections.abc import Collection, Iterable
+from pathlib import Path
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import is_loopback
+from rosproxy.net.interfaces import address_towards
+
+USUAL_EPHEMERAL = PortRange(32768, 60999)
+_LISTEN = "0A"
+_ELSEWHERE = "192.0.2.1"
+"""An address of no network (RFC 5737), to find out where connections to far hosts leave."""
+
+
+def ephemeral_ports() -> PortRange:
+    """The range from which the kernel takes ports for connections, in this network namespace."""
+    return parse_ephemeral(_text("/proc/sys/net/ipv4/ip_local_port_range"))
+
+
+def listening_ports() -> frozenset[int]:
+    """The TCP ports on which anything listens, in this network namespace."""
+    return parse_listening(_text("/proc/net/tcp")) | parse_listening(_text("/proc/net/tcp6"))
+
+
+def parse_ephemeral(text: str) -> PortRange:
+    """The range in ``ip_local_port_range``; the kernel's default if there is none."""
+    words = text.split()
+    if len(words) != 2 or not all(word.isdecimal() for word in words):
+        return USUAL_EPHEMERAL
+    return PortRange(int(words[0]), int(words[1]))
+
+
+def parse_listening(text: str) -> frozenset[int]:
+    """The ports of listening sockets in ``/proc/net/tcp`` or ``/proc/net/tcp6``."""
+    rows = (line.split()[:4] for line in text.splitlines()[1:])
+    return frozenset(
+        int(row[1].rpartition(":")[2], 16) for row in rows if len(row) == 4 and row[3] == _LISTEN
+    )
+
+
+def has_any(addresses: Iterable[str]) -> bool:
+    """Whether one of these is an address of this machine, as seen in this network namespace."""
+    return any(has(address) for address in addresses if address)
+
+
+def has(address: str) -> bool:
+    """Whether an IPv4 address is one of this machine's."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, 0))
+        except OSError as error:
+            return error.errno not in (errno.EADDRNOTAVAIL, errno.EINVAL)
+    return True
+
+
+def own_address_towards(master: str, gateways: Collection[str]) -> str:
+    """This host's address for a master at an address; empty if there is none to be told.
+
+    Where the way leads to a container or to this host itself over one of the engine's
+    ``gateways``, it is the address from which far hosts are reached: the gateway means something
+    to this host alone.
+    """
+    own = address_towards(master)
+    if own in gateways or is_loopback(own):
+        far = address_towards(_ELSEWHERE)
+        own = own if is_loopback(far) else far
+    return "" if is_loopback(own) else own
+
+
+def _text(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="ascii")
+    except OSError:
+        return ""

@@ -1,0 +1,199 @@
+"""Which range of ports each proxy of a Docker host gets, and when it must leave it."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.allocation import PortsExhausted, extended, is_free, negotiate, within
+from rosproxy_operator.common.moves import RETRY_FOR, Move
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.model import STARTED, Desired, Key, Observed, Sandbox
+from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
+from rosproxy_operator.docker.planner.state import SERVING, Memory, Refusal
+
+
+def refused(observed: Observed, live: Iterable[Key], memory: Memory, now: float) -> Memory:
+    """Draw the conclusions from the engine's refusals to start sandboxes.
+
+    A range that has never served is given up at once: its refused ports become ``taken``. One that
+    has served is given up after `RETRY_FOR` seconds, since its ports may only be slow to be let go.
+    """
+    wanted = set(live)
+    for sandbox in observed.sandboxes:
+        refusal = memory.refusals.get(sandbox.container.name)
+        if refusal is not None and sandbox.key in wanted:
+            memory = _concluded(memory, sandbox, refusal, now)
+    return memory
+
+
+def _concluded(memory: Memory, sandbox: Sandbox, refusal: Refusal, now: float) -> Memory:
+    name, served = sandbox.container.name, memory.served.get(sandbox.key)
+    hit = _hit(sandbox.range, refusal)
+    fresh = {port for port in hit if served is None or port not in served}
+    if fresh:
+        return _settled(memory, name, fresh, now)
+    if served is None or now - refusal.since < RETRY_FOR:
+        return memory
+    moved = {**memory.moved, sandbox.key: Move(served, now)}
+    return replace(_settled(memory, name, hit, now), moved=moved)
+
+
+def _hit(ports: PortRange, refusal: Refusal) -> set[int]:
+    """The ports that a refusal is about: those that the engine named, else all of the range."""
+    named = {port for port in refusal.ports or () if port in ports}
+    return named or set(ports.ports())
+
+
+def _settled(memory: Memory, name: str, taken: Iterable[int], now: float) -> Memory:
+    refusals = {other: said for other, said in memory.refusals.items() if other != name}
+    return replace(memory, refusals=refusals, taken={**memory.taken, **dict.fromkeys(taken, now)})
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """The range of each live proxy that can have one, and what is to be told and remembered."""
+
+    given: Mapping[Key, PortRange]
+    memory: Memory
+    problems: tuple[Problem, ...]
+
+
+class _Allocation:
+    """Ranges being given out, one key after the other."""
+
+    def __init__(
+        self, observed: Observed, settings: PlanSettings, memory: Memory, live: set[Key]
+    ) -> None:
+        self.observed = observed
+        self.settings = settings
+        self.memory = memory
+        self.live = live
+        self.given: dict[Key, PortRange] = {}
+        self.problems: list[Problem] = []
+        published = frozenset(port for one in observed.containers for port in one.host_ports)
+        self.claimed = published | memory.taken.keys()
+        self.blocked = self.claimed | observed.host.listening
+
+    def order(self, key: Key) -> tuple[int, Key]:
+        """Who has ports comes before who had some, and that one before who wants some."""
+        ranks = (self.serving(key), key in self.memory.served, key in self.memory.planned)
+        return ranks.index(True) if True in ranks else len(ranks), key
+
+    def serving(self, key: Key) -> bool:
+        """Whether a key has ports on which a proxy serves."""
+        return any(s.key == key and s.container.state in SERVING for s in self.observed.sandboxes)
+
+    def held(self, key: Key) -> list[PortRange]:
+        """The ranges that a key can't have: other proxies', and the kernel's."""
+        others = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
+        return [self.observed.host.ephemeral, *others, *self.given_to_others(key)]
+
+    def given_to_others(self, key: Key) -> list[PortRange]:
+        """What other keys have got already."""
+        return [ports for other, ports in self.given.items() if other != key]
+
+    def may_stay(self, key: Key, ports: PortRange) -> bool:
+        """Whether nobody else is seen to have ports on which this key's proxy has served.
+
+        What listens there does not count: it may be what is left of that very proxy.
+        """
+        others = [
+            one.range
+            for one in self.observed.sandboxes
+            if one.key != key and (one.key not in self.live or self.serving(one.key))
+        ]
+        started = [one for one in self.observed.containers if one.state in STARTED]
+        published = {port for one in started for port in one.host_ports}
+        taken = published | self.memory.taken.keys()
+        return is_free(ports, taken, [*others, *self.given_to_others(key)])
+
+    def keep(self, key: Key) -> None:
+        """Give a key the range where its proxy serves, has served, or is being made."""
+        ports = self.memory.served.get(key)
+        if ports is not None and (self.serving(key) or self.may_stay(key, ports)):
+            self.given[key] = ports
+            return
+        created = [one.range for one in self.observed.sandboxes if one.key == key]
+        ports = self.memory.planned.get(key) or (created[0] if created else None)
+        # What listens on ports of a sandbox that is there may be the engine, which is starting it.
+        blocked = self.claimed if ports in created else self.blocked
+        if ports and is_free(ports, blocked | reserved_ports(key), self.held(key)):
+            self.given[key] = ports
+
+    def fill(self, desired: Desired, frozen: bool) -> None:
+        """Give a key more ports if it has too few, or a range if it has none."""
+        key, count, window = desired.key, desired.ports, self.settings.window
+        blocked, held = self.blocked | reserved_ports(key), self.held(key)
+        kept = self.given.get(key)
+        if kept is None:
+            try:
+                self.given[key] = negotiate(count, window, blocked, held)
+            except PortsExhausted as error:
+                self.problems.append(_exhausted(key, error))
+        elif not frozen:
+            self.given[key] = extended(kept, count, window, blocked, held) or kept
+            if len(self.given[key]) < count:
+                self.problems.append(_too_few(key, kept, count))
+
+
+def allocate(
+    observed: Observed,
+    settings: PlanSettings,
+    desired: Iterable[Desired],
+    memory: Memory,
+    now: float,
+    frozen: bool = False,
+) -> Ranges:
+    """A range for each live proxy: the one that it has or had, else the first that is free.
+
+    A proxy that serves is never moved. One that has served and does not is only moved if
+    others are seen on its ports. With ``frozen`` no range gets longer: nothing can be created.
+    """
+    live = {one.key: one for one in desired if one.live}
+    allocation = _Allocation(observed, settings, memory, set(live))
+    order = sorted(live, key=allocation.order)
+    for key in order:
+        allocation.keep(key)
+    for key in order:
+        allocation.fill(live[key], frozen)
+    given = allocation.given
+    served = memory.served
+    left = {key for key in given if key in served and not within(served[key], given[key])}
+    moved = {key: Move(served[key], now) for key in left} | dict(memory.moved)
+    told = [
+        _moved(key, moved[key], ports)
+        for key, ports in sorted(given.items(), key=lambda item: item[0])
+        if key in moved and not within(moved[key].ports, ports)
+    ]
+    served = {key: ports for key, ports in served.items() if key not in left}
+    memory = replace(memory, served=served, planned=given, moved=moved)
+    return Ranges(given, memory, (*allocation.problems, *told))
+
+
+def _exhausted(key: Key, error: PortsExhausted) -> Problem:
+    return Problem(
+        f"proxy {proxy_name(key)}",
+        f"{error}: lower --ports or the label rosproxy.ports ({error.count}), widen --port-window "
+        f"({error.window}), or stop what holds ports there",
+    )
+
+
+def _too_few(key: Key, kept: PortRange, count: int) -> Problem:
+    more = PortRange(kept.last + 1, kept.first + count - 1)
+    return Problem(
+        f"proxy {proxy_name(key)}",
+        f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps its "
+        f"{len(kept)} at {kept}, since {more} are not free or beyond --port-window: stop what "
+        "holds them",
+        fatal=False,
+    )
+
+
+def _moved(key: Key, move: Move, ports: PortRange) -> Problem:
+    return Problem(
+        f"proxy {proxy_name(key)}",
+        f"HAS LEFT ITS PORTS {move.ports} for {ports}, since something else has taken them: nodes "
+        "that had registered under the old ones can't be reached until they register anew",
+        fatal=False,
+    )

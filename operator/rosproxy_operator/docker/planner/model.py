@@ -1,0 +1,184 @@
+"""What a controller sees on a Docker host, and what it wants there."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.settings import DataPlane
+
+ALIVE = frozenset({"created", "running", "paused", "restarting"})
+"""States of a container, in the engine's words, in which it is or may soon be somebody's node."""
+STARTED = frozenset({"running", "paused"})
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A container on a network.
+
+    ``address`` is its IPv4 address there, empty while it does not run. ``names`` are those by
+    which the engine's name server knows it on that network: aliases, name, short id.
+    ``network_id`` is empty where the engine does not tell (a container never started).
+    """
+
+    network: str
+    address: str = ""
+    names: frozenset[str] = frozenset()
+    network_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Container:
+    """A container, in the engine's words.
+
+    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name.
+    ``master_uri`` is ROS_MASTER_URI of its environment, empty if unset. ``host_ports`` are the TCP
+    ports that it publishes on the host, or will once it is started. ``started_at`` is when it was
+    started last, in the engine's words; empty if never, or if nobody asked.
+    """
+
+    id: str
+    name: str
+    state: str
+    labels: Mapping[str, str] = field(default_factory=dict)
+    network_mode: str = ""
+    attachments: tuple[Attachment, ...] = ()
+    master_uri: str = ""
+    host_ports: frozenset[int] = frozenset()
+    hostname: str = ""
+    started_at: str = ""
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs or is about to."""
+        return self.state in ALIVE
+
+    @property
+    def networks(self) -> frozenset[str]:
+        """The names of its networks."""
+        return frozenset(attachment.network for attachment in self.attachments)
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A network of the engine. ``gateway`` is its IPv4 gateway, empty if it has none."""
+
+    id: str
+    name: str
+    driver: str = "bridge"
+    internal: bool = False
+    gateway: str = ""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Key:
+    """What tells proxies of one host apart: the master's URI and the advertised host."""
+
+    master_uri: str
+    advertise_host: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sandbox:
+    """A container of this controller that holds a proxy's network namespace, as found on the host.
+
+    The published ports, the networks and the names on them are its own; the proxy itself runs in
+    another container in the same namespace. So a proxy can be replaced in no time, while taking
+    published ports down and up again costs an engine seconds. ``fingerprint`` is that of the
+    settings that it was created with.
+    """
+
+    key: Key
+    container: Container
+    range: PortRange
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Proxy:
+    """A container of this controller in which a proxy runs, as found on the host.
+
+    It listens on ``range``, in the namespace of the container that its ``network_mode`` names by
+    its id.
+    """
+
+    key: Key
+    container: Container
+    range: PortRange
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """What a controller knows of the host's ports.
+
+    ``listening`` are TCP ports on which something listens, in the controller's own network
+    namespace; ``ephemeral`` is the range from which the kernel takes ports for connections.
+    """
+
+    ephemeral: PortRange
+    listening: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """A Docker host at one moment.
+
+    ``containers`` are all but the controller's own: the proxies and their sandboxes.
+    ``image_id`` is the id of the proxy's image, empty if the host does not have it. ``advertise``
+    gives, for a master's host name, this host's address towards it; without an entry it is not
+    known.
+    """
+
+    containers: tuple[Container, ...]
+    networks: tuple[Network, ...]
+    proxies: tuple[Proxy, ...]
+    host: Host
+    image_id: str = ""
+    advertise: Mapping[str, str] = field(default_factory=dict)
+    sandboxes: tuple[Sandbox, ...] = ()
+
+    @property
+    def own(self) -> tuple[Sandbox | Proxy, ...]:
+        """All that is the controller's own."""
+        return (*self.sandboxes, *self.proxies)
+
+    @property
+    def keys(self) -> frozenset[Key]:
+        """The keys of all that is the controller's own."""
+        return frozenset(one.key for one in self.own)
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What a labelled container wants, its labels and settings put together.
+
+    ``ports`` is 0 and ``data_plane`` None without a label. ``networks`` are the names of those on
+    which it wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which
+    it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
+    it. A container that is not ``alive`` only keeps networks joined and the data plane for a while.
+    """
+
+    container: str
+    id: str
+    key: Key
+    ports: int = 0
+    networks: frozenset[str] = frozenset()
+    needs: str = ""
+    alive: bool = True
+    data_plane: DataPlane | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Desired:
+    """What one proxy is to be.
+
+    Without ``live`` no running container wants it any more: it is left as it is, but for the
+    networks that it leaves, until its grace ends. ``ports`` is the least number of ports.
+    """
+
+    key: Key
+    live: bool
+    ports: int
+    networks: frozenset[str] = frozenset()
+    wishes: tuple[Wish, ...] = ()
+    data_plane: DataPlane = "auto"

@@ -1,0 +1,193 @@
+"""Text for people: what a controller's host looks like, and what it would do.
+
+Names of containers, networks and nodes are whatever their users say, so all are made harmless.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from rosproxy.telemetry.text import besides_first, clean, plural, shorten, table, wrap
+from rosproxy_operator.docker.planner.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    Remove,
+    Rename,
+    Restart,
+    Start,
+    Unpause,
+)
+
+Status = Mapping[str, Any]
+"""What ``rosproxy-operator docker status --json`` prints."""
+
+PROXIES = ("PROXY", "STATE", "MASTER", "OUTSIDE", "PORTS")
+CONTAINERS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
+LEAST_NAME = 20
+"""Columns that a name gets at least, even where the line is then too long."""
+MOST_LINES = 3
+INDENT = "    "
+
+
+def render(status: Status, columns: int, lines: int | None = None) -> str:
+    """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
+    head = wrap(_head(status), columns, "")
+    ending = [*_problems(status, columns), *_actions(status, columns)]
+    full = [*head, "", *_proxies(status, columns), "", *_containers(status, columns, True), *ending]
+    if lines is None or len(full) <= lines:
+        return "\n".join(full)
+    short = [*head, *ending, "", *_containers(status, columns, False)]
+    if len(short) > lines:
+        more = plural(len(short) - lines + 1, "line")
+        short[lines - 1 :] = [f"… {more} more: rosproxy-operator docker status"]
+    return "\n".join(short)
+
+
+def plan_text(actions: Iterable[Action]) -> str:
+    """One line for each action."""
+    return "\n".join(map(line, actions)) or "Nothing to do."
+
+
+def line(action: Action) -> str:  # noqa: C901, PLR0911 - one case per action
+    """What an action does, in one plain and harmless line."""
+    match action:
+        case CreateNetwork(name):
+            return clean(f"create network {name}, a bridge: the uplink of all proxies")
+        case CreateSandbox(sandbox):
+            return clean(
+                f"create container {sandbox.name}: it holds ports {sandbox.range} for the proxy of "
+                f"the master {sandbox.key.master_uri}"
+            )
+        case Create():
+            return clean(_create(action))
+        case Start(name):
+            return clean(f"start container {name}")
+        case Restart(name):
+            return clean(f"restart container {name}")
+        case Unpause(name):
+            return clean(f"resume container {name}")
+        case Rename(name, to):
+            return clean(f"rename container {name} to {to}")
+        case Connect(name, network, aliases):
+            names = f" as {', '.join(aliases)}" if aliases else ""
+            return clean(f"connect container {name} to network {network}{names}")
+        case Disconnect(name, network):
+            return clean(f"disconnect container {name} from network {network}")
+        case Remove(name, why, retire):
+            after = ", after unregistering its nodes at the master" if retire else ""
+            return clean(f"remove container {name} ({why}){after}")
+
+
+def _create(action: Create) -> str:
+    proxy = action.proxy
+    instead = f", instead of {proxy.replaces}" if proxy.replaces else ""
+    rights = ", with NET_ADMIN" if proxy.data_plane == "kernel" else ""
+    return (
+        f"create container {proxy.name}: proxy of the master {proxy.key.master_uri} at "
+        f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{rights}{instead}"
+    )
+
+
+def _head(status: Status) -> str:
+    proxies, containers = len(status["proxies"]), len(status["containers"])
+    word = "proxy" if proxies == 1 else "proxies"
+    return (
+        f"rosproxy-operator {clean(status['version'])}: {plural(containers, 'container')}, "
+        f"{proxies} {word}, uplink network {clean(status['uplink'])}"
+    )
+
+
+def _proxies(status: Status, columns: int) -> Iterator[str]:
+    proxies = status["proxies"]
+    if not proxies:
+        yield "No proxy."
+        return
+    heading, *rows = _table([PROXIES, *map(_proxy_row, proxies)], columns)
+    yield heading
+    for proxy, row in zip(proxies, rows, strict=True):
+        yield row
+        yield from _wrong(proxy["problems"], columns)
+
+
+def _proxy_row(proxy: Status) -> tuple[str, ...]:
+    used = proxy["used"]
+    free = f" {used} used" if used is not None else ""
+    return (
+        clean(proxy["name"]),
+        _proxy_state(proxy),
+        clean(proxy["master_uri"]) + (" DOWN" if proxy["master_up"] is False else ""),
+        clean(proxy["advertise_host"]),
+        clean(proxy["range"]) + free,
+    )
+
+
+def _proxy_state(proxy: Status) -> str:
+    lost = proxy["state"] == "running" and not proxy["reachable"]
+    return clean(proxy["state"]) + (", no answer" if lost else "")
+
+
+def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
+    containers = status["containers"]
+    if not containers:
+        yield "No container is labelled: docker run --label rosproxy.enable=true …"
+        return
+    ranges = {proxy["name"]: proxy["range"] for proxy in status["proxies"]}
+    heading, *rows = _table(
+        [CONTAINERS, *(_container_row(each, ranges) for each in containers)], columns
+    )
+    yield heading
+    for container, row in zip(containers, rows, strict=True):
+        yield row
+        if details:
+            names = [clean(name) for node in container["nodes"] for name in node["names"]]
+            yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
+        yield from _wrong(_of_container(status, container["name"]), columns)
+
+
+def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:
+    proxy = container["proxy"]
+    return (
+        clean(container["name"]),
+        clean(container["state"]),
+        clean(proxy or "-"),
+        clean(ranges.get(proxy, "-")),
+        str(len(container["nodes"])),
+    )
+
+
+def _of_container(status: Status, name: str) -> list[str]:
+    subject = f"container {name}"
+    return [each["text"] for each in status["problems"] if each["subject"] == subject]
+
+
+def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:
+    for text in texts:
+        yield from wrap(clean(text), columns, INDENT + "  ", f"{INDENT}! ")
+
+
+def _problems(status: Status, columns: int) -> Iterator[str]:
+    """The problems that have not been told beside a container."""
+    told = {f"container {container['name']}" for container in status["containers"]}
+    rest = [problem for problem in status["problems"] if problem["subject"] not in told]
+    if rest:
+        yield from ("", "problems:")
+    for problem in rest:
+        text = f"{clean(problem['subject'])}: {clean(problem['text'])}"
+        yield from wrap(text, columns, INDENT, "  ")
+
+
+def _actions(status: Status, columns: int) -> Iterator[str]:
+    if status["actions"]:
+        yield from ("", f"yet to be done: {plural(len(status['actions']), 'step')}")
+    for text in map(clean, status["actions"]):
+        yield from wrap(text, columns, INDENT, "  ")
+
+
+def _table(rows: list[tuple[str, ...]], columns: int) -> list[str]:
+    room = max(columns - besides_first(rows), LEAST_NAME)
+    return table(
+        [tuple(shorten(cell, columns) for cell in row) for row in rows], len(rows[0]), room
+    )

@@ -1,0 +1,219 @@
+"""The containers of a proxy: what they are made of, and what is read back from their labels."""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.settings import DataPlane, SettingError, parse_range
+from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.docker.planner.settings import PlanSettings
+
+MANAGED = "io.rosproxy.managed"
+ROLE = "io.rosproxy.role"
+ROLE_SANDBOX = "ports"
+ROLE_PROXY = "proxy"
+MASTER_URI = "io.rosproxy.master-uri"
+ADVERTISE_HOST = "io.rosproxy.advertise-host"
+RANGE = "io.rosproxy.range"
+FINGERPRINT = "io.rosproxy.fingerprint"
+
+TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
+ADDRESS_VARIABLE = "ROSPROXY_MASTER_ADDRESS"
+USER = "10001:10001"
+LOCAL_PORTS = "1024 11000"
+"""Where a proxy's outgoing connections start: never on a port that it is to listen on."""
+ADMIN_PORT = 11312
+WAIT = ("sleep", "infinity")
+"""What a sandbox does: nothing, as long as it is let."""
+_KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
+"""What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
+
+Said in so many words, as an engine may have no-new-privileges for its default.
+"""
+_SLUG = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """What a container's labels say that this controller made. ``role`` is one of ``ROLE_…``."""
+
+    role: str
+    key: Key
+    range: PortRange
+    fingerprint: str
+
+
+def proxy_name(key: Key) -> str:
+    """The name of a key's proxy container: its master's host and six digits of the key's hash."""
+    digest = hashlib.sha256(f"{key.master_uri} {key.advertise_host}".encode()).hexdigest()
+    slug = re.sub(r"[^a-z0-9]+", "-", master(key).host.lower())[:_SLUG].strip("-")
+    return f"rosproxy-{slug or 'master'}-{digest[:6]}"
+
+
+def sandbox_name(key: Key) -> str:
+    """The name of the container that holds the ports of a key's proxy."""
+    return f"{proxy_name(key)}-ports"
+
+
+def is_proxy_name(name: str) -> bool:
+    """Whether a name is one that a proxy or its sandbox has, also if it is not there now."""
+    return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports)?", name) is not None
+
+
+def master(key: Key) -> HostPort:
+    """The host and port of a key's master."""
+    where = parse_slave_uri(key.master_uri)
+    if where is None:
+        raise ValueError(f"{key.master_uri!r} is no master's URI")
+    return where
+
+
+def admin_port(key: Key) -> int:
+    """The port of a proxy's admin endpoint: 11312, or 11313 where nodes find their master there."""
+    return ADMIN_PORT + 1 if master(key).port == ADMIN_PORT else ADMIN_PORT
+
+
+def reserved_ports(key: Key) -> frozenset[int]:
+    """The ports on which a key's proxy listens besides its range, so never to be in it."""
+    return frozenset({master(key).port, admin_port(key)})
+
+
+def read_own(labels: Mapping[str, str]) -> Own | None:
+    """What the labels of a container of this controller say.
+
+    None if they are not those of one, or not whole.
+    """
+    role = labels.get(ROLE, "")
+    if labels.get(MANAGED) != "true" or role not in (ROLE_SANDBOX, ROLE_PROXY):
+        return None
+    key = Key(labels.get(MASTER_URI, ""), labels.get(ADVERTISE_HOST, ""))
+    try:
+        ports = parse_range(RANGE, labels.get(RANGE, ""))
+    except SettingError:
+        return None
+    if parse_slave_uri(key.master_uri) is None or not key.advertise_host:
+        return None
+    return Own(role, key, ports, labels.get(FINGERPRINT, ""))
+
+
+def own_labels(spec: SandboxSpec | ProxySpec) -> dict[str, str]:
+    """The labels of a container, from which `read_own` reads it back."""
+    return {
+        MANAGED: "true",
+        ROLE: ROLE_SANDBOX if isinstance(spec, SandboxSpec) else ROLE_PROXY,
+        MASTER_URI: spec.key.master_uri,
+        ADVERTISE_HOST: spec.key.advertise_host,
+        RANGE: str(spec.range),
+        FINGERPRINT: spec.fingerprint,
+    }
+
+
+def sandbox_fingerprint(
+    key: Key, ports: PortRange, settings: PlanSettings, forwards: bool = False
+) -> str:
+    """What a sandbox is made of, in 16 hex digits. The image is not in it: any will do."""
+    body = sandbox_config(SandboxSpec("", key, ports, "", settings.uplink, forwards), settings)
+    return _digest({**body, "Image": ""})
+
+
+def fingerprint(
+    key: Key,
+    ports: PortRange,
+    settings: PlanSettings,
+    image_id: str,
+    data_plane: DataPlane = "auto",
+) -> str:
+    """What a proxy's own container is made of, in 16 hex digits.
+
+    Neither its name, its token, its sandbox nor the master's address are in it.
+    """
+    spec = ProxySpec("", key, ports, "", "", data_plane=data_plane)
+    body = container_config(spec, settings, "", "")
+    return _digest({**body, "Image": image_id})
+
+
+def sandbox_config(spec: SandboxSpec, settings: PlanSettings) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for a sandbox."""
+    return {
+        "Image": settings.image,
+        "User": USER,
+        "Entrypoint": list(WAIT[:1]),
+        "Cmd": list(WAIT[1:]),
+        "Healthcheck": {"Test": ["NONE"]},
+        "Labels": own_labels(spec),
+        "ExposedPorts": {f"{port}/tcp": {} for port in spec.range.ports()},
+        "HostConfig": {
+            **_hardened(),
+            "Init": True,
+            "NetworkMode": spec.uplink,
+            "PortBindings": _bindings(spec.range, settings),
+            "Sysctls": _sysctls(spec),
+        },
+        "NetworkingConfig": {"EndpointsConfig": {spec.uplink: {}}},
+    }
+
+
+def container_config(
+    spec: ProxySpec, settings: PlanSettings, token: str, master_address: str
+) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for a proxy.
+
+    ``master_address`` may be empty: then the proxy resolves its master's host itself.
+    """
+    variables = _environment(spec) | {TOKEN_VARIABLE: token, ADDRESS_VARIABLE: master_address}
+    return {
+        "Image": settings.image,
+        "User": USER,
+        "Env": [f"{name}={value}" for name, value in variables.items() if value],
+        "Labels": own_labels(spec),
+        "HostConfig": {
+            **_hardened(),
+            **(_KERNEL if spec.data_plane == "kernel" else {}),
+            "Init": False,
+            "NetworkMode": f"container:{spec.sandbox}",
+        },
+    }
+
+
+def _sysctls(spec: SandboxSpec) -> dict[str, str]:
+    sysctls = {"net.ipv4.ip_local_port_range": LOCAL_PORTS}
+    return sysctls | {"net.ipv4.ip_forward": "1"} if spec.forwards else sysctls
+
+
+def _environment(spec: ProxySpec) -> dict[str, str]:
+    plane = "" if spec.data_plane == "auto" else spec.data_plane
+    return {
+        "ROS_MASTER_URI": spec.key.master_uri,
+        "ROSPROXY_ADVERTISE_HOST": spec.key.advertise_host,
+        "ROSPROXY_PORT_RANGE": str(spec.range),
+        "ROSPROXY_MASTER_PORT": str(master(spec.key).port),
+        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(spec.key)}",
+        "ROSPROXY_DATA_PLANE": plane,
+    }
+
+
+def _bindings(ports: PortRange, settings: PlanSettings) -> dict[str, Any]:
+    return {
+        f"{port}/tcp": [{"HostIp": address, "HostPort": str(port)} for address in settings.publish]
+        for port in ports.ports()
+    }
+
+
+def _hardened() -> dict[str, Any]:
+    return {
+        "ReadonlyRootfs": True,
+        "CapDrop": ["ALL"],
+        "SecurityOpt": ["no-new-privileges:true"],
+        "RestartPolicy": {"Name": "unless-stopped"},
+    }
+
+
+def _digest(body: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,95 @@
+"""What a controller remembers from look to look. Losing it costs time, never correctness."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.allocation import within
+from rosproxy_operator.common.moves import MOVED_FOR, TAKEN_FOR, Move
+from rosproxy_operator.docker.planner.model import Desired, Key, Observed, Wish
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """The engine didn't start a sandbox because of its ports.
+
+    ``since`` is when it first said so. ``ports`` are those that it named; None if it named none.
+    """
+
+    since: float
+    ports: frozenset[int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Times are in seconds of the controller's monotonic clock.
+
+    ``exited`` are containers, by id, since when they are seen not to run; ``absent`` proxies since
+    when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
+    ``planned`` the one with which one is being created. ``refusals`` are by the name of the
+    sandbox. ``taken`` are ports that the engine has refused, and when.
+    """
+
+    exited: Mapping[str, float] = field(default_factory=dict)
+    absent: Mapping[Key, float] = field(default_factory=dict)
+    served: Mapping[Key, PortRange] = field(default_factory=dict)
+    planned: Mapping[Key, PortRange] = field(default_factory=dict)
+    refusals: Mapping[str, Refusal] = field(default_factory=dict)
+    taken: Mapping[int, float] = field(default_factory=dict)
+    moved: Mapping[Key, Move] = field(default_factory=dict)
+
+    def port_taken(self, name: str, ports: Iterable[int] | None, now: float) -> "Memory":
+        """Note that the engine could not start the sandbox ``name``: ports are taken.
+
+        ``ports`` are those that it named; None or nothing if it is not known which.
+        """
+        known = self.refusals.get(name)
+        refusal = Refusal(known.since if known else now, frozenset(ports or ()) or None)
+        return replace(self, refusals={**self.refusals, name: refusal})
+
+
+SERVING = frozenset({"running", "paused", "restarting"})
+"""States of a container that runs, or does again in a moment."""
+_HAS_SERVED = SERVING | {"exited", "dead", "removing"}
+
+
+def noticed(memory: Memory, wishes: Iterable[Wish], now: float) -> Memory:
+    """The memory with who has exited, and since when."""
+    gone = (wish.id for wish in wishes if not wish.alive)
+    return replace(memory, exited={each: memory.exited.get(each, now) for each in gone})
+
+
+def looked(
+    memory: Memory, observed: Observed, desired: Iterable[Desired], grace: float, now: float
+) -> Memory:
+    """What is remembered after a look at the host, before anything is decided."""
+    live = {one.key for one in desired if one.live}
+    idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
+    known = (observed.keys | set(memory.served)) - live
+    absent = {key: memory.absent.get(key, now) for key in sorted(known)}
+    wanted = live | {key for key, since in absent.items() if now - since < grace}
+    return Memory(
+        exited=memory.exited,
+        absent={k: since for k, since in absent.items() if k in wanted | observed.keys},
+        served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
+        planned={key: ports for key, ports in memory.planned.items() if key in live},
+        refusals={name: said for name, said in memory.refusals.items() if name in idle},
+        taken={port: at for port, at in memory.taken.items() if now - at < TAKEN_FOR},
+        moved={key: move for key, move in memory.moved.items() if now - move.at < MOVED_FOR},
+    )
+
+
+def _served(memory: Memory, observed: Observed) -> dict[Key, PortRange]:
+    """Where each proxy has served: a sandbox that runs knows best.
+
+    What has stopped may be older than what is remembered, unless it has more ports.
+    """
+    served = dict(memory.served)
+    for one in observed.own:
+        known = served.get(one.key)
+        if one.container.state in _HAS_SERVED and (not known or within(known, one.range)):
+            served[one.key] = one.range
+    for sandbox in reversed(observed.sandboxes):
+        if sandbox.container.state in SERVING:
+            served[sandbox.key] = sandbox.range
+    return served

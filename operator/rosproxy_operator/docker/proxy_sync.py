@@ -1,0 +1,214 @@
+"""Keeping the proxies up to date about the containers on their networks, each apart."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from ipaddress import IPv4Network
+from typing import Any
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.docker.planner.model import Proxy, Wish
+from rosproxy_operator.docker.planner.specs import master
+from rosproxy_operator.docker.proxy_news import (
+    AGAIN,
+    Arrival,
+    Facts,
+    Places,
+    facts,
+    gone,
+    node_addresses,
+)
+from rosproxy_operator.docker.snapshot import Look, Way
+
+log = logging.getLogger(__name__)
+
+PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Seconds until a proxy is asked again that did not answer; the last is repeated."""
+AGAIN_MOVED = 1.0
+"""Seconds until a move is told again: the new address may not be reachable at once."""
+STARTING = 8.0
+"""Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
+
+
+class Conversation:
+    """What is told to one run of one proxy. ``answered`` is called when it does for the first time.
+
+    The proxy is asked for its nodes after each look, and told what has changed since it was last
+    told: nothing gets lost while it can't be reached.
+    """
+
+    def __init__(
+        self, name: str, way: Way, proxies: ProxyClient, answered: Callable[[], None]
+    ) -> None:
+        self.name, self.way = name, way
+        self.error: ProxyError | None = None
+        self._proxies, self._answered = proxies, answered
+        self._facts = Facts()
+        self._subnets: set[IPv4Network] = set()
+        self._places = Places()
+        self._moving = False
+        self._due: dict[Arrival, list[float]] = {}
+        self._heard = False
+        self._news = asyncio.Event()
+        self._since = time.monotonic()
+
+    @property
+    def silent_for(self) -> float:
+        """Seconds since it did not answer any more (or was started); 0 while it does."""
+        return 0.0 if self._heard and not self.error else time.monotonic() - self._since
+
+    def update(self, known: Facts) -> None:
+        """Take note of what a look has found."""
+        now = time.monotonic()
+        self._facts = known
+        self._subnets |= set(known.subnets)
+        self._due = {
+            arrival: self._due.get(arrival, [now + after for after in AGAIN])
+            for arrival in known.arrivals
+        }
+        self._news.set()
+
+    async def run(self) -> None:
+        """Tell what there is to be told, for good."""
+        failures = 0
+        while True:
+            pause = PAUSES[min(failures, len(PAUSES)) - 1] if failures else self._next_due()
+            await self._wait(pause)
+            try:
+                await self._tell()
+                failures = 0
+            except ProxyError as error:
+                failures += 1
+                if error.later:
+                    self._well()
+                else:
+                    self._unwell(error)
+
+    async def _wait(self, seconds: float | None) -> None:
+        try:
+            async with asyncio.timeout(seconds):
+                await self._news.wait()
+        except TimeoutError:
+            pass
+
+    async def _tell(self) -> None:
+        self._news.clear()
+        where, token = HostPort(self.way.host, self.way.port), self.way.token
+        status = await self._proxies.status(where)
+        known = self._facts  # not older than need be: its nodes may have come since the last look
+        address = known.master_address
+        if address and status.get("master", {}).get("address") != address:
+            await self._proxies.master_address(where, token, address)
+            log.info("%s: its master is now at %s", self.name, address)
+        now = time.monotonic()
+        body = self._body(status, known, now)
+        if body:
+            log.debug("%s is told %s", self.name, body)
+            self._log(await self._proxies.containers(where, token, body))
+        self._due = {
+            arrival: [when for when in times if when > now] for arrival, times in self._due.items()
+        }
+        self._well()
+
+    def _well(self) -> None:
+        if self.error is not None or not self._heard:
+            self.error, self._heard = None, True
+            self._answered()
+
+    def _unwell(self, error: ProxyError) -> None:
+        if self.error is None and self._heard:
+            self._since = time.monotonic()
+        self.error = error
+
+    def _body(self, status: Mapping[str, Any], known: Facts, now: float) -> dict[str, Any]:
+        self._places.look(known, now)
+        nodes = node_addresses(status)
+        arrived = [
+            {"address": arrival.address, "names": sorted(arrival.names)}
+            for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
+            if times and times[0] <= now
+        ]
+        body = {
+            "gone": gone(nodes, known.taken | self._places.held, self._subnets),
+            "moved": self._places.moved(nodes),
+            "arrived": arrived,
+        }
+        self._moving = bool(body["moved"])
+        return {key: value for key, value in body.items() if value}
+
+    def _next_due(self) -> float | None:
+        """Seconds until there is something to be told again; None if there is nothing."""
+        now = time.monotonic()
+        times = [when for due in self._due.values() for when in due[:1]]
+        times += [self._places.until] if self._places.until else []
+        times += [now + AGAIN_MOVED] if self._moving else []
+        return max(min(times) - now, 0.0) if times else None
+
+    def _log(self, done: Json) -> None:
+        counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}
+        if any(counts.values()):
+            text = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
+            log.info("%s: nodes %s", self.name, text)
+
+
+class ProxySync:
+    """The conversations with all running proxies."""
+
+    def __init__(
+        self,
+        tasks: Tasks,
+        proxies: ProxyClient,
+        masters: MasterResolver,
+        uplink: str,
+        answered: Callable[[], None],
+    ) -> None:
+        self._tasks, self._proxies, self._masters = tasks, proxies, masters
+        self._uplink, self._answered = uplink, answered
+        self._running: dict[str, tuple[Conversation, asyncio.Task[None]]] = {}
+
+    def tell(self, look: Look, wishes: Iterable[Wish]) -> None:
+        """Begin to tell every running proxy what a look has found."""
+        for name, (talk, task) in list(self._running.items()):
+            if look.ways.get(name) != talk.way:
+                task.cancel()
+                del self._running[name]
+        every = list(wishes)
+        for proxy in look.observed.proxies:
+            way = look.ways.get(proxy.container.name)
+            if way is not None:
+                address = self._masters.address(master(proxy.key).host)
+                self._talk(proxy, way).update(facts(look, proxy, every, address))
+
+    def answers(self, name: str) -> bool:
+        """Whether a proxy answers and knows everything."""
+        found = self._running.get(name)
+        return found is not None and found[0].silent_for == 0
+
+    def problems(self, look: Look) -> list[Problem]:
+        """The proxies that do not answer, and what to do about it."""
+        return [
+            silence(name, talk.error, look, self._uplink)
+            for name, (talk, _) in self._running.items()
+            if talk.error is not None and talk.silent_for > STARTING
+        ]
+
+    def _talk(self, proxy: Proxy, way: Way) -> Conversation:
+        name = proxy.container.name
+        if name not in self._running:
+            talk = Conversation(name, way, self._proxies, self._answered)
+            self._running[name] = talk, self._tasks.spawn(talk.run(), f"telling {name}")
+        return self._running[name][0]
+
+
+def silence(name: str, error: ProxyError, look: Look, uplink: str) -> Problem:
+    """The problem of a proxy that does not answer."""
+    if error.away and not look.at_host:
+        advice = f"attach the controller to network {uplink} or run it with network_mode: host"
+    else:
+        advice = f"docker logs {name} may say why"
+    return Problem(f"proxy {name}", f"its admin endpoint {error}: {advice}")

@@ -1,0 +1,178 @@
+"""The conditions of a RosProxy (``metav1.Condition``)."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from rosproxy.telemetry.text import plural
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.text import bounded
+from rosproxy_operator.kubernetes.planner.findings import CONFLICT, EXHAUSTED, NO_MASTER
+from rosproxy_operator.kubernetes.planner.model import Finding, Json, NodeState, RosProxy, Stuck
+from rosproxy_operator.kubernetes.planner.names import INJECT
+from rosproxy_operator.kubernetes.planner.values import parts, word
+
+READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
+LONGEST = 1024
+"""Characters of a message."""
+_REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
+_NO_PODS = "NoPods"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A condition without its times. ``status`` is True, False or Unknown."""
+
+    type: str
+    status: str
+    reason: str
+    message: str
+
+
+def serving(state: NodeState) -> bool:
+    """Whether a node's proxy has its ports and works.
+
+    One that has not been asked since the controller started counts if the kubelet finds it ready.
+    """
+    proxy = state.proxy
+    if proxy is None or proxy.pod.deleting or not proxy.ready or proxy.stuck is not None:
+        return False
+    return state.answer is None or state.answer.answered
+
+
+def verdicts(
+    rosproxy: RosProxy,
+    states: Sequence[NodeState],
+    problems: Sequence[Problem],
+    nodes: int,
+    former: Json,
+) -> tuple[Verdict, ...]:
+    """All conditions of a RosProxy that can be read.
+
+    ``nodes`` is how many ROS nodes there are; ``former`` is the status as it was.
+    """
+    wanted = [state for state in states if state.pods]
+    return (
+        _ready(rosproxy, wanted, problems, nodes),
+        _ports(wanted, problems),
+        _master(states, problems, former),
+        _degraded(problems),
+    )
+
+
+def conditions(
+    judged: Iterable[Verdict], former: Json, generation: int, stamp: str
+) -> list[dict[str, object]]:
+    """Conditions as the API server takes them.
+
+    Args:
+        judged: What they say.
+        former: The status as it was: a condition whose status is still the same keeps its time.
+        generation: That of the object.
+        stamp: The time for the others, as RFC 3339 has it.
+    """
+    return [
+        {
+            "type": one.type,
+            "status": one.status,
+            "observedGeneration": generation,
+            "lastTransitionTime": _since(former, one, stamp),
+            "reason": one.reason if _REASON.fullmatch(one.reason) else "Problem",
+            "message": bounded(one.message, LONGEST),
+        }
+        for one in judged
+    ]
+
+
+def condition(status: Json, type: str) -> Json:
+    """A condition in a status, empty if it is not there."""
+    found = (one for one in parts(status, "conditions") if one.get("type") == type)
+    return next(found, {})
+
+
+def told(problem: Problem) -> str:
+    """A problem in one line."""
+    return f"{problem.subject}: {problem.text}"
+
+
+def reason_of(problem: Problem) -> str:
+    """A problem's reason."""
+    return problem.reason if isinstance(problem, Finding) else "Problem"
+
+
+def _since(former: Json, verdict: Verdict, stamp: str) -> str:
+    was = condition(former, verdict.type)
+    return (word(was, "lastTransitionTime") if was.get("status") == verdict.status else "") or stamp
+
+
+def _ready(
+    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[Problem], nodes: int
+) -> Verdict:
+    if not wanted:
+        return Verdict(READY, "True", _NO_PODS, _no_pods(rosproxy))
+    waiting = [state for state in wanted if not serving(state)]
+    if not waiting:
+        proxies = f"{len(wanted)} of {len(wanted)} proxies"
+        text = f"{proxies} serve {plural(nodes, 'ROS node')}"
+        return Verdict(READY, "True", "Serving", text)
+    blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
+    if blocking:
+        return Verdict(READY, "False", reason_of(blocking[0]), told(blocking[0]))
+    return Verdict(READY, "False", "ProxiesStarting", _starting(waiting[0]))
+
+
+def _no_pods(rosproxy: RosProxy) -> str:
+    if rosproxy.spec.pod_selector is None:
+        return f"no pod is selected: label pods with {INJECT}=true"
+    return "no pod is selected: give pods the labels that spec.podSelector asks for"
+
+
+def _of_pod(problem: Problem) -> bool:
+    """Whether it concerns one of the users' pods, without which the others are served."""
+    return (
+        isinstance(problem, Finding) and problem.about is not None and problem.about.kind == "Pod"
+    )
+
+
+def _starting(state: NodeState) -> str:
+    if state.proxy is None or state.proxy.pod.deleting:
+        return f"node {state.name}: its proxy is being created"
+    return f"node {state.name}: its proxy {state.proxy.pod.id.name} is starting"
+
+
+def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Verdict:
+    if not wanted:
+        return Verdict(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
+    lacking = [state for state in wanted if state.range is None]
+    refused = [one for one in wanted if one.proxy is not None and one.proxy.stuck is Stuck.PORTS]
+    if not lacking and not refused:
+        return Verdict(PORTS, "True", "Allocated", "every node with selected pods has its ports")
+    reason = CONFLICT if refused else EXHAUSTED
+    lines = [told(one) for one in problems if reason_of(one) in (CONFLICT, EXHAUSTED)]
+    names = ", ".join(state.name for state in (*refused, *lacking))
+    return Verdict(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
+
+
+def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Verdict:
+    """Of proxies that are not asked yet nothing is known: what was so far holds on."""
+    proxies = [state for state in states if state.proxy is not None]
+    answers = [state.answer for state in proxies]
+    heard = [answer for answer in answers if answer is not None and answer.answered]
+    if any(not answer.master_up for answer in heard):
+        lines = [told(one) for one in problems if reason_of(one) == NO_MASTER]
+        return Verdict(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
+    was = condition(former, MASTER)
+    if len(heard) == len(proxies) and proxies:
+        return Verdict(MASTER, "True", "Reached", "every proxy reaches the master")
+    if proxies and was:
+        return Verdict(MASTER, word(was, "status"), word(was, "reason"), word(was, "message"))
+    if proxies:
+        return Verdict(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    return Verdict(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
+
+
+def _degraded(problems: Sequence[Problem]) -> Verdict:
+    if not problems:
+        return Verdict(DEGRADED, "False", "AsExpected", "nothing is wrong")
+    lines = "; ".join(map(told, problems))
+    return Verdict(DEGRADED, "True", reason_of(problems[0]), lines)

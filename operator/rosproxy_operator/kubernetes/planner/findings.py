@@ -1,0 +1,175 @@
+"""What is wrong with a RosProxy's nodes and proxies, with reasons.
+
+The texts stay the same as long as the trouble does: an Event is made of each new one.
+"""
+
+from collections.abc import Iterable, Iterator
+
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.text import bounded
+from rosproxy_operator.kubernetes.planner.model import (
+    Failure,
+    Finding,
+    InvalidRosProxy,
+    NodeState,
+    ProxyPod,
+    Reference,
+    RosProxy,
+    Stuck,
+)
+from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT, KIND
+
+NOT_ADMITTED = "ProxyNotAdmitted"
+CONFLICT = "PortConflict"
+EXHAUSTED = "PortsExhausted"
+STUCK = "ProxyStuck"
+SILENT = "ProxyUnreachable"
+NO_MASTER = "MasterUnreachable"
+WARNS = "ProxyWarns"
+_LONGEST = 600
+_ENFORCE = "pod-security.kubernetes.io/enforce"
+_TERMINATING = "because it is being terminated"
+"""The namespace is being deleted: nothing can be created there, and nothing is to be."""
+
+
+def findings(
+    rosproxy: RosProxy, states: Iterable[NodeState], failures: Iterable[Failure] = ()
+) -> tuple[Finding, ...]:
+    """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
+
+    Each has a reason; those that users are to be told by an Event have ``about``, see
+    `happenings.news`. They go, with other problems, into `statuses.status_of`.
+    """
+    found = [_refused(rosproxy, one) for one in failures if _TERMINATING not in one.text]
+    for state in sorted(states, key=lambda one: one.name):
+        found.extend(of_node(rosproxy, state))
+    return tuple(dict.fromkeys(found))
+
+
+def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[Finding]:
+    """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
+    node = f"node {state.name}"
+    if state.problem:
+        default = EXHAUSTED if state.range is None else "Problem"
+        yield _finding(rosproxy, node, state.problem, state.reason or default)
+    proxy = state.proxy
+    if proxy is None or proxy.pod.deleting:
+        return
+    if proxy.stuck is not None:
+        yield _stuck(rosproxy, proxy, proxy.stuck)
+    else:
+        yield from _answered(rosproxy, state, proxy)
+
+
+def invalid_finding(rosproxy: InvalidRosProxy) -> Finding:
+    """That a RosProxy can't be read, with an Event."""
+    return Finding(
+        f"rosproxy {rosproxy.id}",
+        rosproxy.text,
+        reason="Invalid",
+        of=rosproxy.id,
+        about=Reference(KIND, rosproxy.id, rosproxy.uid),
+    )
+
+
+def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Finding:
+    about = Reference(KIND, rosproxy.id, rosproxy.uid)
+    return Finding(subject, bounded(text, _LONGEST), reason=reason, of=rosproxy.id, about=about)
+
+
+def _subject(proxy: ProxyPod) -> str:
+    return f"proxy {proxy.pod.id.name} on node {proxy.on}"
+
+
+def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> Finding:
+    id, said = proxy.pod.id, proxy.message
+    shown = f"kubectl -n {id.namespace} describe pod {id.name}"
+    texts = {
+        Stuck.PORTS: f"ports {proxy.range} are not all free there ({said}); others are tried: to "
+        "keep them clear, leave ports that others take out of spec.portWindow",
+        Stuck.SCHEDULING: f"it is not admitted ({said}): make room on the node, or set "
+        f"spec.tolerations or spec.resources; {shown}",
+        Stuck.IMAGE: f"the node can't get the image {proxy.image} ({said}): load it there, or set "
+        "spec.image, spec.imagePullPolicy or spec.imagePullSecrets",
+        Stuck.CRASHING: f"it ends again and again ({said}): "
+        f"kubectl -n {id.namespace} logs --previous {id.name}",
+        Stuck.SANDBOX: f"the node can't start it ({said}): {shown}",
+    }
+    reason = CONFLICT if why is Stuck.PORTS else STUCK
+    return _finding(rosproxy, _subject(proxy), texts[why], reason)
+
+
+def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[Finding]:
+    """What follows from a proxy's answer. One that is not asked yet is not to blame."""
+    answer = state.answer
+    if answer is None:
+        return
+    if not answer.answered:
+        if proxy.ready:
+            yield _silent(rosproxy, proxy, answer.error)
+        return
+    if not answer.master_up:
+        yield _no_master(rosproxy, proxy, answer.error)
+    for problem in answer.problems:
+        if answer.master_up or not problem.startswith("master: "):
+            yield Finding(
+                _subject(proxy), problem, fatal=False, reason=WARNS, of=rosproxy.id, about=None
+            )
+
+
+def _silent(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
+    """No Event: a controller that is cut off would make one for each proxy."""
+    text = (
+        f"it does not answer the controller ({error}): let the controller's pod connect to port "
+        f"{ADMIN_PORT} of this one (NetworkPolicy)"
+    )
+    return Finding(_subject(proxy), text, reason=SILENT, of=rosproxy.id, about=None)
+
+
+def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
+    master = rosproxy.spec.master
+    if master.service is not None:
+        fix = f"start roscore behind Service {master.service}, port {master.service_port}"
+    else:
+        fix = f"start roscore there, let pods connect to {master.uri}, or mend spec.master"
+    text = f"it does not reach the master ({error}): {fix}"
+    return _finding(rosproxy, _subject(proxy), text, NO_MASTER)
+
+
+def _refused(rosproxy: RosProxy, failure: Failure) -> Finding:
+    said = clean(" ".join(failure.text.split()))
+    remedy = _remedy(said, rosproxy)
+    head = "the API server refused it"
+    said = said[: _LONGEST - len(f"{head} (): {remedy}")]
+    return _finding(rosproxy, failure.subject, f"{head} ({said}): {remedy}", NOT_ADMITTED)
+
+
+def _remedy(said: str, rosproxy: RosProxy) -> str:
+    """What to do about a refusal.
+
+    The words are from k8s.io/pod-security-admission, admission/admission.go and policy/, and
+    k8s.io/apiserver, pkg/admission/plugin/resourcequota/controller.go.
+    """
+    low = said.lower()
+    if "violates podsecurity" in low or "net_admin" in low or "privilegeescalation" in low:
+        return _security_remedy(low, rosproxy)
+    if "exceeded quota" in low or "must specify" in low:
+        return "raise the namespace's ResourceQuota, or set spec.resources"
+    if "is invalid" in low:
+        return "mend the field that is named in the RosProxy's spec"
+    if "cannot" in low and "user" in low:
+        return "the controller lacks a right: install its chart or manifests anew"
+    if "not the controller's" in low:
+        return "delete or rename that object, or the RosProxy"
+    return "it is tried again"
+
+
+def _security_remedy(low: str, rosproxy: RosProxy) -> str:
+    if "hostport" not in low and ("net_admin" in low or "privilegeescalation" in low):
+        return "allow proxies NET_ADMIN in that namespace, or set spec.dataPlane: Auto"
+    kernel = rosproxy.spec.data_plane == "kernel"
+    takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
+    return (
+        f"a proxy takes {takes}, which needs Pod Security privileged: kubectl label namespace "
+        f"{rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"
+    )

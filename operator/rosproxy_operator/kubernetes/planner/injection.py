@@ -1,0 +1,170 @@
+"""How a pod is wired to its proxy at admission, and whether it is."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.kubernetes.planner.model import (
+    ELSEWHERE,
+    Finding,
+    Json,
+    Name,
+    Pod,
+    Reference,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.planner.names import (
+    INJECT,
+    MASTER_PORT,
+    MASTER_URI,
+    master_uri,
+    service_id,
+)
+from rosproxy_operator.kubernetes.planner.values import part, parts, word, words
+
+VARIABLE = "ROS_MASTER_URI"
+IP_VARIABLE = "ROS_IP"
+HOST_VARIABLE = "ROS_HOSTNAME"
+MIRROR = "kubernetes.io/config.mirror"
+"""Annotation of the API server's picture of a static pod: a change of it changes no container."""
+_KINDS = ("initContainers", "containers")
+_STATIC = (
+    "is a static pod, made from a file on its node, which can't be wired: set ROS_MASTER_URI and "
+    "ROS_IP in that file, or run it as an ordinary pod"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """What the webhook makes of a pod: its new ``spec``, None if it stays as it is."""
+
+    spec: Json | None = None
+    annotations: Mapping[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def wire(pod: Json, uri: str, host_aliases: Iterable[Json] = ()) -> Wiring:
+    """Wire a pod, as it is at admission, to the proxy that answers at ``uri``.
+
+    Every container and init container that does not set them gets ROS_MASTER_URI, and ROS_IP where
+    it sets no ROS_HOSTNAME either. They come first, so that variables of the template can use them
+    (``$(ROS_MASTER_URI)``). A ROS_MASTER_URI that this webhook has set before, as in a copy of a
+    wired pod, is set anew. Wiring a wired pod changes nothing.
+
+    A pod in its node's own network must not be given here: see `select.chosen`.
+    """
+    notes = words(pod, "metadata", "annotations")
+    if MIRROR in notes:
+        return Wiring(warnings=(_STATIC,))
+    spec = part(pod, "spec")
+    wired: dict[str, Any] = {
+        kind: [_wired(one, uri, notes.get(MASTER_URI, "")) for one in parts(spec, kind)]
+        for kind in _KINDS
+        if spec.get(kind)
+    }
+    aliases = _merged(parts(spec, "hostAliases"), host_aliases)
+    if aliases:
+        wired["hostAliases"] = aliases
+    changed = any(spec.get(key) != value for key, value in wired.items())
+    ours = any(_value(one, VARIABLE) == uri for kind in _KINDS for one in wired.get(kind, ()))
+    return Wiring({**spec, **wired} if changed else None, {MASTER_URI: uri} if ours else {})
+
+
+def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> Finding | None:
+    """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
+
+    ``cluster_ip`` is that of the RosProxy's Service; without one nothing can be said yet.
+    """
+    if not cluster_ip or pod.ended or pod.deleting:
+        return None
+    text = _astray(pod, rosproxy.id, cluster_ip)
+    about = Reference("Pod", pod.id, pod.uid)
+    subject = f"pod {pod.id}"
+    return (
+        Finding(subject, text, fatal=False, reason="NotWired", of=rosproxy.id, about=about)
+        if text
+        else None
+    )
+
+
+def _astray(pod: Pod, of: Name, cluster_ip: str) -> str:
+    others = [uri for uri in pod.own_masters if not _is_proxys(uri, of, cluster_ip)]
+    if others:
+        return (
+            f"sets ROS_MASTER_URI={clean(others[0])[:200]} itself, which is not its proxy: take "
+            "the variable out of its template, then create the pod anew"
+        )
+    if pod.wired and pod.wired != master_uri(cluster_ip):
+        return (
+            f"was wired to {clean(pod.wired)[:200]}, but its proxy is at {master_uri(cluster_ip)} "
+            "now: create the pod anew"
+        )
+    if pod.wired or pod.own_masters:
+        return ""
+    if INJECT not in pod.labels:
+        return (
+            "has no ROS_MASTER_URI of its proxy: add the label "
+            f"{INJECT}={of.name} to its template, then create the pod anew"
+        )
+    return (
+        "has no ROS_MASTER_URI of its proxy, since it was created while the webhook was not there "
+        "or there was no RosProxy: create the pod anew"
+    )
+
+
+def _is_proxys(uri: str, of: Name, cluster_ip: str) -> bool:
+    """Whether a ROS_MASTER_URI leads to a RosProxy's Service, by address or by name."""
+    if uri == ELSEWHERE:
+        return True
+    where, service = parse_slave_uri(uri.strip()), service_id(of)
+    if where is None or where.port != MASTER_PORT:
+        return False
+    host = where.host.lower().rstrip(".")
+    full = f"{service.name}.{service.namespace}.svc."
+    short = host in (service.name, f"{service.name}.{service.namespace}")
+    return host == cluster_ip.lower() or short or f"{host}.".startswith(full)
+
+
+def _wired(container: Json, uri: str, former: str) -> Json:
+    variables = [_renewed(one, uri, former) for one in parts(container, "env")]
+    there = {word(one, "name") for one in variables}
+    first: list[Json] = []
+    if VARIABLE not in there:
+        first.append({"name": VARIABLE, "value": uri})
+    if not there & {IP_VARIABLE, HOST_VARIABLE}:
+        source = {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}}
+        first.append({"name": IP_VARIABLE, "valueFrom": source})
+    env = [*first, *variables]
+    return {**container, "env": env} if env else container
+
+
+def _renewed(variable: Json, uri: str, former: str) -> Json:
+    ours = word(variable, "name") == VARIABLE and former and variable.get("value") == former
+    return {**variable, "value": uri} if ours else variable
+
+
+def _value(container: Json, name: str) -> str:
+    found = [word(one, "value") for one in parts(container, "env") if one.get("name") == name]
+    return found[-1] if found else ""
+
+
+def _merged(own: Iterable[Json], more: Iterable[Json]) -> list[Json]:
+    """Host aliases with others added: one entry per address, as the API server merges them."""
+    merged = list(own)
+    for alias in more:
+        place = _place(merged, word(alias, "ip"))
+        if place is None:
+            merged.append(alias)
+            continue
+        there = list(merged[place].get("hostnames") or ())
+        new = [name for name in alias.get("hostnames") or () if name not in there]
+        if new:
+            merged[place] = {**merged[place], "hostnames": [*there, *new]}
+    return merged
+
+
+def _place(aliases: list[Json], ip: str) -> int | None:
+    found = (place for place, alias in enumerate(aliases) if alias.get("ip") == ip)
+    return next(found, None)

@@ -1,0 +1,305 @@
+"""What the controller sees in a Kubernetes cluster, in Kubernetes' words."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.settings import DataPlane
+from rosproxy_operator.common.problem import Problem
+
+Json = Mapping[str, Any]
+"""An object as the API server gives it, or a part of one."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Name:
+    """What tells namespaced objects of one kind apart."""
+
+    namespace: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.namespace}/{self.name}"
+
+
+NOBODY = Name("", "")
+"""The name of no object."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selector:
+    """A label selector (``metav1.LabelSelector``): all parts must fit.
+
+    ``expressions`` are (key, operator, values) with the operators In, NotIn, Exists, DoesNotExist.
+    """
+
+    labels: Mapping[str, str] = field(default_factory=dict)
+    expressions: tuple[tuple[str, str, frozenset[str]], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Master:
+    """Where the real ROS master is: outside at ``uri``, or a Service of the cluster.
+
+    ``address`` is the IP address of the host in ``uri``, for names that the cluster's DNS does not
+    know. ``publish`` is the hostPort under which outside finds a master that runs in the cluster,
+    0 for none.
+    """
+
+    uri: str = ""
+    address: str = ""
+    service: Name | None = None
+    service_port: int = 11311
+    publish: int = 0
+
+
+class Advertise(Enum):
+    """Which of a node's addresses outside is told (``status.addresses[].type``)."""
+
+    INTERNAL_IP = "InternalIP"
+    EXTERNAL_IP = "ExternalIP"
+    HOSTNAME = "Hostname"
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """What a RosProxy asks for; the fields are those of the CRD.
+
+    ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
+    RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
+    controller's default. ``resources``, ``tolerations``, ``host_aliases`` and
+    ``image_pull_secrets`` go into the pods as they are.
+    """
+
+    master: Master
+    ports: int
+    window: PortRange
+    pod_selector: Selector | None = None
+    node_selector: Mapping[str, str] = field(default_factory=dict)
+    tolerations: tuple[Json, ...] = ()
+    advertise: Advertise = Advertise.INTERNAL_IP
+    cleanup_after: float = 30.0
+    grace: float = 60.0
+    slave_control: str = "any"
+    data_plane: DataPlane = "auto"
+    image: str = ""
+    image_pull_policy: str = ""
+    image_pull_secrets: tuple[Json, ...] = ()
+    resources: Json = field(default_factory=dict)
+    host_aliases: tuple[Json, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RosProxy:
+    """A RosProxy, the custom resource.
+
+    ``former`` are the ranges by node name that its status holds; ``cluster_ip`` is the address
+    that its Service has, or had; ``status`` is its status as it is now.
+    """
+
+    id: Name
+    uid: str
+    generation: int
+    spec: Spec
+    former: Mapping[str, PortRange] = field(default_factory=dict)
+    cluster_ip: str = ""
+    status: Json = field(default_factory=dict)
+    deleting: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node of the cluster. ``addresses`` are by their type, the first of each.
+
+    ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
+    ``spec.podCIDRs``; ``cordoned`` is ``spec.unschedulable``.
+    """
+
+    name: str
+    labels: Mapping[str, str] = field(default_factory=dict)
+    addresses: Mapping[str, str] = field(default_factory=dict)
+    advertise_host: str = ""
+    pod_networks: tuple[str, ...] = ()
+    ready: bool = True
+    cordoned: bool = False
+    deleting: bool = False
+
+
+ELSEWHERE = "$()"
+"""Stands for a value that is only known once the container runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pod:
+    """A pod. ``node`` and ``ip`` are empty until it has them.
+
+    ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
+    the ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that
+    is not a plain text (from a ConfigMap, for one) is `ELSEWHERE`. ``wired`` is the one that the
+    webhook has set, empty if it has not.
+    """
+
+    id: Name
+    uid: str
+    labels: Mapping[str, str] = field(default_factory=dict)
+    node: str = ""
+    phase: str = "Pending"
+    ip: str = ""
+    host_ports: frozenset[int] = frozenset()
+    host_network: bool = False
+    deleting: bool = False
+    own_masters: tuple[str, ...] = ()
+    wired: str = ""
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has run to its end: it holds no ports any more."""
+        return self.phase in ("Succeeded", "Failed")
+
+
+class Stuck(Enum):
+    """Why a proxy's pod does not run."""
+
+    PORTS = "ports"  # one of its hostPorts is taken
+    SCHEDULING = "scheduling"  # the scheduler or the kubelet does not admit it for another reason
+    IMAGE = "image"
+    CRASHING = "crashing"
+    SANDBOX = "sandbox"  # the kubelet can't set it up
+
+
+@dataclass(frozen=True, slots=True)
+class ProxyPod:
+    """A pod of the controller in which a proxy runs, or is to run.
+
+    ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
+    (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
+    say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
+    condition Ready. ``restarts`` counts those of its container.
+    """
+
+    pod: Pod
+    of: Name
+    owner: str
+    on: str
+    range: PortRange
+    fingerprint: str
+    image: str
+    token: str = ""
+    ready: bool = False
+    stuck: Stuck | None = None
+    message: str = ""
+    restarts: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A Service of the controller: under its address pods find the proxy on their node."""
+
+    of: Name
+    owner: str
+    uid: str
+    cluster_ip: str
+    fingerprint: str
+    deleting: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a proxy says of itself (``/status``), as far as it matters here.
+
+    ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
+    warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer.
+    """
+
+    answered: bool
+    master_up: bool = False
+    error: str = ""
+    nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    topics: frozenset[str] = frozenset()
+    used: int = 0
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class NodeState:
+    """What one RosProxy has on one node, and what it gets there: a line of its status.
+
+    ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
+    told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
+    had. ``proxy`` is the pod that serves the node, None where there is none yet or any more.
+    ``problem`` is what keeps the node without one, ``reason`` the same in one CamelCase word.
+    """
+
+    name: str
+    advertise_host: str
+    range: PortRange | None
+    proxy: ProxyPod | None = None
+    pods: tuple[Pod, ...] = ()
+    answer: Answer | None = None
+    problem: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What a Kubernetes Event is about (``involvedObject``)."""
+
+    kind: str
+    id: Name
+    uid: str
+
+
+@dataclass(frozen=True, slots=True)
+class Finding(Problem):
+    """A problem as conditions and Kubernetes Events tell it.
+
+    ``reason`` is one word in CamelCase; ``of`` the RosProxy that it belongs to. ``about`` is the
+    object that the Event is about; None means that the problem gets no Event.
+    """
+
+    reason: str = "Problem"
+    of: Name = NOBODY
+    about: Reference | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InvalidRosProxy:
+    """A RosProxy that can't be read: ``text`` says why, the rest is as it is there."""
+
+    id: Name
+    uid: str
+    generation: int
+    text: str
+    status: Json = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An action on an object that the API server refused; ``text`` is what it said."""
+
+    subject: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """A cluster at one moment, as far as it matters.
+
+    ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
+    ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
+    wrong; one of them is empty. ``answers`` are by the uid of the proxy's pod. ``unusable`` are the
+    RosProxies that can't be read at all: what they have is left as it is. ``failures`` are those of
+    the last try to carry something out.
+    """
+
+    rosproxies: tuple[RosProxy, ...] = ()
+    nodes: Mapping[str, Node] = field(default_factory=dict)
+    pods: tuple[Pod, ...] = ()
+    proxies: tuple[ProxyPod, ...] = ()
+    services: Mapping[Name, Service] = field(default_factory=dict)
+    masters: Mapping[Name, tuple[str, str]] = field(default_factory=dict)
+    answers: Mapping[str, Answer] = field(default_factory=dict)
+    unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
+    failures: Mapping[Name, tuple[Failure, ...]] = field(default_factory=dict)

@@ -1,0 +1,87 @@
+"""What the controller calls things in a cluster: names, labels, annotations, ports."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+
+from rosproxy_operator.kubernetes.planner.model import Name
+
+GROUP = "rosproxy.io"
+VERSION = "v1alpha1"
+API_VERSION = f"{GROUP}/{VERSION}"
+KIND = "RosProxy"
+PLURAL = "rosproxies"
+
+INJECT = "rosproxy.io/inject"
+"""Label of users' pods: "true" or a RosProxy's name."""
+PROXY_OF = "rosproxy.io/proxy-of"
+"""Label of proxies' pods and of Services: the name of their RosProxy."""
+NODE = "rosproxy.io/node"
+PORT_RANGE = "rosproxy.io/port-range"
+FINGERPRINT = "rosproxy.io/fingerprint"
+ADVERTISE_HOST = "rosproxy.io/advertise-host"
+"""Annotation of nodes, which users set, and of proxies' pods."""
+MASTER_URI = "rosproxy.io/master-uri"
+"""Annotation of users' pods: the ROS_MASTER_URI that the webhook has set."""
+
+NAME_LABEL = "app.kubernetes.io/name"
+COMPONENT_LABEL = "app.kubernetes.io/component"
+MANAGED_BY_LABEL = "app.kubernetes.io/managed-by"
+_OWN = {
+    NAME_LABEL: "rosproxy",
+    COMPONENT_LABEL: "proxy",
+    MANAGED_BY_LABEL: "rosproxy-operator",
+}
+OWN_SELECTOR = ",".join(f"{label}={value}" for label, value in _OWN.items())
+"""Label selector, in the API's words, of everything that the controller makes."""
+
+MASTER_PORT = 11311
+ADMIN_PORT = 11312
+CONTAINER = "proxy"
+"""Name of the container in a proxy's pod."""
+TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
+
+_PREFIX = "rosproxy-"
+_DIGITS = 6
+_LONGEST = 63
+"""A pod whose name is longer is cut off in its host name."""
+_SLUG = 30
+
+
+def own_labels(of: str) -> dict[str, str]:
+    """The labels of a proxy's pod and of the Service of the RosProxy that is called ``of``."""
+    return {**_OWN, PROXY_OF: of}
+
+
+def is_own(labels: Mapping[str, str]) -> bool:
+    """Whether labels are those that the controller gives to what it makes."""
+    return all(labels.get(label) == value for label, value in _OWN.items()) and PROXY_OF in labels
+
+
+def service_name(of: str) -> str:
+    """The name of a RosProxy's Service."""
+    return f"{_PREFIX}{of}"
+
+
+def service_id(of: Name) -> Name:
+    """The namespace and name of a RosProxy's Service."""
+    return Name(of.namespace, service_name(of.name))
+
+
+def proxy_name(of: str, node: str) -> str:
+    """The name of a RosProxy's pod on a node, always the same, so that there are never two."""
+    digest = hashlib.sha256(f"{of} {node}".encode()).hexdigest()[:_DIGITS]
+    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{of}--{digest}"))
+    slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
+    return "-".join(part for part in (f"{_PREFIX}{of}", slug, digest) if part)
+
+
+def proxy_id(of: Name, node: str) -> Name:
+    """The namespace and name of a RosProxy's pod on a node."""
+    return Name(of.namespace, proxy_name(of.name, node))
+
+
+def master_uri(cluster_ip: str) -> str:
+    """What pods use as their ROS_MASTER_URI, from the cluster IP of the RosProxy's Service."""
+    host = f"[{cluster_ip}]" if ":" in cluster_ip else cluster_ip
+    return f"http://{host}:{MASTER_PORT}"

@@ -1,0 +1,144 @@
+"""Why a proxy's pod does not run, from what the scheduler and the kubelet say of it.
+
+The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes.
+"""
+
+import re
+
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.kubernetes.planner.model import Json, Stuck
+from rosproxy_operator.kubernetes.planner.names import CONTAINER
+from rosproxy_operator.kubernetes.planner.values import number, part, parts, word
+
+PORTS_TAKEN = "didn't have free ports for the requested pod ports"
+"""``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
+same text with the reason ``NodePorts`` (pkg/kubelet/lifecycle/predicate.go).
+"""
+_REASON_TRANSIENT = "SchedulerError"
+_REASON_PORTS = "NodePorts"
+_IMAGE = frozenset(
+    {
+        "ErrImagePull",
+        "ImagePullBackOff",
+        "ErrImageNeverPull",
+        "InvalidImageName",
+        "ImageInspectError",
+        "RegistryUnavailable",
+        "SignatureValidationFailed",
+    }
+)
+"""pkg/kubelet/images/types.go, and k8s.io/cri-api, pkg/errors/errors.go."""
+_SANDBOX = frozenset(
+    {
+        "CreateContainerConfigError",
+        "PreCreateHookError",
+        "CreateContainerError",
+        "PreStartHookError",
+        "PostStartHookError",
+        "RunContainerError",
+        "CreatePodSandboxError",
+        "ConfigPodSandboxError",
+    }
+)
+"""pkg/kubelet/kuberuntime/kuberuntime_container.go, pkg/kubelet/container/sync_result.go."""
+_CRASHING = "CrashLoopBackOff"
+_NOT_STARTED = ("StartError", "ContainerCannotRun")
+"""What containerd and cri-dockerd say of a container whose program could not be started."""
+_BACK_OFF = re.compile(r'Back-off pulling image "[^"]*"(: )?')
+"""The kubelet puts this before the error of the try before and takes it off again at the next
+(pkg/kubelet/images/image_manager.go): the same trouble in other words.
+"""
+_REASON = re.compile(r"(ErrImagePull|RegistryUnavailable|SignatureValidationFailed): ")
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.,]+Z? *")
+_TAKEN = ("address already in use", "port is already allocated", "cannot open hostport")
+"""What container runtimes say that look for listeners on a hostPort: CRI-O and cri-dockerd. With
+the CNI plugin portmap the port is silently taken over.
+"""
+_LONGEST = 300
+
+
+def stuck(obj: Json) -> tuple[Stuck | None, str]:
+    """Why a pod does not run, and the same in the words of Kubernetes; None if it does, or may yet.
+
+    The words don't change while the trouble is the same.
+    """
+    status = part(obj, "status")
+    if word(status, "phase") == "Failed":
+        return _failed(status)
+    for one in parts(status, "conditions"):
+        if one.get("type") == "PodScheduled" and one.get("status") == "False":
+            return _unscheduled(one)
+    for one in parts(status, "containerStatuses"):
+        if word(one, "name") == CONTAINER:
+            return _waiting(one)
+    return None, ""
+
+
+def stuck_by_event(message: str) -> Stuck:
+    """What the message of a FailedCreatePodSandBox event means: PORTS or SANDBOX."""
+    low = message.lower()
+    return Stuck.PORTS if any(text in low for text in _TAKEN) else Stuck.SANDBOX
+
+
+def _failed(status: Json) -> tuple[Stuck, str]:
+    """The kubelet did not admit the pod, or ended it (``rejectPod`` in pkg/kubelet/kubelet.go)."""
+    reason, message = word(status, "reason"), word(status, "message")
+    ports = reason == _REASON_PORTS or PORTS_TAKEN in message
+    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(reason, message)
+
+
+def _unscheduled(condition: Json) -> tuple[Stuck | None, str]:
+    """The scheduler found no place: reason Unschedulable or SchedulingGated.
+
+    After a SchedulerError, as when a pod of the same name has just been deleted, it tries again by
+    itself (``handleSchedulingFailure`` in pkg/scheduler/schedule_one.go).
+    """
+    reason, message = word(condition, "reason"), word(condition, "message")
+    if reason in ("", _REASON_TRANSIENT):
+        return None, ""
+    return Stuck.PORTS if PORTS_TAKEN in message else Stuck.SCHEDULING, _text(reason, message)
+
+
+def _waiting(container: Json) -> tuple[Stuck | None, str]:
+    """What a container waits for. One that has ended for the second time waits as well.
+
+    The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
+    """
+    ended = part(container, "state", "terminated")
+    if number(ended, "exitCode") and number(container, "restartCount"):
+        return _crashing(ended)
+    waiting = part(container, "state", "waiting")
+    reason, message = word(waiting, "reason"), word(waiting, "message")
+    if reason in _IMAGE:
+        return Stuck.IMAGE, _image(reason, message)
+    if reason == _CRASHING:
+        return _crashing(part(container, "lastState", "terminated"))
+    if reason in _SANDBOX:
+        return Stuck.SANDBOX, _text(reason, message)
+    return None, ""
+
+
+def _image(reason: str, message: str) -> str:
+    bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
+    return _text("", bare) or reason
+
+
+def _crashing(terminated: Json) -> tuple[Stuck, str]:
+    """Between two tries to start a container that never ran, the kubelet calls that a crash too."""
+    if word(terminated, "reason") in _NOT_STARTED:
+        return Stuck.SANDBOX, _text("RunContainerError", word(terminated, "message"))
+    return Stuck.CRASHING, _crash(terminated)
+
+
+def _crash(terminated: Json) -> str:
+    """How the container ended; the kubelet's own words count the seconds until it is started."""
+    lines = word(terminated, "message").strip().splitlines() or [""]
+    how = f"exit code {number(terminated, 'exitCode')}"
+    if word(terminated, "reason") not in ("", "Error", "Completed"):
+        how = f"{word(terminated, 'reason')}, {how}"
+    return _text(how, _STAMP.sub("", lines[-1]))
+
+
+def _text(reason: str, message: str) -> str:
+    text = clean(": ".join(one for one in (reason, " ".join(message.split())) if one))
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"

@@ -1,0 +1,98 @@
+"""When an action is asked for again that has had no effect: soon, then ever later."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from rosproxy_operator.kubernetes.planner.model import Failure, Name
+
+LAG = 3.0
+"""Seconds after which something that was done must be seen in the API server's lists."""
+FIRST = 1.0
+"""Seconds until something that failed is tried again, the first time."""
+LONGEST = 60.0
+"""Seconds between tries at most."""
+AT_ONCE = 3
+"""How often a pod is made anew without delay that never got well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Something to be done for a RosProxy. ``subject`` is the object, as in `Failure`.
+
+    ``detail`` tells tasks apart that concern objects of one name, or one object in several ways.
+    """
+
+    of: Name
+    verb: str
+    subject: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Try:
+    """How often a task was asked for, and when the last time.
+
+    ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the API
+    server said of it.
+    """
+
+    count: int
+    at: float
+    effect: bool = False
+    error: str = ""
+
+    @property
+    def pause(self) -> float:
+        """Seconds after which it may be tried again."""
+        if self.effect and not self.error:
+            late = self.count - AT_ONCE
+            return min(FIRST * 2.0 ** min(late, 10), LONGEST) if late >= 0 else 0.0
+        first = FIRST if self.error else LAG
+        return min(first * 2.0 ** min(self.count - 1, 10), LONGEST)
+
+
+class Retries:
+    """The tries as they are noted in one look. What no one asks about is forgotten."""
+
+    def __init__(
+        self,
+        known: Mapping[Task, Try],
+        failures: Mapping[Name, Iterable[Failure]],
+        now: float,
+    ) -> None:
+        said = {(of, one.subject): one.text for of, some in failures.items() for one in some}
+        self._known = {
+            task: replace(tried, error=said.get((task.of, task.subject), tried.error))
+            for task, tried in known.items()
+        }
+        self._now = now
+        self.noted: dict[Task, Try] = {}
+
+    def ask(self, task: Task) -> bool:
+        """Whether a task is to be done now; if so, that is noted."""
+        tried = self._known.get(task)
+        if tried is not None and self._now - tried.at < tried.pause:
+            self.noted[task] = tried
+            return False
+        count, error = (tried.count, tried.error) if tried else (0, "")
+        self.noted[task] = Try(count + 1, self._now, error=error)
+        return True
+
+    def effect(self, task: Task) -> None:
+        """Note that what a task does is there, though not well yet."""
+        if task in self._known:
+            self.noted[task] = replace(self._known[task], effect=True, error="")
+
+    def failures(self, of: Name) -> tuple[Failure, ...]:
+        """What can't be done for a RosProxy."""
+        found = (Failure(task.subject, tried.error) for task, tried in self._of(of) if tried.error)
+        return tuple(dict.fromkeys(found))
+
+    def waits(self) -> Iterator[float]:
+        """In how many seconds there is something to be tried again."""
+        for tried in self.noted.values():
+            if not tried.effect:
+                yield max(tried.at + tried.pause - self._now, 0.0)
+
+    def _of(self, of: Name) -> Iterator[tuple[Task, Try]]:
+        yield from ((task, tried) for task, tried in self.noted.items() if task.of == of)

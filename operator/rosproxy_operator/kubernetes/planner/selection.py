@@ -1,0 +1,164 @@
+"""Which pods a RosProxy takes."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from rosproxy_operator.kubernetes.planner.model import (
+    Finding,
+    Node,
+    Pod,
+    Reference,
+    RosProxy,
+    Selector,
+    Spec,
+)
+from rosproxy_operator.kubernetes.planner.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
+
+OFF = ("", "false")
+"""Values of the label with which a pod is left alone, whatever a podSelector says."""
+_ANY = "true"
+_PART_OF_LABEL = "app.kubernetes.io/part-of"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The RosProxy that a pod has, if any, and why it has none though it was selected.
+
+    The finding's reason is Ambiguous or HostNetwork.
+    """
+
+    rosproxy: RosProxy | None = None
+    finding: Finding | None = None
+
+
+def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
+    """Whether a label selector fits labels.
+
+    As ``Requirement.Matches`` in k8s.io/apimachinery, pkg/labels/selector.go, says.
+    """
+    if any(labels.get(key) != value for key, value in selector.labels.items()):
+        return False
+    return all(_fits(*one, labels) for one in selector.expressions)
+
+
+def label_selector(spec: Spec, name: str) -> str:
+    """The selector of a RosProxy's pods as the API server takes it (``labelSelector=``).
+
+    ``name`` is the RosProxy's.
+    """
+    if spec.pod_selector is None:
+        return f"{INJECT} in {_listed({_ANY, name})}"
+    return ",".join([*_requirements(spec.pod_selector), f"{INJECT} notin {_listed(OFF)}"])
+
+
+def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> Choice:
+    """The RosProxy of a pod, of those of any namespace that are not being deleted.
+
+    Of several it is the one that the pod's label names.
+    """
+    taking = sorted((one for one in rosproxies if _selects(one, pod)), key=lambda one: one.id)
+    named = [one for one in taking if one.id.name == pod.labels.get(INJECT)]
+    if not taking:
+        return Choice()
+    if not named and len(taking) > 1:
+        return Choice(finding=_finding(pod, taking[0], "Ambiguous", _ambiguous(taking)))
+    of = (named or taking)[0]
+    if pod.host_network:
+        return Choice(finding=_finding(pod, of, "HostNetwork", _HOST_NETWORK))
+    return Choice(of)
+
+
+def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
+    """Why no RosProxy takes a pod that is labelled, for a warning at admission.
+
+    Empty if the pod is not labelled, or its label says that it is to be left alone.
+    """
+    label = pod.labels.get(INJECT, "")
+    there = sorted(one.id.name for one in rosproxies if one.id.namespace == pod.id.namespace)
+    if label in OFF:
+        return ""
+    lost = "its ROS nodes are not reachable from outside"
+    if not there:
+        return (
+            f"no RosProxy in namespace {pod.id.namespace}, so {lost}: create one there, then "
+            "create the pod anew"
+        )
+    if label not in (_ANY, *there):
+        return (
+            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}: "
+            f"set it to {' or '.join(there)}, then create the pod anew"
+        )
+    return (
+        f"spec.podSelector of RosProxy {' and '.join(there)} does not fit its labels, so {lost}: "
+        "change either, then create the pod anew"
+    )
+
+
+def on_node(rosproxy: RosProxy, node: Node) -> bool:
+    """Whether the RosProxy's nodeSelector fits a node."""
+    return matches(Selector(rosproxy.spec.node_selector), node.labels)
+
+
+_HOST_NETWORK = (
+    "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get none: take "
+    f"hostNetwork off, or the label {INJECT}"
+)
+
+
+def _ambiguous(taking: Iterable[RosProxy]) -> str:
+    names = [one.id.name for one in taking]
+    return (
+        f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to one "
+        f"of them, as {INJECT}={names[0]}"
+    )
+
+
+def _finding(pod: Pod, of: RosProxy, reason: str, text: str) -> Finding:
+    about = Reference("Pod", pod.id, pod.uid)
+    return Finding(f"pod {pod.id}", text, reason=reason, of=of.id, about=about)
+
+
+def _selects(rosproxy: RosProxy, pod: Pod) -> bool:
+    if rosproxy.id.namespace != pod.id.namespace or rosproxy.deleting or _is_ours(pod.labels):
+        return False
+    label = pod.labels.get(INJECT)
+    if label in OFF:
+        return False
+    selector = rosproxy.spec.pod_selector
+    return label in (_ANY, rosproxy.id.name) if selector is None else matches(selector, pod.labels)
+
+
+def _is_ours(labels: Mapping[str, str]) -> bool:
+    """Whether labels are those of a proxy, or of the controller as its chart labels it."""
+    whole = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
+    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "controller" and "rosproxy" in whole)
+
+
+def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, str]) -> bool:
+    match operator:
+        case "In":
+            return key in labels and labels[key] in values
+        case "NotIn":
+            return labels.get(key) not in values
+        case "Exists":
+            return key in labels
+        case "DoesNotExist":
+            return key not in labels
+    return False
+
+
+def _requirements(selector: Selector) -> Iterator[str]:
+    for key, value in sorted(selector.labels.items()):
+        yield f"{key}={value}"
+    for key, operator, values in selector.expressions:
+        match operator:
+            case "In" | "NotIn":
+                yield f"{key} {operator.lower()} {_listed(values)}"
+            case "Exists":
+                yield key
+            case "DoesNotExist":
+                yield f"!{key}"
+
+
+def _listed(values: Iterable[str]) -> str:
+    return f"({','.join(sorted(set(values)))})"

@@ -1,0 +1,150 @@
+"""Talking with the proxies: what they say of themselves, and news for them."""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.kubernetes.planner.model import Answer, ProxyPod
+from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT
+from rosproxy_operator.kubernetes.planner.proxy_status import answer, no_answer
+
+log = logging.getLogger(__name__)
+
+EVERY = 3.0
+"""Seconds between two questions to a proxy."""
+EVERY_STARTING = 0.5
+"""The same until it has answered for the first time."""
+STARTING = 10.0
+"""Seconds for which a proxy may be silent after its pod has an address: it is just starting."""
+SILENT = 2
+"""Unanswered questions in a row before a proxy counts as silent."""
+AT_ONCE = 32
+"""Proxies that are asked at the same time."""
+
+
+class Conversation:
+    """Asks one proxy again and again, and tells it which pods are gone until it has heard.
+
+    ``changed`` is called when what is known of it has changed.
+    """
+
+    def __init__(
+        self,
+        proxy: ProxyPod,
+        proxies: ProxyClient,
+        room: asyncio.Semaphore,
+        changed: Callable[[], None],
+    ) -> None:
+        self.where = address_of(proxy)
+        self.answer: Answer | None = None
+        self._token = proxy.token
+        self._proxies, self._room, self._changed = proxies, room, changed
+        self._gone: set[str] = set()
+        self._news = asyncio.Event()
+        self._recheck = False
+        self._failures = 0
+        self._since = time.monotonic()
+
+    def tell(self, gone: Iterable[str]) -> None:
+        """Let it know that the pods with these addresses are no more."""
+        self._gone |= set(gone)
+        if self._gone:
+            self._news.set()
+
+    async def run(self) -> None:
+        """Converse until cancelled."""
+        while True:
+            async with self._room:
+                told = await self._tell()
+                await self._ask()
+                self._recheck = told
+            heard = self.answer is not None and self.answer.answered
+            pause = EVERY if heard or self._waited(EVERY * 20) else EVERY_STARTING
+            await self._pause(pause)
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait, but not with news that have just come in."""
+        try:
+            async with asyncio.timeout(seconds):
+                await self._news.wait()
+        except TimeoutError:
+            pass
+
+    async def _ask(self) -> None:
+        try:
+            found = answer(await self._proxies.status(self.where))
+            self._failures = 0
+        except ProxyError as error:
+            self._failures += 1
+            if self._failures < SILENT or not (self.answer or self._waited(STARTING)):
+                return
+            found = no_answer(str(error))
+        starting = self.answer is None and not self._waited(STARTING)
+        if starting and found.answered and not found.master_up:
+            return  # it may not have asked its master yet
+        # A process may outlive its pod for a moment: then the next look tells it again.
+        if found != self.answer or self._recheck:
+            self.answer = found
+            self._changed()
+
+    async def _tell(self) -> bool:
+        """Tell the news, if there are any; whether there were and it has heard them."""
+        self._news.clear()
+        gone = sorted(self._gone)
+        if not gone:
+            return False
+        try:
+            told = await self._proxies.containers(self.where, self._token, {"gone": gone})
+        except ProxyError as error:
+            # It may just be without its master; it is told again with the next question.
+            log.debug("%s was not told that %s are gone: %s", self.where, gone, error)
+            return False
+        self._gone -= set(gone)
+        log.debug("%s was told that %s are gone: %s", self.where, gone, told)
+        return True
+
+    def _waited(self, seconds: float) -> bool:
+        return time.monotonic() - self._since > seconds
+
+
+class ProxySync:
+    """All conversations, one for each proxy's pod that has an address."""
+
+    def __init__(self, tasks: Tasks, proxies: ProxyClient, changed: Callable[[], None]) -> None:
+        self._tasks, self._proxies, self._changed = tasks, proxies, changed
+        self._room = asyncio.Semaphore(AT_ONCE)
+        self._all: dict[str, tuple[Conversation, asyncio.Task[None]]] = {}
+
+    @property
+    def answers(self) -> dict[str, Answer]:
+        """What is known, by the uid of the proxy's pod; of one that is just starting, nothing."""
+        return {uid: one.answer for uid, (one, _) in self._all.items() if one.answer is not None}
+
+    def hold(self, proxies: Iterable[ProxyPod]) -> None:
+        """Converse with these and no others."""
+        wanted = {each.pod.uid: each for each in proxies if each.pod.ip and not each.pod.ended}
+        for uid in [*self._all]:
+            conversation, task = self._all[uid]
+            if uid not in wanted or address_of(wanted[uid]) != conversation.where:
+                task.cancel()
+                del self._all[uid]
+        for uid, proxy in wanted.items():
+            if uid not in self._all:
+                one = Conversation(proxy, self._proxies, self._room, self._changed)
+                task = self._tasks.spawn(one.run(), f"conversation with {proxy.pod.id}")
+                self._all[uid] = one, task
+
+    def tell(self, gone: Mapping[str, Iterable[str]]) -> None:
+        """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
+        for uid, addresses in gone.items():
+            if uid in self._all:
+                self._all[uid][0].tell(addresses)
+
+
+def address_of(proxy: ProxyPod) -> HostPort:
+    """Where a proxy answers the controller."""
+    return HostPort(proxy.pod.ip, ADMIN_PORT)

@@ -1,0 +1,247 @@
+"""Keeping a valid certificate for the admission webhook: in a Secret, or from a directory."""
+
+import asyncio
+import base64
+import logging
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Protocol
+
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api import Api, Found
+from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.webhook import certificates
+from rosproxy_operator.kubernetes.webhook.certificates import Pair, Unfit
+from rosproxy_operator.settings import WebhookSettings
+
+log = logging.getLogger(__name__)
+
+EVERY = 20.0
+"""Seconds between two checks: a certificate that is due, a CA that somebody has overwritten."""
+EVERY_DIRECTORY = 10.0
+"""The same for a certificate that somebody else puts into a directory."""
+OVERLAP = 10.0
+"""Seconds from trusting a new CA to serving its certificate: API servers learn of it by a watch."""
+_SUBJECT = "webhook"
+
+
+class Source(Protocol):
+    """Where the certificate comes from."""
+
+    every: float
+
+    def refresh(self) -> Pair:
+        """The certificate to serve by now. May take long. Raises Unfit and ApiError."""
+
+
+class CertificateRotation:
+    """Holds the certificate that is to be served. `pair` may be read from any thread."""
+
+    def __init__(self, source: Source, metrics: ClusterMetrics) -> None:
+        self.pair: Pair | None = None
+        self._source, self._metrics = source, metrics
+        self._log = ProblemLog()
+
+    async def run(self) -> None:
+        """Keep it valid until cancelled, whatever happens."""
+        while True:
+            await self.refresh()
+            await asyncio.sleep(self._source.every if self.pair else 2.0)
+
+    async def refresh(self) -> None:
+        """Check it once, and renew it if it is due."""
+        problems = []
+        try:
+            pair = await in_thread(self._source.refresh)
+        except (ApiError, Unfit) as error:
+            problems.append(Problem(_SUBJECT, f"no certificate: {error}"))
+        except Exception as error:  # a mistake of ours must not end the certificate
+            log.exception("checking the webhook's certificate failed; going on")
+            problems.append(Problem(_SUBJECT, f"the controller failed: {error!r}"))
+        else:
+            if pair != self.pair:
+                log.info("webhook: serving a certificate that is valid until %s", pair.expires)
+            self.pair = pair
+            self._metrics.certificate_expiry.set(pair.expires.timestamp())
+            problems += getattr(self._source, "problems", ())
+        self._log.update(problems)
+
+
+class Directory:
+    """A certificate that somebody else renews, cert-manager for one, as a mounted Secret."""
+
+    every = EVERY_DIRECTORY
+
+    def __init__(self, directory: str) -> None:
+        self._directory = Path(directory)
+
+    def refresh(self) -> Pair:
+        """What is there now. Raises Unfit."""
+        try:
+            found = [
+                (self._directory / name).read_bytes()
+                for name in (certificates.CERTIFICATE, certificates.KEY)
+            ]
+        except OSError as error:
+            raise Unfit(f"--webhook-cert-dir: {error.filename}: {error.strerror}") from None
+        try:
+            return certificates.checked(Pair(*found))
+        except Unfit as error:
+            raise Unfit(f"--webhook-cert-dir {self._directory}: {error}") from None
+
+
+class SelfSigned:
+    """A certificate that is made here, kept in a Secret, its CA in the webhook's configuration.
+
+    First a new CA is trusted, together with the one before, then its certificate is served; so
+    there is no moment at which an API server refuses what is served.
+    """
+
+    every = EVERY
+
+    def __init__(
+        self,
+        api: Api,
+        names: list[str],
+        secret: Name | None,
+        configuration: str,
+        now: Callable[[], datetime] = certificates.now,
+    ) -> None:
+        self._api, self._names, self._now = api, names, now
+        self._secret, self._configuration = secret, configuration
+        self._pair: Pair | None = None
+        self._serving: Pair | None = None
+        self._trusted_at: datetime | None = None
+        self.problems: list[Problem] = []
+
+    def refresh(self) -> Pair:
+        """Renew it if it is due, and see to it that its CA is trusted. Raises ApiError."""
+        self.problems = []
+        self._pair = self._kept()
+        trusted = self._trust(self._pair.ca)
+        if self._serving is None or self._is_expired(self._serving) or not self._configuration:
+            self._serving = self._pair
+        elif self._pair != self._serving and trusted and self._is_known():
+            self._serving, self._trusted_at = self._pair, None
+        return self._serving
+
+    def _is_known(self) -> bool:
+        """Whether API servers have had the time to learn of the new CA."""
+        self._trusted_at = self._trusted_at or self._now()
+        return (self._now() - self._trusted_at).total_seconds() >= OVERLAP
+
+    def _kept(self) -> Pair:
+        """The pair in the Secret, or a new one that is put there."""
+        if self._secret is None:
+            return self._usable(self._pair) or self._new(self._pair)
+        try:
+            there = self._api.get("secrets", self._secret)
+        except ApiError as error:
+            if self._pair is None and error.kind is Kind.AWAY:
+                raise
+            self._complain(error)
+            return self._usable(self._pair) or self._new(self._pair)
+        found = self._read(there)
+        if usable := self._usable(found):
+            return usable
+        return self._put(self._new(found or self._pair), self._secret, there)
+
+    def _put(self, pair: Pair, secret: Name, there: Found) -> Pair:
+        """Write a pair into the Secret. Whoever was faster has the right one."""
+        try:
+            self._api.patch("secrets", secret, secret_patch(pair, there))
+        except ApiError as error:
+            if error.kind in (Kind.INVALID, Kind.CONFLICT):
+                raise ApiError(Kind.AWAY, f"somebody else writes {secret}: {error}") from None
+            self._complain(error)
+        log.info("webhook: made a certificate that is valid until %s", pair.expires)
+        return pair
+
+    def _complain(self, error: ApiError) -> None:
+        """Tell that the Secret can't be used: the certificate is then this process's alone.
+
+        That the API server is away the controller's looks tell.
+        """
+        if error.kind is Kind.AWAY:
+            return
+        text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
+        if error.kind is Kind.GONE:
+            text += "; create an empty Secret of this name (the chart does)"
+        self.problems.append(Problem(_SUBJECT, text))
+
+    def _read(self, secret: Found) -> Pair | None:
+        data = secret.get("data")
+        if not isinstance(data, dict) or not data.get(certificates.KEY):
+            return None
+        try:
+            return certificates.read(data)
+        except Unfit as error:
+            log.warning("webhook: Secret %s: %s; making another one", self._secret, error)
+            return None
+
+    def _usable(self, pair: Pair | None) -> Pair | None:
+        """The pair, if it is for our names and has not lived too long."""
+        if pair is None or pair.due(self._now()) or not pair.names() >= set(self._names):
+            return None
+        return pair
+
+    def _new(self, before: Pair | None) -> Pair:
+        return certificates.make(self._names, self._now(), before.ca if before else b"")
+
+    def _is_expired(self, pair: Pair) -> bool:
+        return pair.expires <= self._now()
+
+    def _trust(self, authorities: bytes) -> bool:
+        """Write the CAs where the API server looks for them; whether they are there."""
+        if not self._configuration:
+            return True
+        try:
+            there = self._api.webhook_configuration(self._configuration)
+            operations = trust_patch(there, authorities)
+            if operations:
+                self._api.patch_webhook_configuration(self._configuration, operations)
+                log.info("webhook: its CA is now in %s", self._configuration)
+        except ApiError as error:
+            text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
+            if error.kind is Kind.GONE:
+                text += "; without it no pod is wired: install it anew (the chart has it)"
+            if error.kind is not Kind.AWAY:
+                self.problems.append(Problem(_SUBJECT, text))
+            return False
+        return True
+
+
+def source(api: Api, settings: WebhookSettings) -> Source:
+    """Where the certificate comes from, by the settings."""
+    if settings.directory or settings.service is None:
+        return Directory(settings.directory)
+    names = certificates.service_names(settings.service.namespace, settings.service.name)
+    return SelfSigned(api, names, settings.secret, settings.configuration)
+
+
+def secret_patch(pair: Pair, there: Found) -> list[Json]:
+    """The JSON patch that puts a pair into a Secret, if it is as it was when it was read."""
+    version = there.get("metadata", {}).get("resourceVersion")
+    return [
+        {"op": "test", "path": "/metadata/resourceVersion", "value": version},
+        {"op": "add", "path": "/data", "value": {**(there.get("data") or {}), **pair.secret()}},
+    ]
+
+
+def trust_patch(configuration: Found, authorities: bytes) -> list[Json]:
+    """The JSON patch that makes a configuration's webhooks trust these CAs; empty if they do."""
+    bundle = base64.b64encode(authorities).decode()
+    operations: list[Json] = []
+    for index, webhook in enumerate(configuration.get("webhooks") or ()):
+        if webhook.get("clientConfig", {}).get("caBundle") != bundle:
+            where = f"/webhooks/{index}"
+            operations += [
+                {"op": "test", "path": f"{where}/name", "value": webhook.get("name")},
+                {"op": "add", "path": f"{where}/clientConfig/caBundle", "value": bundle},
+            ]
+    return operations

@@ -1,0 +1,99 @@
+"""Serving the admission webhook for kopf, with a certificate that may change any time.
+
+`kopf.WebhookServer` does not do: even with an SSL context of ours it makes a certificate of its own
+unless it is given files, and it closes its port to exchange one.
+"""
+
+import asyncio
+import json
+import logging
+import ssl
+from collections.abc import AsyncIterator
+from typing import Any
+
+import kopf
+from aiohttp import web
+
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.kubernetes.webhook import certificates
+from rosproxy_operator.kubernetes.webhook.certificates import Pair
+from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation
+
+log = logging.getLogger(__name__)
+
+CHECK = 0.5
+"""Seconds between two looks whether there is another certificate to serve."""
+MOST = 8 * 2**20
+"""Bytes of a request: the API server takes objects of 3 MiB, and a review holds two of them."""
+ENDING = 2.0
+"""Seconds that requests have to be answered when serving ends."""
+
+
+class WebhookServer:
+    """What kopf takes as ``settings.admission.server``.
+
+    The certificate is exchanged in the event loop that does the handshakes, and therefore never
+    in the midst of one. Connections that stand go on.
+    """
+
+    def __init__(self, bind: HostPort, keeper: CertificateRotation) -> None:
+        self._bind, self._keeper = bind, keeper
+
+    async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
+        """Serve until cancelled."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        while (pair := self._keeper.pair) is None:  # noqa: ASYNC110 - set in another thread
+            await asyncio.sleep(CHECK)
+        certificates.load(context, pair)
+        runner = web.AppRunner(_application(fn), access_log=None, shutdown_timeout=ENDING)
+        await runner.setup()
+        try:
+            bind = self._bind
+            await web.TCPSite(runner, bind.host, bind.port, ssl_context=context).start()
+            log.info("wiring pods at https://%s", bind)
+            yield kopf.WebhookClientConfig(url=f"https://{bind}")
+            await self._keep(context, pair)
+        finally:
+            await runner.cleanup()
+
+    async def _keep(self, context: ssl.SSLContext, served: Pair) -> None:
+        """Serve another certificate as soon as there is one."""
+        while True:
+            await asyncio.sleep(CHECK)
+            pair = self._keeper.pair
+            if pair is not None and pair != served:
+                try:
+                    certificates.load(context, pair)
+                except ssl.SSLError:
+                    log.exception("a certificate can't be served; the one before stays")
+                served = pair
+
+
+def _application(fn: kopf.WebhookFn) -> web.Application:
+    async def serve(request: web.Request) -> web.Response:
+        try:
+            review = json.loads(await request.text())
+            uid = review["request"]["uid"]
+        except (ValueError, TypeError, KeyError):
+            return web.Response(status=400, text="this is no AdmissionReview\n")
+        try:
+            return web.json_response(await fn(review, webhook=request.match_info["id"]))
+        except Exception as error:
+            log.warning("a pod at admission: %r", error)
+            return web.json_response(_allowed(review, uid, repr(error)))
+
+    application = web.Application(client_max_size=MOST)
+    application.router.add_post("/{id}", serve)
+    return application
+
+
+def _allowed(review: dict[str, Any], uid: str, reason: str) -> dict[str, Any]:
+    """An answer that lets the pod pass as it is."""
+    warning = f"{NOT_WIRED}the controller failed: {reason}"
+    return {
+        "apiVersion": review.get("apiVersion", "admission.k8s.io/v1"),
+        "kind": review.get("kind", "AdmissionReview"),
+        "response": {"uid": uid, "allowed": True, "warnings": [warning[:200]]},
+    }

@@ -1,0 +1,1 @@
+"""The admin endpoint: health, metrics, status, and what an operator tells the proxy."""

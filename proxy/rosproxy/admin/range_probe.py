@@ -1,0 +1,171 @@
+"""Can the advertised ports be reached? Tried over free ports of the range, from two places.
+
+The proxy dials its own advertised address; where NAT has no way back for that (no hairpin), it
+fails although outside gets through. So the master is made to try as well: it calls paramUpdate at
+a subscriber of a parameter, which here is the port under test. That leaves no trace in the graph
+and none among the parameters.
+"""
+
+import asyncio
+import logging
+import secrets
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosproxy.net.acceptor import Acceptor
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.resolver import resolve
+from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.uris import slave_uri
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry.leases import Leases
+
+log = logging.getLogger(__name__)
+
+TIMEOUT = 3.0
+MASTER_WAIT = 4.0
+"""Seconds that the master gets to call back; rosmaster does so from three threads."""
+MAX_REQUEST = 65536
+
+
+@dataclass(slots=True, eq=False)
+class _Trial:
+    """One port under test.
+
+    ``mine`` and ``masters`` are the secrets by which the two callers are told from strangers.
+    """
+
+    port: int
+    where: HostPort
+    mine: str = field(default_factory=lambda: secrets.token_hex(16))
+    masters: str = field(default_factory=lambda: secrets.token_hex(16))
+    reached: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def greet(self, conn: socket.socket, peer: str) -> None:
+        """Answer a caller, in the way of a node, if it knows one of the secrets."""
+        loop, seen = asyncio.get_running_loop(), b""
+        async with asyncio.timeout(TIMEOUT):
+            while not self._known(seen) and len(seen) < MAX_REQUEST:
+                part = await loop.sock_recv(conn, 4096)
+                if not part:
+                    break
+                seen += part
+            if self._known(seen):
+                await loop.sock_sendall(conn, _reply(self.mine))
+        conn.close()
+
+    def _known(self, seen: bytes) -> bool:
+        if self.masters.encode() in seen:
+            self.reached.set()
+        return self.masters.encode() in seen or self.mine.encode() in seen
+
+
+async def probe_range(context: Context, leases: Leases) -> dict[str, Any]:
+    """Try the lowest and the highest free port of the range; where none is free, one fast port.
+
+    ``probes`` holds for each its ``port``, the ``advertised`` address and two outcomes.
+    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
+    on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
+    master's call did not arrive) or unknown (the master could not be asked).
+
+    The second port is left out where the master misses the first: rosmaster calls back from three
+    threads, and each call into a void holds one for as long as TCP tries, two minutes.
+    """
+    pool, ports = context.registry.pool, context.settings.ports.listen.ports()
+    probes: list[dict[str, Any]] = []
+    for order in (ports, reversed(ports)):
+        async with leases.lent(order) as port:
+            if port is None:
+                break
+            probes.append(await _try(context, _Trial(port, context.addressing.outside(port))))
+        if probes[0]["from_master"] == "missed" or pool.free == 1:
+            break
+    return {"probes": probes}
+
+
+async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
+    result = {"port": trial.port, "advertised": str(trial.where)}
+    acceptor = Acceptor(context.tasks, context.bank.open(trial.port), trial.greet)
+    try:
+        mine, masters = await asyncio.gather(_dial(context, trial), _ask_master(context, trial))
+    finally:
+        acceptor.stop()
+        context.bank.close(trial.port, acceptor.sock)
+    return {**result, "from_proxy": mine, "from_master": masters}
+
+
+async def _dial(context: Context, trial: _Trial) -> str:
+    """Connect through the advertised address and see who answers."""
+    addresses = await resolve(context.upstream.reach(trial.where).host)
+    if not addresses:
+        return "unresolvable"
+    try:
+        async with asyncio.timeout(TIMEOUT):
+            reader, writer = await asyncio.open_connection(addresses[0], trial.where.port)
+    except TimeoutError:
+        return "silent"
+    except ConnectionRefusedError:
+        return "refused"
+    except OSError:
+        return "unreachable"
+    return await _greeted(trial, reader, writer)
+
+
+async def _greeted(
+    trial: _Trial, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+) -> str:
+    answer = b""
+    try:
+        async with asyncio.timeout(TIMEOUT):
+            writer.write(f"GET /{trial.mine} HTTP/1.0\r\n\r\n".encode())
+            while len(answer) < MAX_REQUEST and (part := await reader.read(4096)):
+                answer += part
+    except TimeoutError:
+        return "stranger"
+    except OSError as error:
+        log.debug("%s ended the connection: %s", trial.where, error)
+    finally:
+        writer.close()
+    if trial.mine.encode() in answer:
+        return "ok"
+    return "stranger" if answer else "closed"
+
+
+async def _ask_master(context: Context, trial: _Trial) -> str:
+    """Have the master call the port, as it calls a node whose parameter has changed."""
+    try:
+        async with _subscribed(context, trial):
+            async with asyncio.timeout(MASTER_WAIT):
+                await trial.reached.wait()
+    except TimeoutError:
+        return "missed"
+    except Unreachable as error:
+        log.debug("the master can't try port %d: %s", trial.port, error)
+        return "unknown"
+    return "ok"
+
+
+@asynccontextmanager
+async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
+    """A parameter with the port under test as its subscriber, for as long as it takes."""
+    name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(trial.where)
+    batch = context.upstream.batch
+    try:
+        done = await batch(
+            [("subscribeParam", [name, uri, name]), ("setParam", [CALLER_ID, name, True])]
+        )
+        if None in done:
+            raise Unreachable("the master refused a call")
+        yield
+    finally:
+        await batch([("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])])
+
+
+def _reply(secret: str) -> bytes:
+    body = xmlrpc.dump_reply([1, secret, 0])
+    head = f"HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
+    return head.encode() + body

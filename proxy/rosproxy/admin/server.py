@@ -1,0 +1,124 @@
+"""The admin endpoint: health, readiness, metrics, status, and what a controller tells.
+
+It is on loopback by default. GET is open to whoever reaches it; POST changes things.
+"""
+
+import asyncio
+import hmac
+import json
+import logging
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from aiohttp import web
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
+
+from rosproxy.admin.requests import BodyError
+from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+
+log = logging.getLogger(__name__)
+
+GREETING = "rosproxy: /healthz /readyz /metrics /status\n"
+MAX_BODY = 1024 * 1024
+"""Longest body in bytes of a POST."""
+FORBIDDEN = (
+    "rosproxy: POST is for callers on this host's loopback, and for those that send "
+    "'Authorization: Bearer TOKEN' with the proxy's --admin-token (ROSPROXY_ADMIN_TOKEN){}\n"
+)
+
+Action = Callable[[Any], Awaitable[dict[str, Any]]]
+"""Does what a POST asks for, given its JSON body. Raises BodyError, Unreachable, MasterError."""
+
+
+class AdminServer:
+    """Serves what operators, orchestrators and controllers ask.
+
+    ``ready`` gives None or the reason why not; ``actions`` are what paths do when something is
+    posted there, each one call at a time; ``token`` lets callers from elsewhere than loopback
+    post.
+    """
+
+    def __init__(
+        self,
+        metrics: CollectorRegistry,
+        status: Callable[[], dict[str, Any]],
+        ready: Callable[[], str | None],
+        actions: Mapping[str, Action],
+        token: str | None = None,
+    ) -> None:
+        self._metrics, self._status, self._ready = metrics, status, ready
+        self._actions, self._token = actions, token
+        self._runner: web.AppRunner | None = None
+        self._turn: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+
+    async def start(self, where: HostPort) -> None:
+        """Listen. Raises OSError."""
+        app = web.Application(client_max_size=MAX_BODY)
+        app.router.add_get("/", self._greet)
+        app.router.add_get("/healthz", self._healthz)
+        app.router.add_get("/readyz", self._readyz)
+        app.router.add_get("/metrics", self._get_metrics)
+        app.router.add_get("/status", self._get_status)
+        for path in self._actions:
+            app.router.add_post(path, self._post)
+        self._runner = web.AppRunner(app, access_log=None)
+        await self._runner.setup()
+        await web.TCPSite(self._runner, where.host, where.port).start()
+
+    async def stop(self) -> None:
+        """Stop listening."""
+        if self._runner is not None:
+            await self._runner.cleanup()
+
+    async def _greet(self, request: web.Request) -> web.Response:
+        return web.Response(text=GREETING)
+
+    async def _healthz(self, request: web.Request) -> web.Response:
+        return web.Response(text="ok\n")
+
+    async def _readyz(self, request: web.Request) -> web.Response:
+        reason = self._ready()
+        return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
+
+    async def _get_metrics(self, request: web.Request) -> web.Response:
+        body = generate_latest(self._metrics)
+        return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+    async def _get_status(self, request: web.Request) -> web.Response:
+        return web.json_response(self._status())
+
+    async def _post(self, request: web.Request) -> web.Response:
+        if not self._may(request):
+            hint = "" if self._token else "; this proxy has none"
+            return web.Response(status=403, text=FORBIDDEN.format(hint))
+        try:
+            body = _parsed(await request.read())
+            async with self._turn[request.path]:
+                return web.json_response(await self._actions[request.path](body))
+        except BodyError as error:
+            return web.Response(status=400, text=f"rosproxy: {error}\n")
+        except (Unreachable, MasterError) as error:
+            log.warning("POST %s could not be carried out: %s", request.path, error)
+            return web.Response(status=503, text=f"rosproxy: {error}; try again\n")
+
+    def _may(self, request: web.Request) -> bool:
+        """Whether a caller may post.
+
+        A browser on this host is on loopback too; it says on behalf of which page it calls.
+        """
+        if self._token:
+            said = request.headers.get("Authorization", "").encode("utf-8", "replace")
+            if hmac.compare_digest(said, f"Bearer {self._token}".encode()):
+                return True
+        return is_loopback(request.remote or "") and "Origin" not in request.headers
+
+
+def _parsed(body: bytes) -> Any:
+    """A body as JSON; an empty object if there is none. Raises BodyError."""
+    try:
+        return json.loads(body) if body.strip() else {}
+    except (ValueError, RecursionError) as error:
+        raise BodyError("the body", f"must be JSON: {error}") from None

@@ -1,0 +1,96 @@
+"""Asking a running proxy's admin endpoint, for the commands ``status``, ``health``, ``doctor``.
+
+Plain http.client: it starts fast, and unlike urllib it heeds no ``http_proxy`` variable, which has
+no say in how a container asks itself.
+"""
+
+import http.client
+import json
+import os
+from typing import Any
+
+from rosproxy.net.addresses import HostPort, parse_host_port
+
+DEFAULT_URL = "http://127.0.0.1:11312"
+MAX_REPLY = 64 * 1024 * 1024
+"""Longest reply in bytes that is read."""
+_EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+
+
+class AdminError(Exception):
+    """The admin endpoint can't be asked; the message is one line that says what to do."""
+
+
+class AdminClient:
+    """Calls the admin endpoint at ``url``, ``http://host:port`` or ``host:port``.
+
+    Raises ValueError if it is neither.
+    """
+
+    def __init__(self, url: str) -> None:
+        bare = url.removeprefix("http://").rstrip("/")
+        where = parse_host_port(bare)
+        if where is None:
+            raise ValueError(f"{url!r} is not of the form {DEFAULT_URL}")
+        self.where = where
+        self.url = f"http://{where}"
+
+    def get(self, path: str, within: float = 5.0) -> str:
+        """The text at a path; ``within`` bounds each wait in seconds. Raises AdminError."""
+        return self._ask("GET", path, within)
+
+    def status(self) -> dict[str, Any]:
+        """What ``/status`` says. Raises AdminError."""
+        return self._json(self._ask("GET", "/status", 5.0), "settings")
+
+    def probe(self) -> dict[str, Any]:
+        """Let the proxy find out whether its range can be reached. Raises AdminError."""
+        return self._json(self._ask("POST", "/probe", 20.0), "probes")
+
+    def _ask(self, method: str, path: str, within: float) -> str:
+        connection = http.client.HTTPConnection(self.where.host, self.where.port, timeout=within)
+        try:
+            connection.request(method, path, headers=_authorization())
+            reply = connection.getresponse()
+            text = reply.read(MAX_REPLY).decode("utf-8", "replace")
+        except (OSError, http.client.HTTPException) as error:
+            raise self._no_answer(error) from None
+        finally:
+            connection.close()
+        if reply.status != 200:
+            raise AdminError(f"{self.url}{path} answers HTTP {reply.status}: {text.strip()[:200]}")
+        return text
+
+    def _json(self, text: str, key: str) -> dict[str, Any]:
+        try:
+            found = json.loads(text)
+        except ValueError:
+            found = None
+        if not isinstance(found, dict) or key not in found:
+            raise AdminError(f"what answers at {self.url} is not the admin endpoint of a rosproxy")
+        return found
+
+    def _no_answer(self, error: Exception) -> AdminError:
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        return AdminError(
+            f"no rosproxy answers at {self.url} ({reason.lower()}). Run this where the proxy runs "
+            "(docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
+            "http://HOST:PORT or ROSPROXY_ADMIN"
+        )
+
+
+def _authorization() -> dict[str, str]:
+    """What lets callers change things that are not on the proxy's own loopback."""
+    token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
+    return {"Authorization": f"Bearer {token}"} if token.isascii() and token.isprintable() else {}
+
+
+def default_url() -> str:
+    """Where the proxy of this container or shell has its admin endpoint.
+
+    The same variable that told the proxy where to listen tells where to ask.
+    """
+    bound = parse_host_port(os.environ.get("ROSPROXY_ADMIN_BIND", ""))
+    if bound is None:
+        return DEFAULT_URL
+    return f"http://{HostPort(_EVERYWHERE.get(bound.host, bound.host), bound.port)}"

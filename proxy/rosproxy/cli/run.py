@@ -1,0 +1,32 @@
+"""Running a proxy until a signal ends it."""
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rosproxy.app import serve
+from rosproxy.settings import Settings, parse_settings
+from rosproxy.telemetry import logs
+
+new_event_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
+with contextlib.suppress(ImportError):
+    from uvloop import new_event_loop
+
+
+def run(options: Mapping[str, Any], log_format: str, log_level: str, check: bool) -> None:
+    """Run a proxy, or only check its options. Raises SettingError."""
+    logs.set_up(log_format, log_level)
+    settings = parse_settings(options)
+    if check:
+        return
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(_serve_until_signal(settings))
+
+
+async def _serve_until_signal(settings: Settings) -> None:
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    await serve(settings, stopped)

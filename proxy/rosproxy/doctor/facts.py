@@ -1,0 +1,219 @@
+"""What the doctor has gathered, before any judgement."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cached_property
+from typing import Any
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+
+
+class Reach(Enum):
+    """How an attempt to reach somebody ended."""
+
+    ANSWERED = "answers"
+    REFUSED = "connection refused"
+    SILENT = "no answer"
+    STRANGER = "something else answers"
+    UNRESOLVABLE = "host name unknown"
+    UNTRIED = "not tried"
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An attempt to reach somebody: how it ended and, in the words of the caller, why."""
+
+    reach: Reach = Reach.UNTRIED
+    reason: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether it was tried in vain."""
+        return self.reach not in (Reach.ANSWERED, Reach.UNTRIED)
+
+
+@dataclass(frozen=True, slots=True)
+class Master:
+    """The master as the doctor found it.
+
+    ``at_root``: it does answer at the path ``/``. ``looped``: what answers is this very proxy.
+    """
+
+    uri: str
+    attempt: Attempt = Attempt()
+    addresses: tuple[str, ...] = ()
+    at_root: bool = False
+    looped: bool = False
+    round_trip: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """What a node says of itself: topics with types, and its connections.
+
+    ``peers`` are (direction, topic, peer) of open connections, the direction ``i`` or ``o``; the
+    peer of an outgoing one is a node's name, of an incoming one a slave URI.
+    """
+
+    publishes: Mapping[str, str] = field(default_factory=dict)
+    subscribes: Mapping[str, str] = field(default_factory=dict)
+    peers: frozenset[tuple[str, str, str]] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node that the master knows.
+
+    ``uri`` is what the master says, empty if it says nothing. ``words`` are only there for nodes
+    that were asked for and could be asked.
+    """
+
+    name: str
+    uri: str = ""
+    addresses: tuple[str, ...] = ()
+    attempt: Attempt = Attempt()
+    words: Words | None = None
+
+    @property
+    def where(self) -> HostPort | None:
+        """Host and port of its URI."""
+        return parse_slave_uri(self.uri)
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """The master's state: who publishes, subscribes to and provides what."""
+
+    publishers: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    subscribers: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    services: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def topics(self) -> set[str]:
+        """All topics that anybody publishes or subscribes to."""
+        return {*self.publishers, *self.subscribers}
+
+    def sides(self, topic: str) -> list[str]:
+        """The publishers and the subscribers of a topic."""
+        return [*self.publishers.get(topic, ()), *self.subscribers.get(topic, ())]
+
+    def lonely(self, topic: str) -> bool:
+        """Whether a topic lacks publishers or subscribers."""
+        return not (self.publishers.get(topic) and self.subscribers.get(topic))
+
+    def names(self) -> set[str]:
+        """All nodes."""
+        tables = (self.publishers, self.subscribers, self.services)
+        return {name for table in tables for names in table.values() for name in names}
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """What the names that the user asked for lead to.
+
+    ``named`` are the nodes among the names, ``nodes`` all that have to be looked at; ``pairs`` are
+    (topic, publisher, subscriber), ``lonely`` topics that lack one side.
+    """
+
+    named: Sequence[str] = ()
+    pairs: Sequence[tuple[str, str, str]] = ()
+    lonely: Sequence[str] = ()
+    services: Sequence[str] = ()
+    unknown: Sequence[str] = ()
+    nodes: frozenset[str] = frozenset()
+
+
+def scope(graph: Graph, names: Sequence[str]) -> Scope:
+    """Resolve names of nodes, topics and services.
+
+    One node means all of its topics (without ``/rosout``, which every node has), several nodes
+    what they have in common, topics their publishers and subscribers. A name that is both a
+    node's and a topic's means the topic.
+    """
+    topics = [name for name in names if name in graph.topics]
+    nodes = [name for name in names if name in graph.names() and name not in topics]
+    services = [name for name in names if name in graph.services]
+    candidates = sorted(topics or (graph.topics - {"/rosout"} if nodes else ()))
+    pairs = [
+        (topic, publisher, subscriber)
+        for topic in candidates
+        for publisher in graph.publishers.get(topic, ())
+        for subscriber in graph.subscribers.get(topic, ())
+        if _asked_for({publisher, subscriber}, {*nodes})
+    ]
+    lonely = [topic for topic in candidates if graph.lonely(topic)]
+    if not topics:
+        lonely = [topic for topic in lonely if {*nodes} & {*graph.sides(topic)}]
+    unknown = [name for name in names if name not in {*nodes, *topics, *services}]
+    asked = {*nodes, *(node for name in services for node in graph.services[name])}
+    sides = {node for _, *both in pairs for node in both}
+    sides |= {node for topic in topics for node in graph.sides(topic)}
+    return Scope(nodes, pairs, lonely, services, unknown, frozenset(asked | sides))
+
+
+def _asked_for(pair: set[str], nodes: set[str]) -> bool:
+    """Whether a publisher and a subscriber are among the nodes asked for; one will do for one."""
+    return pair <= nodes if len(nodes) > 1 else nodes <= pair
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Everything gathered.
+
+    ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status``
+    and ``probe`` are what it said. ``advertised_addresses`` is what the advertised host resolves
+    to here. ``service_uris`` are the master's, by service. ``clock``: nodes are told to use
+    simulated time. ``names`` are the nodes, topics and services that the user asked for;
+    ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
+    whether that was reached from here.
+    """
+
+    admin: str = ""
+    admin_error: str = ""
+    status: Mapping[str, Any] | None = None
+    probe: Mapping[str, Any] | None = None
+    probe_error: str = ""
+    master: Master | None = None
+    advertise_host: str = ""
+    advertised_addresses: tuple[str, ...] = ()
+    published_master: Attempt = Attempt()
+    graph: Graph | None = None
+    nodes: Mapping[str, Node] = field(default_factory=dict)
+    service_uris: Mapping[str, str] = field(default_factory=dict)
+    services: Mapping[str, Attempt] = field(default_factory=dict)
+    clock: bool = False
+    names: tuple[str, ...] = ()
+    data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = field(default_factory=dict)
+
+    @cached_property
+    def scope(self) -> Scope:
+        """What the names asked for lead to."""
+        return scope(self.graph or Graph(), self.names)
+
+    @cached_property
+    def leases(self) -> dict[int, Mapping[str, Any]]:
+        """The nodes of ``status`` by the port that outside sees."""
+        if self.status is None:
+            return {}
+        found = ((parse_slave_uri(n["advertised_uri"]), n) for n in self.status["nodes"])
+        return {where.port: node for where, node in found if where}
+
+    @cached_property
+    def advertised(self) -> PortRange | None:
+        """The range of ports that outside sees, if the proxy could be asked."""
+        if self.status is None:
+            return None
+        first, _, last = self.status["ports"]["advertise"].partition("-")
+        return PortRange(int(first), int(last))
+
+    def ours(self, where: HostPort | None) -> bool:
+        """Whether an address from the master is one that this proxy gives to inside nodes."""
+        return bool(
+            where
+            and self.advertised
+            and where.host == self.advertise_host
+            and where.port in self.advertised
+        )

@@ -1,0 +1,88 @@
+"""Findings: what ``rosproxy doctor`` says, as text and as JSON."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+from typing import Any
+
+from rosproxy.telemetry.text import clean, plural, wrap
+
+MOST_ALIKE = 10
+"""Findings of one check with the same mending that are shown one by one."""
+INDENT = " " * 9
+
+
+class Severity(IntEnum):
+    """How bad it is: an error keeps somebody from hearing somebody."""
+
+    OK = 0
+    INFO = 1
+    WARNING = 2
+    ERROR = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One result: of which ``check``, about which ``subject``, what, and what mends it."""
+
+    severity: Severity
+    check: str
+    subject: str
+    text: str
+    fix: str = ""
+
+
+def failed(findings: Sequence[Finding]) -> bool:
+    """Whether anything is wrong."""
+    return any(finding.severity is Severity.ERROR for finding in findings)
+
+
+def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
+    """The findings as plain data."""
+    rows = [{**asdict(f), "severity": f.severity.name.lower()} for f in findings]
+    return {"ok": not failed(findings), "findings": rows}
+
+
+def render(findings: Sequence[Finding], columns: int) -> str:
+    """The findings as text, the worst last, where the eye is when the command has ended."""
+    lines: list[str] = []
+    for severity in Severity:
+        lines += _grouped([f for f in findings if f.severity is severity], columns)
+    return "\n".join([*lines, "", _summary(findings)])
+
+
+def _grouped(findings: Sequence[Finding], columns: int) -> Iterator[str]:
+    """Findings of one kind that are mended alike stand together, and what mends them once."""
+    alike: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        alike.setdefault((finding.check, finding.fix), []).append(finding)
+    for (check, fix), group in alike.items():
+        for finding in group[:MOST_ALIKE]:
+            yield from _block(finding, columns)
+        if len(group) > MOST_ALIKE:
+            yield f"{INDENT}... and {len(group) - MOST_ALIKE} more like this ({check}): see --json"
+        yield from wrap(clean(fix), columns, f"{INDENT}  ", f"{INDENT}> ")
+
+
+def _block(finding: Finding, columns: int) -> list[str]:
+    subject = f"{clean(finding.subject)}: " if finding.subject else ""
+    first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
+    return wrap(subject + clean(finding.text), columns, INDENT, first)
+
+
+_WORDS = {
+    Severity.OK: "ok",
+    Severity.INFO: "note",
+    Severity.WARNING: "WARNING",
+    Severity.ERROR: "ERROR",
+}
+
+
+def _summary(findings: Sequence[Finding]) -> str:
+    errors, warnings = (
+        sum(f.severity is severity for f in findings)
+        for severity in (Severity.ERROR, Severity.WARNING)
+    )
+    if not errors and not warnings:
+        return "Nothing wrong was found."
+    return f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."

@@ -1,0 +1,152 @@
+"""The names asked for: which publisher and subscriber are not connected, and why."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from rosproxy.doctor.facts import Attempt, Facts, Node, Reach
+from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.rules.proxy import local_master
+from rosproxy.net.addresses import is_loopback, parse_host_port
+from rosproxy.telemetry.text import listed, size
+
+PAIR, ANY = "pair", "*"
+
+
+def check(facts: Facts) -> Iterator[Finding]:
+    """All findings about the names asked for."""
+    if facts.names and facts.graph is None:
+        text = "nothing can be said: the master does not answer"
+        yield Finding(Severity.INFO, PAIR, ", ".join(facts.names), text)
+    elif facts.names:
+        yield from _named(facts)
+
+
+def _named(facts: Facts) -> Iterator[Finding]:
+    scope = facts.scope
+    yield from (_unknown(facts, name) for name in scope.unknown)
+    yield from (_lonely(facts, topic) for topic in scope.lonely)
+    yield from (_pair(facts, *pair) for pair in scope.pairs)
+    yield from (_service(facts, service) for service in scope.services)
+    together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
+    if scope.named and len(together) > 1 and not scope.pairs:
+        yield _nothing_common(together)
+
+
+def _unknown(facts: Facts, name: str) -> Finding:
+    graph = facts.graph
+    known = sorted(graph.names() | graph.topics | {*graph.services}) if graph else []
+    alike = get_close_matches(name, known, 3, 0.7)
+    alike += [other for other in known if other.endswith(name) and other not in alike][:3]
+    hint = f"; there is {listed(alike)}" if alike else ""
+    text = f"the master knows no node, topic or service of this name{hint}"
+    fix = "rosnode list; rostopic list; look for a namespace or a remapping too many"
+    return Finding(Severity.ERROR, PAIR, name, text, fix)
+
+
+def _lonely(facts: Facts, topic: str) -> Finding:
+    graph = facts.graph
+    publishers = graph.publishers.get(topic, ()) if graph else ()
+    sides = graph.sides(topic) if graph else ()
+    who, lacks = ("published", "subscribes to") if publishers else ("subscribed to", "publishes")
+    text = f"{who} by {listed(sides)}; nobody {lacks} it"
+    others = sorted(graph.topics - {topic}) if graph else []
+    alike = [o for o in others if o.rpartition("/")[2] == topic.rpartition("/")[2]]
+    fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
+    fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
+    severity = Severity.ERROR if topic in facts.names else Severity.INFO
+    return Finding(severity, PAIR, topic, text, fix)
+
+
+def _nothing_common(names: Sequence[str]) -> Finding:
+    text = "none publishes what another of them subscribes to"
+    fix = f"compare: rosnode info {' '.join(names)}; look for namespaces and remappings"
+    return Finding(Severity.ERROR, PAIR, " and ".join(names), text, fix)
+
+
+def _pair(facts: Facts, topic: str, publisher: str, subscriber: str) -> Finding:
+    giver, taker = facts.nodes[publisher], facts.nodes[subscriber]
+    label = f"{topic} from {publisher} to {subscriber}"
+    if connected(topic, giver, taker):
+        return Finding(Severity.OK, PAIR, label, "connected" + _traffic(facts, topic, giver, taker))
+    text, fix = _why(facts, topic, giver, taker)
+    return Finding(Severity.ERROR, PAIR, label, f"not connected: {text}", fix)
+
+
+def connected(topic: str, giver: Node, taker: Node) -> bool:
+    """Whether a publisher says that a subscriber is connected.
+
+    The publisher knows best: a subscriber lists connections that it only tries to make. Where the
+    publisher can't be asked, the subscriber's word has to do.
+    """
+    if giver.words is not None:
+        return ("o", topic, taker.name) in giver.words.peers
+    return taker.words is not None and ("i", topic, giver.uri) in taker.words.peers
+
+
+def _traffic(facts: Facts, topic: str, giver: Node, taker: Node) -> str:
+    lease = facts.leases.get(giver.where.port) if giver.where and facts.ours(giver.where) else None
+    for connection in lease["connections"] if lease else ():
+        if (connection["name"], connection["caller_id"]) == (topic, taker.name):
+            rate = f"{size(connection['sent_rate'])}/s just now"
+            return f", {size(connection['sent'])} so far, {rate}"
+    return ""
+
+
+def _why(facts: Facts, topic: str, giver: Node, taker: Node) -> tuple[str, str]:
+    """Why a pair is not connected, the most certain reason first, and what mends it."""
+    for node in (giver, taker):
+        if unreachable(facts, node):
+            return f"{node.name} can't be reached from here", "see what is said of it"
+    offered = giver.words.publishes.get(topic) if giver.words else ANY
+    wanted = taker.words.subscribes.get(topic) if taker.words else ANY
+    if offered is None:
+        return f"{giver.name} says that it does not publish it", f"restart {giver.name}"
+    if wanted is None:
+        return f"{taker.name} says that it is not subscribed to it", f"restart {taker.name}"
+    if ANY not in (offered, wanted) and offered != wanted:
+        return f"types differ, {offered} and {wanted}", "use the same message type on both sides"
+    return _why_no_transport(facts, topic, giver, taker)
+
+
+def unreachable(facts: Facts, node: Node) -> bool:
+    """Whether a node can't be reached, as far as is known."""
+    if facts.ours(node.where) and node.where:
+        lease: Mapping[str, Any] | None = facts.leases.get(node.where.port)
+        return lease is None or lease["state"] not in ("ok", "new")
+    return node.attempt.failed or (node.where is None)
+
+
+def _why_no_transport(facts: Facts, topic: str, giver: Node, taker: Node) -> tuple[str, str]:
+    address, attempt = facts.data_ports.get((giver.name, topic), ("", Attempt()))
+    where = parse_host_port(address)
+    restart = f"restart {taker.name}"
+    if attempt.failed:
+        what = f"{giver.name} gives {address or 'nothing'} as its data port, {attempt.reach.value}"
+        set_ip = f"where {giver.name} runs: ROS_IP=ADDRESS and no firewall, then restart it"
+        return f"{what} ({attempt.reason})" if attempt.reason else what, set_ip
+    elsewhere = not facts.ours(giver.where) and not local_master(facts)
+    if where and is_loopback(where.host) and elsewhere:
+        text = f"{giver.name} gives {address} as its data port, which is loopback"
+        return text, f"where {giver.name} runs: ROS_IP=ADDRESS, then restart it"
+    if facts.ours(giver.where) and not facts.ours(taker.where) and giver.where:
+        port = giver.where
+        return (
+            f"{giver.name} is behind the proxy and fine; {taker.name} has not come to {port}",
+            f"on the machine of {taker.name}: nc -vz {port.host} {port.port}; then {restart}",
+        )
+    text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
+    return text, f"look into the log of {taker.name}; {restart}"
+
+
+def _service(facts: Facts, service: str) -> Finding:
+    uri, attempt = facts.service_uris.get(service, ""), facts.services.get(service, Attempt())
+    providers = listed(facts.graph.services.get(service, ())) if facts.graph else ""
+    if not attempt.failed:
+        text = f"{providers} provides it at {uri}: {attempt.reach.value}"
+        return Finding(Severity.OK, PAIR, service, text)
+    text = f"{providers} provides it at {uri}: {attempt.reach.value}"
+    fix = f"restart {providers}; if it is gone: rosnode cleanup"
+    if attempt.reach is Reach.UNRESOLVABLE:
+        fix = f"where {providers} runs: ROS_IP=ADDRESS, then restart it"
+    return Finding(Severity.ERROR, PAIR, service, text, fix)

@@ -1,0 +1,1 @@
+"""Moving the bytes of a connection: by splice in user space, or by the kernel alone."""

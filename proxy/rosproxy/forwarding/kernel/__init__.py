@@ -1,0 +1,1 @@
+"""Connections that the kernel forwards: netfilter rules kept in step with the leases."""

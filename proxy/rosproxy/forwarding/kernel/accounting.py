@@ -1,0 +1,140 @@
+"""What the kernel has forwarded and forwards, by endpoint: bytes, and open connections."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rosproxy.forwarding.kernel import conntrack
+from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.nft import Counters
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.registry import Registry
+
+
+@dataclass(slots=True)
+class Account:
+    """Bytes of IP packets of one endpoint: sent outside, and received from there.
+
+    ``rates`` are both in bytes per second, as of the last count.
+    """
+
+    sent: int = 0
+    received: int = 0
+    rates: tuple[float, float] = (0.0, 0.0)
+
+
+class Ledger:
+    """Bytes by port, from counters that begin anew whenever their table is made again."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, tuple[int, int]] = {}
+
+    def take(self, counters: Counters) -> dict[int, tuple[int, int]]:
+        """What has been counted since the last time, by port; ports without anything left out."""
+        grown = {port: self._grown(port, *counted) for port, counted in counters.items()}
+        self._last = dict(counters)
+        return {port: more for port, more in grown.items() if any(more)}
+
+    def _grown(self, port: int, sent: int, received: int) -> tuple[int, int]:
+        before = self._last.get(port, (0, 0))
+        if sent < before[0] or received < before[1]:
+            return sent, received
+        return sent - before[0], received - before[1]
+
+
+SILENCE_WINDOW = 2.0
+"""Seconds at least over which it is told whether anything goes back through a port."""
+
+
+class Silence:
+    """Ports through which something comes in and nothing goes back.
+
+    Connections that are dropped on the way never show up as such; their bytes do. A first packet
+    is sent again after one and after three seconds: two windows in a row see it.
+    """
+
+    def __init__(self) -> None:
+        self._began = 0.0
+        self._bytes: dict[int, tuple[int, int]] = {}
+        self._before: set[int] = set()
+
+    def look(self, grown: Counters, now: float) -> list[int]:
+        """The ports that were silent in two windows in a row, by what was counted of late."""
+        for port, (sent, received) in grown.items():
+            out, into = self._bytes.get(port, (0, 0))
+            self._bytes[port] = out + sent, into + received
+        if now - self._began < SILENCE_WINDOW:
+            return []
+        silent = {port for port, (sent, received) in self._bytes.items() if received and not sent}
+        found, self._before = silent & self._before, silent
+        self._began, self._bytes = now, {}
+        return sorted(found)
+
+
+class KernelBook:
+    """Whose the connections through the fast ports are, and what went through them.
+
+    A port that was given back stays its last holder's until somebody else holds it, or the holder
+    ends: the connections through it go on meanwhile. ``silent`` are the ports behind which nobody
+    answered of late.
+    """
+
+    def __init__(self) -> None:
+        self.owners: Mapping[int, Endpoint] = {}
+        self._accounts: dict[Endpoint, Account] = {}
+        self._ledger, self._silence = Ledger(), Silence()
+        self.silent: list[int] = []
+        self._counted_at = 0.0
+
+    def note_owners(self, registry: Registry) -> None:
+        """Take in who holds which fast port now."""
+        there = {p: e for p, e in self.owners.items() if registry.by_port.get(e.port) is e}
+        self.owners = there | {e.fast_port: e for e in registry if e.fast_port is not None}
+        known = set(self.owners.values())
+        self._accounts = {e: account for e, account in self._accounts.items() if e in known}
+
+    def count(self, counters: Counters, now: float) -> list[tuple[str, int, int]]:
+        """Take in counters; what was sent and received since the last time, by node name."""
+        passed, self._counted_at = now - self._counted_at, now
+        for account in self._accounts.values():
+            account.rates = 0.0, 0.0
+        grown, by_port = [], self._ledger.take(counters)
+        self.silent = self._silence.look(by_port, now)
+        for port, (sent, received) in by_port.items():
+            endpoint = self.owners.get(port)
+            if endpoint is not None:
+                self._add(endpoint, sent, received, passed)
+            names = endpoint.caller_ids if endpoint else []
+            grown.append((names[0] if names else "unnamed", sent, received))
+        return grown
+
+    def _add(self, endpoint: Endpoint, sent: int, received: int, passed: float) -> None:
+        account = self._accounts.setdefault(endpoint, Account())
+        account.sent += sent
+        account.received += received
+        out, into = account.rates
+        if passed > 0:
+            account.rates = out + sent / passed, into + received / passed
+
+    def note_peers(self, flows: Sequence[Flow]) -> None:
+        """Take in all connections that the kernel tracks now.
+
+        Those to a node that is down don't count: if its host vanished without a word, the kernel
+        takes them for open for days.
+        """
+        by_port: dict[int, list[Flow]] = {}
+        for flow in flows:
+            by_port.setdefault(flow.port, []).append(flow)
+        found: dict[Endpoint, list[Flow]] = {}
+        for port, endpoint in self.owners.items():
+            found.setdefault(endpoint, []).extend(by_port.get(port, []))
+        for endpoint, mine in found.items():
+            there = [] if endpoint.health.down else mine
+            endpoint.fast_peers = conntrack.peers(there, endpoint.place.address)
+
+    def account(self, endpoint: Endpoint) -> Account:
+        """What went through an endpoint's fast ports so far."""
+        return self._accounts.get(endpoint, Account())
+
+    def ports_of(self, endpoint: Endpoint) -> list[int]:
+        """The fast ports that connections to an endpoint may go through."""
+        return [port for port, owner in self.owners.items() if owner is endpoint]

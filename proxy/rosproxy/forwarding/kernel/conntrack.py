@@ -1,0 +1,82 @@
+"""What ``conntrack -L`` prints: one connection a line, as the kernel tracks it.
+
+    tcp 6 431999 ESTABLISHED src=A dst=B sport=1 dport=2 src=C dst=D sport=3 dport=4 [ASSURED]
+    mark=5 use=1
+
+The first four addresses are of the connection as it came, the others of what answers it.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from rosproxy.forwarding.kernel.nft import Marks
+from rosproxy.net.addresses import HostPort
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``."""
+
+    state: str
+    peer: HostPort
+    port: int
+    node: HostPort
+
+    @property
+    def open(self) -> bool:
+        """Whether both sides have said yes and none has ended it."""
+        return self.state == "ESTABLISHED"
+
+    @property
+    def unanswered(self) -> bool:
+        """Whether the node has not answered yet."""
+        return self.state == "SYN_SENT"
+
+
+def read(text: str, marks: Marks) -> list[Flow]:
+    """The connections of one proxy, by its marks. Lines that make no sense are left out."""
+    flows = (_flow(line, marks) for line in text.splitlines())
+    return [flow for flow in flows if flow]
+
+
+def peers(flows: Iterable[Flow], address: str) -> dict[str, int]:
+    """How many open connections each peer has with the node at an address."""
+    return dict(Counter(f.peer.host for f in flows if f.open and f.node.host == address))
+
+
+class Watch:
+    """Which connections nobody has answered for ``patience`` seconds."""
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._since: dict[Flow, float] = {}
+
+    def look(self, flows: Sequence[Flow], now: float) -> list[Flow]:
+        """Those among the connections that there are at a time."""
+        self._since = {flow: self._since.get(flow, now) for flow in flows if flow.unanswered}
+        return [flow for flow, since in self._since.items() if now - since >= self._patience]
+
+
+def _flow(line: str, marks: Marks) -> Flow | None:
+    words = line.split()
+    if not words or words[0] != "tcp":
+        return None
+    said: dict[str, list[str]] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if equals:
+            said.setdefault(key, []).append(value)
+    state = next((word for word in words[1:] if word.isupper() and word[0].isalpha()), "")
+    try:
+        port = marks.port(int(said["mark"][0]))
+        if port is None:
+            return None
+        return Flow(
+            state,
+            HostPort(said["src"][0], int(said["sport"][0])),
+            port,
+            HostPort(said["src"][1], int(said["sport"][1])),
+        )
+    except (KeyError, IndexError, ValueError):
+        return None

@@ -1,0 +1,122 @@
+"""The kernel plane: which ports the kernel forwards to where, and why it doesn't.
+
+Plain decisions; the shell (`plane`) reads and changes the kernel's tables. A
+forward never sees a connection header. Should a policy ever need one (who may subscribe to what),
+`destination` is the place to answer why such an endpoint stays in user space.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.ros1.registry.endpoint import Endpoint
+
+Forwards = Mapping[int, HostPort]
+"""Fast ports with the TCPROS addresses of the nodes that they are forwarded to."""
+
+FIRST_PAUSE = 5.0
+LONGEST_PAUSE = 3600.0
+"""Seconds for which a forward behind which nobody answered is not made again; the first and the
+longest time, it doubles from one to the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """What the kernel can do here: forward IPv4, forward IPv6; ``own`` tells own addresses."""
+
+    ipv4: bool = True
+    ipv6: bool = True
+    own: Collection[str] = ()
+
+
+def destination(endpoint: Endpoint, world: World) -> HostPort | str:
+    """Where an endpoint's fast port may be forwarded to, or why it may not.
+
+    The address is the one that the proxy found the node at, the port the one that the node itself
+    named: a forged registration can't make the kernel forward to another host.
+    """
+    ports = {port for port in (endpoint.tcpros_port, *endpoint.topic_ports.values()) if port}
+    address = endpoint.place.address
+    if endpoint.health.down or not endpoint.trusted:
+        return "the node does not answer"
+    if not ports:
+        return "nobody outside has asked for a topic of it yet"
+    if len(ports) > 1:
+        return "its topics are on several TCPROS ports"
+    if is_loopback(address) or address in world.own:
+        return "the node runs in the network namespace of the proxy itself"
+    if not (world.ipv6 if ":" in address else world.ipv4):
+        return f"{_FORWARDING[':' in address]} is not 1 in the proxy's network namespace"
+    return HostPort(address, ports.pop())
+
+
+_FORWARDING = ("net.ipv4.ip_forward", "net.ipv6.conf.all.forwarding")
+
+
+def kept(now: Forwards, endpoints: Iterable[Endpoint], recovered: bool) -> dict[int, HostPort]:
+    """The forwards from before a restart that nothing is known against yet.
+
+    Until the registry is rebuilt these are all; after that those of endpoints whose node has not
+    been heard yet, if they lead to the address where it is looked for.
+    """
+    if not recovered:
+        return dict(now)
+    waiting = {e.fast_port: e.place.address for e in endpoints if not e.trusted and e.fast_port}
+    return {port: where for port, where in now.items() if waiting.get(port) == where.host}
+
+
+def unchanged(
+    now: Forwards, owners: Mapping[int, Endpoint], changed: Collection[Endpoint]
+) -> dict[int, HostPort]:
+    """The forwards of all endpoints that still have them, without those that have changed."""
+    found = ((port, where, owners.get(port)) for port, where in now.items())
+    return {
+        port: where
+        for port, where, owner in found
+        if owner is not None and owner.fast_port == port and owner not in changed
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What is to be taken out of the kernel's maps, and then put in."""
+
+    removed: Mapping[int, HostPort] = field(default_factory=dict)
+    added: Mapping[int, HostPort] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to do."""
+        return bool(self.removed or self.added)
+
+
+def changes(now: Forwards, wanted: Forwards) -> Changes:
+    """What makes ``now`` what is ``wanted``."""
+    return Changes(_besides(now, wanted), _besides(wanted, now))
+
+
+def _besides(these: Forwards, others: Forwards) -> dict[int, HostPort]:
+    """What is not also among the others; identity first, since nearly all of a thousand is."""
+    pairs = ((port, where, others.get(port)) for port, where in these.items())
+    return {port: where for port, where, other in pairs if where is not other and where != other}
+
+
+class Pauses:
+    """Forwards that are not made for a while, since nobody answered behind them."""
+
+    def __init__(self) -> None:
+        self._until: dict[tuple[int, HostPort], tuple[float, float, str]] = {}
+
+    def note(self, port: int, where: HostPort, why: str, now: float) -> None:
+        """Note that a forward failed at a time; for longer each time."""
+        _, pause, _ = self._until.get((port, where), (0.0, FIRST_PAUSE / 2, ""))
+        pause = min(2 * pause, LONGEST_PAUSE)
+        self._until[port, where] = now + pause, pause, why
+
+    def why(self, port: int, where: HostPort, now: float) -> str | None:
+        """Why a forward is not made now; None if it may be."""
+        until, _, why = self._until.get((port, where), (now, 0.0, ""))
+        return why if now < until else None
+
+    def keep(self, ports: Collection[int]) -> None:
+        """Forget what was noted about all other ports."""
+        self._until = {key: value for key, value in self._until.items() if key[0] in ports}

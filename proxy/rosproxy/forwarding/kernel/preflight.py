@@ -1,0 +1,83 @@
+"""Whether the kernel plane may be used in the network namespace that the proxy runs in."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
+from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.tools import ToolError, Tools
+from rosproxy.settings import DataPlane
+
+_INTERFACES = Path("/sys/class/net")
+_LEGACY_TABLES = Path("/proc/net/ip_tables_names")
+_IPV4 = Path("/proc/sys/net/ipv4/ip_forward")
+_IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
+
+
+def forwarding() -> World:
+    """What this network namespace forwards."""
+    return World(ipv4=_says_one(_IPV4), ipv6=_says_one(_IPV6))
+
+
+async def why_not(mode: DataPlane, tools: Tools) -> str | None:
+    """What is in the way of the kernel plane, and what to do about it; None if nothing is seen.
+
+    ``auto`` stays away from what looks like a host's own network: there a table of the proxy
+    would concern everybody's connections.
+    """
+    for reason in _reasons(mode):
+        return reason
+    try:
+        chains = dropping_chains(await tools.nft("list", "chains"))
+    except (ToolError, NftError) as error:
+        return str(error)
+    if chains:
+        return (
+            f"another firewall here drops what is forwarded ({', '.join(chains)}): run the proxy "
+            "in a network namespace of its own"
+        )
+    return None
+
+
+def _reasons(mode: DataPlane) -> Iterator[str]:
+    if sys.platform != "linux":
+        yield "only Linux has it"
+        return
+    if mode == "auto" and (hardware := _hardware()):
+        yield (
+            f"this looks like a host's own network (it has {hardware}), which --data-plane auto "
+            "leaves alone: use --data-plane kernel, or a network namespace of its own"
+        )
+    world = forwarding()
+    if not (world.ipv4 or world.ipv6):
+        yield (
+            "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
+            "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"
+        )
+    if "filter" in _read(_LEGACY_TABLES).split():
+        yield (
+            "iptables-legacy has a filter table here, which may drop what is forwarded: use "
+            "iptables-nft, or run the proxy in a network namespace of its own"
+        )
+
+
+def _hardware() -> str | None:
+    """A network interface that is a device: containers have only virtual ones."""
+    try:
+        names = sorted(_INTERFACES.iterdir())
+    except OSError:
+        return None
+    return next((path.name for path in names if (path / "device").exists()), None)
+
+
+def _says_one(path: Path) -> bool:
+    return _read(path).strip() == "1"
+
+
+def _read(path: Path) -> str:
+    """A file's text; nothing if there is none, or it is not for this user."""
+    try:
+        return path.read_text(encoding="ascii")
+    except OSError:
+        return ""

@@ -1,0 +1,101 @@
+"""The relays of a service that are open."""
+
+import asyncio
+import contextlib
+import logging
+import selectors
+import socket
+from collections.abc import Callable, Iterator
+
+from rosproxy.forwarding.relay import Relay
+
+log = logging.getLogger(__name__)
+
+STOP_TIMEOUT = 1.0
+"""Seconds that relays get to end when a service stops."""
+STARTS_PER_TURN = 64
+"""Threads started before the loop does other work, when many subscribers leave at once."""
+
+
+class OpenRelays:
+    """Relays from their start to their end. Needs a running event loop to start one."""
+
+    def __init__(self) -> None:
+        self._open: set[Relay] = set()
+        self._quiet: _Quiet | None = None
+        self._none = asyncio.Event()
+        self._none.set()
+
+    def __iter__(self) -> Iterator[Relay]:
+        """All open relays; safe against changes while iterating."""
+        return iter(list(self._open))
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._open)
+
+    def start(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
+        """Start a relay; ``ended`` is called in the event loop when it has ended."""
+        loop = asyncio.get_running_loop()
+        if self._quiet is None:
+            self._quiet = _Quiet(loop)
+        self._open.add(relay)
+        self._none.clear()
+        relay.start(
+            lambda done: _call_in(loop, lambda: self._finish(done, ended)),
+            self._quiet.when_readable,
+        )
+
+    async def stop(self) -> None:
+        """End all of them."""
+        for relay in self:
+            relay.end()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STOP_TIMEOUT):
+                await self._none.wait()
+        if self._quiet is not None:
+            self._quiet.close()
+            self._quiet = None
+
+    def _finish(self, relay: Relay, ended: Callable[[Relay], None]) -> None:
+        self._open.discard(relay)
+        if not self._open:
+            self._none.set()
+        ended(relay)
+
+
+def _call_in(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
+    """Run a function in the loop from a thread; not at all if the loop has ended."""
+    try:
+        loop.call_soon_threadsafe(function)
+    except RuntimeError:
+        log.debug("the event loop has ended before a relay")
+
+
+class _Quiet:
+    """Sockets that have nothing to say yet.
+
+    The loop sees one descriptor for all of them: libuv makes non-blocking what it watches, and
+    relays block.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop, self._selector = loop, selectors.DefaultSelector()
+        loop.add_reader(self._number(), self._look)
+
+    def when_readable(self, sock: socket.socket, function: Callable[[], object]) -> None:
+        """Call a function in the loop, once, when a socket has bytes, has ended or has failed."""
+        self._selector.register(sock, selectors.EVENT_READ, function)
+
+    def close(self) -> None:
+        """Forget all of them."""
+        self._loop.remove_reader(self._number())
+        self._selector.close()
+
+    def _look(self) -> None:
+        for key, _ in self._selector.select(0)[:STARTS_PER_TURN]:
+            self._selector.unregister(key.fileobj)
+            key.data()
+
+    def _number(self) -> int:
+        return self._selector.fileno()

@@ -1,0 +1,1 @@
+"""What the proxy calls: the real master, and nodes."""

@@ -1,0 +1,181 @@
+"""XML-RPC calls to the master and to inside nodes."""
+
+import asyncio
+import time
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiohttp
+
+from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.net.http_client import HttpClient
+from rosproxy.net.resolver import resolve
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.telemetry.metrics import Metrics
+
+CALLER_ID = "/rosproxy"
+"""The node name under which the proxy itself calls."""
+LOOP_HEADER = "X-Rosproxy"
+"""Carries the proxy's own id, so that it notices when a call of its own comes back to it."""
+MULTICALL_SIZE = 100
+MASTER_CONNECTIONS = 64
+MASTER_TIMEOUT = 30.0
+MASTER_KEEPALIVE = 8.0
+"""Seconds that an unused connection to the master is kept; rosmaster spends a thread on each."""
+NODE_KEEPALIVE = 2.0
+"""The same for a node; rospy spends a thread on each."""
+NODE_TIMEOUT = 15.0
+
+
+class Unreachable(Exception):
+    """A call that got no answer; ``refused`` if the connection was refused."""
+
+    def __init__(self, message: str, refused: bool = False) -> None:
+        super().__init__(message)
+        self.refused = refused
+
+    @property
+    def probe(self) -> ProbeResult:
+        """What this means for a node's health."""
+        return ProbeResult.REFUSED if self.refused else ProbeResult.SILENT
+
+
+class MasterError(Exception):
+    """The master answered, but not with status 1."""
+
+
+class MasterClient:
+    """HTTP sessions towards the master and the nodes.
+
+    Connections are kept alive: the master's between any two calls, a node's for the calls that
+    follow each other closely, as when a machine subscribes to several of its topics.
+
+    ``master_address``, which may be changed at any time, is the IP address at which the host of
+    ``master_uri`` is reached; None: where its name leads. In a container network that name may
+    lead to the proxy itself. It holds for the nodes that run on the master's host as well.
+    """
+
+    def __init__(
+        self, master_uri: str, instance: str, metrics: Metrics, master_address: str | None = None
+    ) -> None:
+        self.master_uri, self.master_address = master_uri, master_address
+        self._metrics = metrics
+        parts = urlsplit(master_uri)
+        self._master_path, self._netloc = parts.path or "/", parts.netloc
+        self._master_where = HostPort(parts.hostname or "", parts.port or 80)
+        self._master = HttpClient({LOOP_HEADER: instance}, MASTER_KEEPALIVE, MASTER_CONNECTIONS)
+        self._nodes = HttpClient({LOOP_HEADER: f"{instance} node"}, NODE_KEEPALIVE, 10_000)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await asyncio.gather(self._master.close(), self._nodes.close())
+
+    @property
+    def reached_at(self) -> str | None:
+        """The address at which the master is looked for; None before its name was resolved."""
+        host = self._master_where.host
+        return self.master_address or (host if is_address(host) else self._master.last)
+
+    async def master_addresses(self) -> list[str]:
+        """The addresses of the master's host; empty if its name can't be resolved."""
+        if self.master_address:
+            return [self.master_address]
+        return await resolve(self._master_where.host)
+
+    def reach(self, where: HostPort) -> HostPort:
+        """Where to connect to for a host and port that a URI from outside names.
+
+        That differs only for the master's host while its address is given.
+        """
+        if self.master_address and where.host.lower() == self._master_where.host:
+            return HostPort(self.master_address, where.port)
+        return where
+
+    async def master(self, body: bytes) -> bytes:
+        """The master's reply to a call. Raises Unreachable.
+
+        Kept connections are told apart by address, so a new address means new connections.
+        """
+        where, path = self.reach(self._master_where), self._master_path
+        try:
+            return await self._master.post(where, path, self._netloc, body, MASTER_TIMEOUT)
+        except _FAILURES as error:
+            raise _unreachable(f"master {self.master_uri}", error) from error
+
+    async def ask_master(self, method: str, *params: Any) -> Any:
+        """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
+        started = time.monotonic()
+        reply = await self.master(xmlrpc.dump_call(method, CALLER_ID, *params))
+        self._metrics.master_round_trip.observe(time.monotonic() - started)
+        return _value(method, _parsed(reply))
+
+    async def batch(self, calls: Sequence[tuple[str, list[Any]]]) -> list[Any]:
+        """The values of many calls ``(method, params)``, as ``system.multicall``.
+
+        ``params`` include the caller_id. A call that failed gives None. Raises Unreachable.
+        """
+        values: list[Any] = []
+        for start in range(0, len(calls), MULTICALL_SIZE):
+            part = calls[start : start + MULTICALL_SIZE]
+            body = [{"methodName": method, "params": params} for method, params in part]
+            results = _parsed(await self.master(xmlrpc.dump_call("system.multicall", body)))
+            if not isinstance(results, list) or len(results) != len(part):
+                raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
+            values += [_batched(result) for result in results]
+        return values
+
+    async def node(
+        self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
+    ) -> bytes:
+        """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
+        try:
+            return await self._nodes.post(self.reach(where), path, str(where), body, within)
+        except _FAILURES as error:
+            raise _unreachable(f"node at {where}", error) from error
+
+    async def ask_node(self, where: HostPort, within: float, method: str, *params: Any) -> Any:
+        """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
+        body = xmlrpc.dump_call(method, CALLER_ID, *params)
+        return _value(method, _parsed(await self.node(where, body, within)))
+
+
+_FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
+
+
+def _unreachable(who: str, error: BaseException) -> Unreachable:
+    refused = isinstance(error, ConnectionRefusedError)
+    if isinstance(error, TimeoutError):
+        reason = "no answer in time"
+    elif isinstance(error, OSError) and error.strerror:
+        reason = error.strerror.lower()
+    else:
+        reason = str(error) or type(error).__name__
+    return Unreachable(f"{who}: {reason}", refused)
+
+
+def _parsed(reply: bytes) -> Any:
+    """A reply's value, a fault's too."""
+    try:
+        return xmlrpc.python_value(xmlrpc.parse_response(reply)[0])
+    except xmlrpc.XmlRpcError as error:
+        raise Unreachable(f"no XML-RPC reply: {error}") from None
+
+
+def _value(method: str, reply: Any) -> Any:
+    match reply:
+        case [1, _, value]:
+            return value
+        case [_, str(message), _]:
+            raise MasterError(f"{method}: {message}")
+        case {"faultString": str(message)}:
+            raise MasterError(f"{method}: {message}")
+    raise MasterError(f"{method}: not a ROS status triple")
+
+
+def _batched(result: Any) -> Any:
+    triple = result[0] if isinstance(result, list) and len(result) == 1 else None
+    if not isinstance(triple, list) or len(triple) != 3 or triple[0] != 1:
+        return None
+    return triple[2]

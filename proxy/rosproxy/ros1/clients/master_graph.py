@@ -1,0 +1,35 @@
+"""Reading the ROS graph from the master."""
+
+import asyncio
+from collections.abc import Iterable, Mapping, Sequence
+
+from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import Graph, GraphError, read_state
+
+
+async def read_registrations(upstream: MasterClient) -> dict[str, list[Registration]]:
+    """What each node has registered. Raises Unreachable, MasterError."""
+    state, types = await asyncio.gather(
+        upstream.ask_master("getSystemState"), upstream.ask_master("getTopicTypes")
+    )
+    try:
+        return read_state(state, types)
+    except GraphError as error:
+        raise MasterError(str(error)) from None
+
+
+async def read_graph(upstream: MasterClient) -> Graph:
+    """What each node has registered, and where it is. Raises Unreachable, MasterError."""
+    held = await read_registrations(upstream)
+    return await locate(upstream, held, held)
+
+
+async def locate(
+    upstream: MasterClient, held: Mapping[str, Sequence[Registration]], nodes: Iterable[str]
+) -> Graph:
+    """What nodes have registered, with where some of them are. Raises Unreachable."""
+    names = sorted(nodes)
+    uris = await upstream.batch([("lookupNode", [CALLER_ID, name]) for name in names])
+    found = zip(names, uris, strict=False)
+    return Graph(held, {name: uri for name, uri in found if isinstance(uri, str)})

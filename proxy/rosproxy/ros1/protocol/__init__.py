@@ -1,0 +1,1 @@
+"""What ROS 1 speaks: XML-RPC documents, TCPROS headers, URIs, the master's methods. Pure."""

@@ -1,0 +1,70 @@
+"""The addresses in ROS URIs: slave URIs (``http://host:port/``) and service URIs (``rosrpc://``).
+
+An *advertised* URI carries the inside address in its path, ``http://HOST:PORT/10.0.0.5:40001/``.
+Where the node calls itself by a name, a second segment holds the address that it was found at:
+``http://HOST:PORT/c1:40001/10.0.0.5/``. roscpp drops
+the path and rospy sends it back; the port alone always suffices. The path is what lets a
+restarted proxy rebuild its table from what the master holds.
+"""
+
+import re
+from dataclasses import dataclass
+from urllib.parse import quote, unquote, urlsplit
+
+from rosproxy.net.addresses import HostPort, cached, is_address, parse_authority, parse_host_port
+
+_UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
+
+
+@dataclass(frozen=True, slots=True)
+class InsidePath:
+    """What the path of an advertised URI says: the node's own host and port, and its address."""
+
+    node: HostPort
+    address: str | None = None
+
+
+def parse_slave_uri(uri: str) -> HostPort | None:
+    """Host and port of an ``http://host:port/…`` URI, or None if it is no such URI."""
+    return parse_authority(uri) if uri.startswith("http://") else None
+
+
+def parse_service_uri(uri: str) -> HostPort | None:
+    """Host and port of a ``rosrpc://host:port`` URI, or None if it is no such URI."""
+    return parse_authority(uri) if uri.startswith("rosrpc://") else None
+
+
+def slave_uri(where: HostPort, path: str = "/") -> str:
+    """The slave URI of a host and port."""
+    return f"http://{where}{path}"
+
+
+def service_uri(where: HostPort) -> str:
+    """The service URI of a host and port; it has no path (rospy's parser takes none)."""
+    return f"rosrpc://{where}"
+
+
+def inside_path(node: HostPort, address: str) -> str:
+    """The path that carries an inside address; see the module's text."""
+    segment = _quoted(str(node))
+    return f"/{segment}/" if node.host == address else f"/{segment}/{_quoted(address)}/"
+
+
+@cached
+def parse_inside_path(uri: str) -> InsidePath | None:
+    """The inside address in the path of an advertised URI, or None if it carries none.
+
+    An address segment must be an IP address; a name there is refused.
+    """
+    try:
+        parts = [unquote(part) for part in urlsplit(uri).path.strip("/").split("/")]
+    except ValueError:
+        return None
+    node = parse_host_port(parts[0])
+    if node is None or len(parts) > 2 or (len(parts) == 2 and not is_address(parts[1])):
+        return None
+    return InsidePath(node, parts[1] if len(parts) == 2 else None)
+
+
+def _quoted(text: str) -> str:
+    return text if _UNQUOTED.fullmatch(text) else quote(text, safe=":[]")

@@ -1,0 +1,1 @@
+"""XML-RPC as ROS uses it, edited in place: every byte that need not change stays."""

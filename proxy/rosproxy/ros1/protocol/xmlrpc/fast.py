@@ -1,0 +1,139 @@
+"""XML-RPC documents in the plain form that ROS's clients write, read by regular expressions.
+
+Such a document holds nothing but printable ASCII, tags without attributes, and no entity,
+comment, CDATA or self-closing tag. So a tag ends at the next ``>`` and text at the next ``<``, and
+no two readers differ in what it says. Any other document is left to expat, which takes four times
+as long and decides what is an error.
+"""
+
+import re
+from collections.abc import Iterator
+
+from rosproxy.ros1.protocol.xmlrpc.values import INTEGERS, Kind, Value, text_of
+
+_PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
+_PROLOG = rb"(?:<\?xml version=(?:'1\.0'|\"1\.0\")\?>)?\s*"
+_CALL = re.compile(_PROLOG + rb"<methodCall>\s*<methodName>\s*([^<\s]+)\s*</methodName>\s*<params>")
+_CALL_END = re.compile(rb"\s*</params>\s*</methodCall>\s*\Z")
+_RESPONSE = re.compile(_PROLOG + rb"<methodResponse>\s*<params>")
+_RESPONSE_END = re.compile(rb"\s*</params>\s*</methodResponse>\s*\Z")
+_TOKEN = re.compile(
+    rb"""\s*(?:
+    (<value>)(?:
+        \s*<(string|int|i4|i8|boolean|double|dateTime\.iso8601|base64)>([^<]*)</\2>\s*</value>
+        |([^<]*)</value>
+        |\s*<array>\s*<data>()
+        |\s*<struct>()
+    )
+    |</data>\s*</array>\s*</value>()
+    |<member>\s*<name>([^<]*)</name>
+    |</member>()
+    |</struct>\s*</value>()
+    |<param>()
+    |</param>()
+    |()
+    )""",
+    re.VERBOSE,
+)
+_VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
+_ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
+"""The groups of a token; the last one of a match tells what it is."""
+_END_OF_VALUE = len(b"</value>")
+_KINDS: dict[bytes, Kind] = {b"string": "string"}
+_KINDS.update((name.encode(), "int") for name in INTEGERS)
+
+_Tokens = Iterator[re.Match[bytes]]
+
+
+class _NotPlain(Exception):
+    """A document of another form, or of none."""
+
+
+def call(body: bytes, depth: int, elements: int) -> tuple[str, list[Value]] | None:
+    """The method and parameters of a ``methodCall``, None if it is not of the plain form.
+
+    ``depth`` and ``elements`` are bounds as in `document.Limits`; None beyond them.
+    """
+    head = _CALL.match(body)
+    if head is None or not _is_plain(body, elements):
+        return None
+    values = _params(body, head.end(), _CALL_END, depth - 3)
+    return None if values is None else (head[1].decode(), values)
+
+
+def response(body: bytes, depth: int, elements: int) -> Value | None:
+    """The value of a ``methodResponse``, None if it is a fault or not of the plain form."""
+    head = _RESPONSE.match(body)
+    if head is None or not _is_plain(body, elements):
+        return None
+    values = _params(body, head.end(), _RESPONSE_END, depth - 3)
+    return values[0] if values is not None and len(values) == 1 else None
+
+
+def _is_plain(body: bytes, elements: int) -> bool:
+    return (
+        not body.translate(None, _PLAIN)
+        and b"]]>" not in body
+        and body.count(b"</") <= elements  # each is closed by a tag of its own
+    )
+
+
+def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
+    tokens, values, place = _TOKEN.finditer(body, start), list[Value](), start
+    try:
+        for token in tokens:
+            if token.lastindex != _PARAM:
+                break
+            values.append(_value(body, next(tokens), tokens, depth))
+            last = next(tokens)
+            if last.lastindex != _PARAM_END:
+                return None
+            place = last.end()
+    except (_NotPlain, StopIteration):
+        return None
+    return values if end.match(body, place) else None
+
+
+def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> Value:
+    """The value that a token begins; ``depth`` is how many elements may be around its text."""
+    which = token.lastindex
+    start, inside = token.span(_VALUE)
+    if which == _TYPED and depth > 1:
+        kind = _KINDS.get(token[_TYPE], "other")
+        return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
+    if which == _TEXT and depth:
+        return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
+    if depth < 4:
+        raise _NotPlain
+    if which == _ARRAY:
+        return _array(body, start, inside, tokens, depth - 3)
+    if which == _STRUCT:
+        return _struct(body, start, inside, tokens, depth - 3)
+    raise _NotPlain
+
+
+def _array(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
+    items = list[Value]()
+    for token in tokens:
+        if token.lastindex == _ARRAY_END:
+            end = token.end()
+            inner = inside, end - _END_OF_VALUE
+            return Value(body, "utf-8", "array", (start, end), inner, items, [])
+        items.append(_value(body, token, tokens, depth))
+    raise _NotPlain
+
+
+def _struct(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
+    items, members = list[Value](), list[str]()
+    for token in tokens:
+        if token.lastindex == _STRUCT_END:
+            end = token.end()
+            inner = inside, end - _END_OF_VALUE
+            return Value(body, "utf-8", "struct", (start, end), inner, items, members)
+        if token.lastindex != _NAME:
+            break
+        members.append(text_of(token[_NAME], "utf-8"))
+        items.append(_value(body, next(tokens), tokens, depth))
+        if next(tokens).lastindex != _MEMBER_END:
+            break
+    raise _NotPlain

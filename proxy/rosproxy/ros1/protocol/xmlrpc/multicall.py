@@ -1,0 +1,99 @@
+"""``system.multicall``: many calls in one, ``[{methodName: string, params: array}, …]``.
+
+Each success comes back as a one-element array, each failure as a bare fault struct
+(https://mirrors.talideon.com/articles/multicall.html).
+"""
+
+from collections.abc import Iterable, Sequence
+from xml.sax.saxutils import escape
+
+from rosproxy.ros1.protocol.xmlrpc.document import (
+    INVALID_PARAMS,
+    Call,
+    Edit,
+    Value,
+    XmlRpcError,
+    dump_value,
+    parse_response,
+)
+
+MULTICALL = "system.multicall"
+
+
+def inner_items(call: Call) -> list[Value]:
+    """The elements of a multicall's parameter."""
+    if len(call.params) != 1 or call.params[0].kind != "array":
+        return []
+    return call.params[0].items
+
+
+def inner_calls(call: Call) -> list[Call | None]:
+    """The calls of a multicall, in order; None for an element that is no call.
+
+    Raises XmlRpcError if one of them is a multicall again: rosmaster would carry it out, and
+    XmlRpc++ does so without end.
+    """
+    return [_inner_call(item) for item in inner_items(call)]
+
+
+def single_call(call: Call) -> bytes:
+    """One call of a multicall as a document of its own, its parameters as they were sent."""
+    params = b"".join(b"<param>" + value.raw + b"</param>" for value in call.params)
+    name = escape(call.method).encode()
+    return (
+        b"<?xml version='1.0'?><methodCall><methodName>" + name + b"</methodName>"
+        b"<params>" + params + b"</params></methodCall>"
+    )
+
+
+def result_value(reply: bytes) -> bytes:
+    """The reply to a single call as a result among others.
+
+    Raises XmlRpcError if it is no XML-RPC response.
+    """
+    value, fault = parse_response(reply)
+    return value.raw if fault else _array([value.raw])
+
+
+def fault_value(code: int, message: str) -> bytes:
+    """A fault of the proxy's own as a result among others."""
+    return dump_value({"faultCode": code, "faultString": message})
+
+
+def results_reply(results: Iterable[bytes]) -> bytes:
+    """The ``methodResponse`` of a multicall from its results, each a raw value."""
+    return (
+        b"<?xml version='1.0'?><methodResponse><params><param>"
+        + _array(results)
+        + b"</param></params></methodResponse>"
+    )
+
+
+def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edit]:
+    """Edits that insert raw values into an array of at least one item.
+
+    Each insert is (index in the finished array, value); indices rise.
+    """
+    edits = []
+    for done, (index, raw) in enumerate(inserts):
+        before = index - done
+        if before < len(array.items):
+            place = array.items[before].outer[0]
+        else:
+            place = array.items[-1].outer[1]
+        edits.append(Edit(place, place, raw))
+    return edits
+
+
+def _inner_call(item: Value) -> Call | None:
+    method, params = item.member("methodName"), item.member("params")
+    name = method.string() if method else None
+    if name == MULTICALL:
+        raise XmlRpcError(INVALID_PARAMS, f"{MULTICALL} inside {MULTICALL}")
+    if not name or params is None or params.kind != "array":
+        return None
+    return Call(name, params.items)
+
+
+def _array(items: Iterable[bytes]) -> bytes:
+    return b"<value><array><data>" + b"".join(items) + b"</data></array></value>"

@@ -1,0 +1,72 @@
+"""The values of XML-RPC documents, as `rosproxy.ros1.protocol.xmlrpc.document` finds them."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+from xml.parsers import expat
+
+INTEGERS = frozenset({"int", "i4", "i8"})
+SCALARS = INTEGERS | {"string", "boolean", "double", "dateTime.iso8601", "base64", "nil"}
+"""The elements that hold text (http://xmlrpc.com/spec.md, and nil, which it lacks)."""
+
+Kind = Literal["string", "int", "array", "struct", "other"]
+
+
+@dataclass(slots=True)
+class Value:
+    """One ``<value>``: its kind, its place in the document and what it holds.
+
+    ``outer`` spans the whole element, ``inner`` the text of a scalar; both are byte offsets.
+    ``members`` are the names of a struct's members, in the order of ``items``. ``encoding`` is the
+    document's.
+    """
+
+    body: bytes = field(repr=False)
+    encoding: str = "utf-8"
+    kind: Kind = "string"
+    outer: tuple[int, int] = (0, 0)
+    inner: tuple[int, int] = (0, 0)
+    items: list["Value"] = field(default_factory=list)
+    members: list[str] = field(default_factory=list)
+    _text: str | None = field(default=None, init=False, repr=False, compare=False)
+
+    @property
+    def text(self) -> str:
+        """The text of a scalar, with entities and CDATA resolved."""
+        if self._text is None:
+            start, end = self.inner
+            self._text = text_of(self.body[start:end], self.encoding)
+        return self._text
+
+    @property
+    def raw(self) -> bytes:
+        """The whole element as it was sent, in UTF-8."""
+        return self.body[slice(*self.outer)].decode(self.encoding).encode()
+
+    def string(self) -> str | None:
+        """The text if this is a string, else None."""
+        return self.text if self.kind == "string" else None
+
+    def integer(self) -> int | None:
+        """The number if this is an int, else None."""
+        if self.kind != "int":
+            return None
+        try:
+            return int(self.text)
+        except ValueError:
+            return None
+
+    def member(self, name: str) -> "Value | None":
+        """The value of a struct's member, or None."""
+        return self.items[self.members.index(name)] if name in self.members else None
+
+
+def text_of(raw: bytes, encoding: str) -> str:
+    """What a piece of a document reads, with entities, CDATA and line ends resolved."""
+    if b"&" not in raw and b"<" not in raw:
+        text = raw.decode(encoding, "replace")
+        return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
+    pieces: list[str] = []
+    parser = expat.ParserCreate(encoding)
+    parser.CharacterDataHandler = pieces.append
+    parser.Parse(b"<t>" + raw + b"</t>", True)
+    return "".join(pieces)

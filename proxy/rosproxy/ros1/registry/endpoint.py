@@ -1,0 +1,138 @@
+"""An endpoint: a node behind the proxy, where it is, what it registered, the port it holds."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.health import Health
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a node's slave API really is.
+
+    ``address`` is the IP address the proxy connects to. ``named``: the host that the node gives
+    leads there, so that neighbours can use it. ``confirmed``: the address is the one that the
+    registration came from; if not, the node's TCPROS port is believed only from the node itself.
+    ``stale``: the host that the node gives is an address that it no longer has.
+    """
+
+    address: str
+    named: bool
+    confirmed: bool = True
+    stale: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """One registration at the master, on behalf of an endpoint.
+
+    ``type`` is the topic's message type, ``service_api`` the service URI as the node gave it
+    (None after a recovery, when only the node knows it).
+    """
+
+    kind: Kind
+    name: str
+    caller_id: str
+    type: str = "*"
+    service_api: str | None = None
+    since: float = 0.0
+
+    @property
+    def key(self) -> tuple[Kind, str, str]:
+        """What tells registrations apart at the master."""
+        return self.kind, self.name, self.caller_id
+
+
+@dataclass(slots=True, eq=False)
+class Endpoint:
+    """An inside slave URI and the port that stands for it outside.
+
+    ``callers`` are the nodes' names with the number of their registrations, which `Registry` keeps.
+    ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
+    listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
+    ``trusted`` is False while only the master's data tell of the endpoint.
+
+    ``former_uris`` are those by which the master may have known it: the node's own, if it
+    registered around the proxy, and advertised ones of places where it was. ``unsettled``: what
+    the master has may still be registered with one of them. Until ``settles_at``, a time, a list
+    of publishers without this one is taken for one from before it was registered anew.
+
+    ``fast_port`` is a second port of the range, for topics alone, which the kernel forwards where
+    it may (None: it has none). ``fast_peers`` tells how many connections the kernel forwards now,
+    by the peer's address.
+    """
+
+    uri: str
+    node: HostPort
+    place: Place
+    port: int
+    registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
+    callers: dict[str, int] = field(default_factory=dict)
+    topic_ports: dict[str, int] = field(default_factory=dict)
+    tcpros_port: int | None = None
+    connections: int = 0
+    pending: int = 0
+    idle_since: float | None = None
+    trusted: bool = True
+    health: Health = field(default_factory=Health)
+    admissions: set[tuple[str, str]] = field(default_factory=set)
+    former_uris: set[str] = field(default_factory=set)
+    unsettled: bool = False
+    settles_at: float = 0.0
+    fast_port: int | None = None
+    fast_peers: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def direct(self) -> bool:
+        """Whether the node registered around the proxy, so that it may do so again."""
+        return self.uri in self.former_uris
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """The address and port of the slave API: what an endpoint is keyed by."""
+        return self.place.address, self.node.port
+
+    @property
+    def slave(self) -> HostPort:
+        """Where the proxy reaches the slave API."""
+        return HostPort(*self.key)
+
+    @property
+    def caller_ids(self) -> list[str]:
+        """The names of the nodes registered here; one, as a rule."""
+        return sorted(self.callers)
+
+    @property
+    def label(self) -> str:
+        """How messages name this endpoint: node name and own URI."""
+        return f"{', '.join(self.caller_ids) or 'unnamed node'} ({self.uri})"
+
+    def names(self, kind: Kind) -> list[str]:
+        """The topics, services or parameters registered as ``kind``."""
+        return sorted(held.name for held in self.registrations.values() if held.kind is kind)
+
+    def publishes(self, topic: str) -> bool:
+        """Whether a topic is registered as published."""
+        return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics registered here, published or subscribed to."""
+        return {*self.names(Kind.PUBLISHER), *self.names(Kind.SUBSCRIBER)}
+
+    @property
+    def connected(self) -> bool:
+        """Whether somebody outside is connected, through the proxy or through the kernel."""
+        return bool(self.connections or self.fast_peers)
+
+    @property
+    def fast_connections(self) -> int:
+        """How many connections the kernel forwards now."""
+        return sum(self.fast_peers.values())
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is registered, nobody is connected and no call is under way."""
+        return not (self.registrations or self.connected or self.pending)

@@ -1,0 +1,72 @@
+"""The ROS graph as the master tells it: who publishes, subscribes and serves what, and where."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Registration
+
+_STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
+
+
+class GraphError(ValueError):
+    """An answer of the master that does not have the form that it should have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """What each node has registered, and each node's slave URI as far as known."""
+
+    held: Mapping[str, Sequence[Registration]]
+    uris: Mapping[str, str]
+
+    def by_topic(self, kind: Kind) -> dict[str, list[str]]:
+        """The slave URIs of each topic's publishers or subscribers."""
+        topics: dict[str, list[str]] = {}
+        for node, registrations in self.held.items():
+            for held in registrations:
+                if held.kind is kind and node in self.uris:
+                    topics.setdefault(held.name, []).append(self.uris[node])
+        return topics
+
+
+def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
+    """What each node has registered, from the values of getSystemState and getTopicTypes.
+
+    ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
+    ``types`` is ``[[topic, type], …]``. Raises GraphError if ``state`` is not of that form.
+    """
+    if not _is_state(state):
+        raise GraphError("getSystemState: not of the form [[[name, [node, ...]], ...], ...]")
+    known = read_types(types)
+    found: dict[str, list[Registration]] = {}
+    for kind, entries in zip(_STATE_KINDS, state, strict=True):
+        for name, nodes in entries:
+            for node in nodes:
+                held = Registration(kind, name, node, known.get(name, "*"))
+                found.setdefault(node, []).append(held)
+    return found
+
+
+def read_types(rows: Any) -> dict[str, str]:
+    """Topics with their types, from ``[[topic, type], …]``; other rows are left out."""
+    held: dict[str, str] = {}
+    for row in rows if isinstance(rows, list) else ():
+        match row:
+            case [str(name), str(type_)]:
+                held[name] = type_
+    return held
+
+
+def _is_state(state: Any) -> bool:
+    if not (isinstance(state, list) and len(state) == 3):
+        return False
+    return all(isinstance(entries, list) and all(map(_is_entry, entries)) for entries in state)
+
+
+def _is_entry(entry: Any) -> bool:
+    match entry:
+        case [str(), list(nodes)]:
+            return all(isinstance(node, str) for node in nodes)
+    return False

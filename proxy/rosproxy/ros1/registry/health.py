@@ -1,0 +1,103 @@
+"""When a node counts as failing, dead or back: a state machine over probe results."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+UNKNOWN_PID = (None, -1)
+"""What stands for a pid that is not known, or not relied on."""
+
+FAILURES_TO_CLOSE = 2
+"""Failed probes in a row after which a node's port refuses."""
+
+
+RETRY = 1.0
+"""Seconds between probes of a node that is down."""
+
+
+class ProbeResult(Enum):
+    """How a call to a node's slave API ended."""
+
+    ANSWERED = "answered"
+    REFUSED = "refused"
+    SILENT = "silent"
+
+
+class Change(Enum):
+    """What a probe result means for the endpoint."""
+
+    NONE = "none"
+    DOWN = "down"
+    UP = "up"
+
+
+@dataclass(slots=True)
+class Health:
+    """What is known of a node's health; times are seconds of a monotonic clock.
+
+    ``refused`` tells whether the last failure was a refused connection, which only a node that
+    has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
+    taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
+    again. ``over``: it is known to have ended for good, even if its address is just silent.
+    """
+
+    answered: float | None = None
+    failing_since: float | None = None
+    failures: int = 0
+    refused: bool = False
+    cleaned: bool = False
+    cleaned_at: float = 0.0
+    over: bool = False
+    pid: int | None = None
+    checked: float | None = None
+
+    @property
+    def down(self) -> bool:
+        """Whether the node is known not to answer, so that its port refuses."""
+        return self.failures >= FAILURES_TO_CLOSE
+
+    @property
+    def state(self) -> str:
+        """One word for status: ok, new, failing, refused, silent or cleaned."""
+        if self.cleaned:
+            return "cleaned"
+        if self.down:
+            return "refused" if self.refused else "silent"
+        if self.failures:
+            return "failing"
+        return "new" if self.answered is None else "ok"
+
+    def suspect(self) -> None:
+        """Have the node probed at once, as if another process could be there by now."""
+        self.checked, self.pid = None, -1
+
+    def note(self, probe: ProbeResult, now: float) -> Change:
+        """Take in a probe result and tell whether the node went down or came up by it."""
+        was_down = self.down
+        self.checked = now
+        if probe is ProbeResult.ANSWERED:
+            self.answered, self.failing_since, self.failures = now, None, 0
+            self.refused = self.over = False
+            return Change.UP if was_down else Change.NONE
+        self.failures += 1
+        self.refused = probe is ProbeResult.REFUSED
+        self.failing_since = now if self.failing_since is None else self.failing_since
+        return Change.DOWN if self.down and not was_down else Change.NONE
+
+    def end(self, now: float) -> None:
+        """Note that the node has ended, whatever it is that its address answers."""
+        self.failures = max(self.failures, FAILURES_TO_CLOSE)
+        self.checked, self.failing_since, self.over = now, float("-inf"), True
+
+    def due(self, now: float, interval: float) -> bool:
+        """Whether to probe: idle for ``interval`` seconds, or under suspicion."""
+        if self.checked is None or 0 < self.failures < FAILURES_TO_CLOSE:
+            return True
+        if self.down:
+            return now - self.checked >= min(RETRY, interval)
+        return now - self.checked >= interval
+
+    def clean_up(self, now: float, after: float) -> bool:
+        """Whether to unregister the node at the master: down for ``after`` seconds (0: never)."""
+        if not after or self.cleaned or self.failing_since is None or not self.down:
+            return False
+        return now - self.failing_since >= after

@@ -1,0 +1,262 @@
+"""What the proxy knows: endpoints, the ports they hold, and what is registered for them.
+
+Plain state without I/O. It is changed in place rather than copied: with a thousand nodes of ten
+topics each a copy per call would make registration quadratic.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from rosproxy.leases.ports import PortPool, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_service_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+
+
+class RangeExhausted(Exception):
+    """No port of the range is left for another node; the message is meant for the node's user."""
+
+
+class Registry:
+    """All endpoints, found by port, by address, by URI, by service and by node name."""
+
+    def __init__(self, ports: PortRange) -> None:
+        self.pool = PortPool(ports)
+        self.by_port: dict[int, Endpoint] = {}
+        self._by_key: dict[tuple[str, int], Endpoint] = {}
+        self._by_uri: dict[str, list[Endpoint]] = {}
+        self._by_caller: dict[str, Endpoint] = {}
+        self._services: dict[str, tuple[Endpoint, Registration]] = {}
+        self._admitted: dict[tuple[str, str], Endpoint] = {}
+        self._last_port: dict[tuple[str, int], int] = {}
+        self._former: dict[int, Endpoint] = {}
+        self._former_uris: dict[str, dict[int, Endpoint]] = {}
+
+    def __iter__(self) -> Iterator[Endpoint]:
+        """All endpoints; safe against changes while iterating."""
+        return iter(list(self.by_port.values()))
+
+    def __len__(self) -> int:
+        """How many ports are held."""
+        return len(self.by_port)
+
+    def admitted(self, uri: str, source: str) -> Endpoint | None:
+        """The endpoint that ``uri`` was found to mean when ``source`` registered it before."""
+        return self._admitted.get((uri, source))
+
+    def admit(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+        """The endpoint of a slave URI that ``source`` registers; made if there is none.
+
+        One that is there already takes on what came from the node's own address: nobody can rename
+        somebody else's. Raises RangeExhausted if it needs a port and none can be had.
+        """
+        endpoint = self._by_key.get((place.address, node.port))
+        if endpoint is None:
+            endpoint = self._add(uri, node, place, self._port_for(place, node))
+        elif place.confirmed or not endpoint.place.confirmed:
+            self._rename(endpoint, uri, node, place)
+        self._admit(endpoint, uri, source)
+        return endpoint
+
+    def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
+        """Rebuild an endpoint on the port that it had; None if either is taken."""
+        if (place.address, node.port) in self._by_key or not self.pool.claim(port):
+            return None
+        endpoint = self._add(uri, node, place, port)
+        endpoint.trusted = False
+        self._admit(endpoint, uri, place.address)
+        return endpoint
+
+    def remove(self, endpoint: Endpoint) -> None:
+        """Forget an endpoint with all its registrations and give its port back."""
+        for key in list(endpoint.registrations):
+            self._drop(endpoint, key)
+        del self.by_port[endpoint.port], self._by_key[endpoint.key]
+        self._forget_uri(endpoint)
+        for admission in endpoint.admissions:
+            del self._admitted[admission]
+        self._former[endpoint.port] = endpoint
+        self._former_uris.setdefault(endpoint.uri, {})[endpoint.port] = endpoint
+        self.pool.give_back(endpoint.port)
+
+    def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+        """Note that nodes are at other addresses now; ports and registrations stay.
+
+        What came from the old address means the node at the new one from now on, and what it
+        calls itself too. Those whose new address and port another endpoint holds are left where
+        they are; the others are returned.
+        """
+        moved = self._movable(places)
+        for endpoint in moved:
+            del self._by_key[endpoint.key], self._last_port[endpoint.key]
+        admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
+        for endpoint in moved:
+            endpoint.place = places[endpoint]
+            self._by_key[endpoint.key] = endpoint
+            self._remember(endpoint)
+        for endpoint, uri in admissions:
+            self._admit(endpoint, uri, endpoint.place.address)
+        return moved
+
+    def reclaimable(self) -> Endpoint | None:
+        """The endpoint to give up first when the range is short: idle for the longest time.
+
+        One that has just been admitted is not idle: the master's reply is still on its way.
+        """
+        unused = [e for e in self if not (e.connected or e.pending or e.idle_since is None)]
+        idle = [e for e in unused if e.idle or e.health.cleaned]
+        return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
+
+    def exhausted(self) -> RangeExhausted:
+        """The error for a node that can't get a port."""
+        return RangeExhausted(
+            f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} leases "
+            f"held, {self.pool.blocked} taken by other programs); give the proxy a larger "
+            "--port-range (ROSPROXY_PORT_RANGE)"
+        )
+
+    def register(self, endpoint: Endpoint, held: Registration) -> None:
+        """Note what the master has accepted.
+
+        As the master does, a service has one provider, and a name that registers from another
+        URI loses all that it had at the old one (rosmaster/registrations.py).
+        """
+        other = self._by_caller.get(held.caller_id)
+        if other and other is not endpoint:
+            self.drop_caller(other, held.caller_id)
+        if held.kind is Kind.SERVICE:
+            self._replace_service(endpoint, held)
+        if held.key not in endpoint.registrations:
+            endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
+        endpoint.registrations[held.key] = held
+        self._by_caller[held.caller_id] = endpoint
+        endpoint.idle_since = None
+
+    def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
+        """Note that a registration has ended, whoever ended it."""
+        endpoint = self._by_caller.get(caller_id)
+        if endpoint:
+            self._drop(endpoint, (kind, name, caller_id))
+
+    def drop_caller(self, endpoint: Endpoint, caller_id: str) -> None:
+        """Note that a node is no longer registered at an endpoint at all."""
+        for key in [key for key in endpoint.registrations if key[2] == caller_id]:
+            self._drop(endpoint, key)
+
+    def by_uri(self, uri: str) -> list[Endpoint]:
+        """The endpoints that call themselves ``uri``; several only for host names reused.
+
+        Those removed come last, until somebody else has their port: a node that was handed their
+        URI may still send it back.
+        """
+        former = self._former_uris.get(uri)
+        return self._by_uri.get(uri, []) + (list(former.values()) if former else [])
+
+    def at(self, address: str, port: int) -> Endpoint | None:
+        """The endpoint of the slave API at an address and port."""
+        return self._by_key.get((address, port))
+
+    def by_caller(self, caller_id: str) -> Endpoint | None:
+        """The endpoint of a node's name."""
+        return self._by_caller.get(caller_id)
+
+    def service(self, name: str) -> tuple[Endpoint, Registration] | None:
+        """Who provides a service."""
+        return self._services.get(name)
+
+    def service_port(self, endpoint: Endpoint, name: str) -> int | None:
+        """The TCPROS port that an endpoint's node gave for a service, if it may be believed."""
+        known = self._services.get(name)
+        if known is None or known[0] is not endpoint or not endpoint.place.confirmed:
+            return None
+        where = parse_service_uri(known[1].service_api or "")
+        return where.port if where else None
+
+    def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
+        """Everything that is registered, with its endpoint."""
+        return [(e, held) for e in self for held in e.registrations.values()]
+
+    def _movable(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+        """Those whose new keys are free, or will be; of two for the same key the first."""
+        moved = list(places)
+        while True:
+            taken = {k for k, e in self._by_key.items() if e not in moved}
+            kept = []
+            for endpoint in moved:
+                key = places[endpoint].address, endpoint.node.port
+                if key not in taken:
+                    taken.add(key)
+                    kept.append(endpoint)
+            if len(kept) == len(moved):
+                return kept
+            moved = kept
+
+    def _take_admissions(self, endpoint: Endpoint) -> list[str]:
+        """The URIs that meant an endpoint if its own address gave them; they no longer do."""
+        address = endpoint.place.address
+        uris = [uri for uri, source in endpoint.admissions if source == address]
+        for uri in uris:
+            endpoint.admissions.discard((uri, address))
+            del self._admitted[uri, address]
+        return [*uris, endpoint.uri]
+
+    def _port_for(self, place: Place, node: HostPort) -> int:
+        port = self.pool.take(prefer=self._last_port.get((place.address, node.port)))
+        if port is None:
+            raise self.exhausted()
+        return port
+
+    def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
+        endpoint = Endpoint(uri, node, place, port)
+        self.by_port[port] = self._by_key[endpoint.key] = endpoint
+        self._remember(endpoint)
+        self._by_uri.setdefault(uri, []).append(endpoint)
+        return endpoint
+
+    def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
+        before = self._admitted.get((uri, source), endpoint)
+        before.admissions.discard((uri, source))
+        self._admitted[uri, source] = endpoint
+        endpoint.admissions.add((uri, source))
+
+    def _remember(self, endpoint: Endpoint) -> None:
+        """Note who has a port now, in place of who had it last."""
+        former = self._former.pop(endpoint.port, None)
+        if former is not None:
+            self._forget_former(former)
+        former = former or endpoint
+        if self._last_port.get(former.key) == endpoint.port:
+            del self._last_port[former.key]
+        self._last_port[endpoint.key] = endpoint.port
+
+    def _forget_former(self, former: Endpoint) -> None:
+        same = self._former_uris[former.uri]
+        del same[former.port]
+        if not same:
+            del self._former_uris[former.uri]
+
+    def _rename(self, endpoint: Endpoint, uri: str, node: HostPort, place: Place) -> None:
+        self._forget_uri(endpoint)
+        endpoint.uri, endpoint.node, endpoint.place = uri, node, place
+        self._by_uri.setdefault(uri, []).append(endpoint)
+
+    def _forget_uri(self, endpoint: Endpoint) -> None:
+        same = [other for other in self._by_uri.pop(endpoint.uri) if other is not endpoint]
+        if same:
+            self._by_uri[endpoint.uri] = same
+
+    def _replace_service(self, endpoint: Endpoint, held: Registration) -> None:
+        before = self._services.get(held.name)
+        if before and before[1].key != held.key:
+            self._drop(before[0], before[1].key)
+        self._services[held.name] = (endpoint, held)
+
+    def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
+        if endpoint.registrations.pop(key, None) is None:
+            return
+        kind, name, caller_id = key
+        if kind is Kind.SERVICE:
+            self._services.pop(name, None)
+        endpoint.callers[caller_id] -= 1
+        if not endpoint.callers[caller_id]:
+            del endpoint.callers[caller_id], self._by_caller[caller_id]

@@ -1,0 +1,184 @@
+"""Export (inside to outside) and import (outside to inside) of URIs.
+
+The two are inverses for every URI that the proxy ever handed out: a tool inside may send any of
+them back, as ``rosnode cleanup`` does when it unregisters somebody else's node.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from rosproxy.leases.ports import PortMap
+from rosproxy.net.addresses import HostPort, Network, as_ip
+from rosproxy.ros1.protocol.uris import (
+    InsidePath,
+    inside_path,
+    parse_inside_path,
+    parse_service_uri,
+    parse_slave_uri,
+    service_uri,
+    slave_uri,
+)
+from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.registry import Registry
+
+
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Who is going to use an address.
+
+    ``address`` is the asker's own IP address, ``proxy`` the proxy's address that it can reach,
+    ``caller_id`` its node name and ``endpoint`` its endpoint, each as far as known. ``master`` is
+    how it calls its master: ``host:port``.
+    """
+
+    address: str
+    proxy: str
+    caller_id: str = ""
+    master: str = ""
+    endpoint: Endpoint | None = None
+
+
+@dataclass(slots=True)
+class Addressing:
+    """The rules that turn one side's addresses into the other's.
+
+    ``networks`` are those inside which nodes reach each other without the proxy.
+    """
+
+    registry: Registry
+    host: str
+    ports: PortMap
+    networks: Sequence[Network] = field(default_factory=tuple)
+    _advertised: dict[int, tuple[HostPort, Place, str]] = field(default_factory=dict)
+    """What `advertised_uri` said last of each port, and what it was made of."""
+
+    def outside(self, port: int) -> HostPort:
+        """What outside sees of a port that the proxy listens on."""
+        return HostPort(self.host, self.ports.advertised(port))
+
+    def advertised_uri(self, endpoint: Endpoint) -> str:
+        """The slave URI that stands for an endpoint at the master and outside."""
+        node, place, uri = self._advertised.get(endpoint.port, (None, None, ""))
+        if node is not endpoint.node or place is not endpoint.place:
+            uri = slave_uri(self.outside(endpoint.port), self._path(endpoint))
+            self._advertised[endpoint.port] = endpoint.node, endpoint.place, uri
+        return uri
+
+    def advertised_service(self, endpoint: Endpoint) -> str:
+        """The service URI that stands for an endpoint's services outside."""
+        return service_uri(self.outside(endpoint.port))
+
+    def export_slave(self, uri: str, asker: Asker) -> str:
+        """The outside form of a slave URI that an inside node gave."""
+        where = parse_slave_uri(uri)
+        if where is None:
+            return uri
+        endpoint = self._own(uri, asker)
+        if endpoint:
+            return self.advertised_uri(endpoint)
+        if self._is_relayed(where, asker):
+            return uri.replace(str(where), str(self.outside(where.port)), 1)
+        return uri
+
+    def export_service(self, uri: str, service: str, asker: Asker) -> str:
+        """The outside form of the URI of a service that an inside node gave."""
+        where = parse_service_uri(uri)
+        if where is None:
+            return uri
+        if self._is_relayed(where, asker):
+            return service_uri(self.outside(where.port))
+        known = self.registry.service(service)
+        if known and (where.host == known[0].node.host or uri == known[1].service_api):
+            return self.advertised_service(known[0])
+        return uri
+
+    def import_slave(self, uri: str, asker: Asker) -> str:
+        """The form of a slave URI from outside that an inside node can use."""
+        endpoint = self.stands_for(uri)
+        return self._import(endpoint, asker) if endpoint else uri
+
+    def import_slaves(self, uris: Sequence[str], asker: Asker) -> list[str]:
+        """The same for a list; it keeps order and length."""
+        return [self.import_slave(uri, asker) for uri in uris]
+
+    def import_service(self, uri: str, service: str, asker: Asker) -> str:
+        """The form of a service URI from outside that an inside node can use."""
+        where = parse_service_uri(uri)
+        port = self._listening(where)
+        endpoint = self.registry.by_port.get(port) if port else None
+        if endpoint is None or port is None:
+            return uri
+        literal = self._service_literal(endpoint, service)
+        if literal and self._direct(endpoint, asker):
+            return literal
+        return service_uri(HostPort(asker.proxy, port))
+
+    def handed_out(self, uri: str, asker: Asker) -> bool:
+        """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
+        where = parse_slave_uri(uri)
+        if where is None:
+            return False
+        return self._is_relayed(where, asker) or self.stands_for(uri) is not None
+
+    def advertises(self, where: HostPort) -> bool:
+        """Whether outside finds one of this proxy's own ports at a host and port."""
+        return self._listening(where) is not None
+
+    def identify(self, uri: str) -> tuple[int, InsidePath] | None:
+        """The listening port and inside address of an advertised slave URI of this proxy."""
+        port, path = self._listening(parse_slave_uri(uri)), parse_inside_path(uri)
+        return (port, path) if port and path else None
+
+    def _import(self, endpoint: Endpoint, asker: Asker) -> str:
+        if self._direct(endpoint, asker) and self._own(endpoint.uri, asker) is endpoint:
+            return endpoint.uri
+        return slave_uri(HostPort(asker.proxy, endpoint.port), self._path(endpoint))
+
+    def _direct(self, endpoint: Endpoint, asker: Asker) -> bool:
+        if endpoint is asker.endpoint:
+            return True
+        if asker.address == endpoint.place.address:
+            return not endpoint.place.stale
+        return endpoint.place.named and self._neighbours(asker.address, endpoint.place.address)
+
+    def _neighbours(self, one: str, other: str) -> bool:
+        first, second = as_ip(one), as_ip(other)
+        if first is None or second is None:
+            return False
+        return any(first in network and second in network for network in self.networks)
+
+    def _path(self, endpoint: Endpoint) -> str:
+        return inside_path(endpoint.node, endpoint.place.address)
+
+    def stands_for(self, uri: str) -> Endpoint | None:
+        """The endpoint that an advertised slave URI stands for."""
+        port = self._listening(parse_slave_uri(uri))
+        endpoint = self.registry.by_port.get(port) if port else None
+        return endpoint if endpoint and self.advertised_uri(endpoint) == uri else None
+
+    def _listening(self, where: HostPort | None) -> int | None:
+        if where is None or where.host != self.host:
+            return None
+        return self.ports.listening(where.port)
+
+    def _is_relayed(self, where: HostPort, asker: Asker) -> bool:
+        return where.host == asker.proxy and where.port in self.ports.listen
+
+    def _own(self, uri: str, asker: Asker) -> Endpoint | None:
+        """Whom an asker means by an inside URI; several nodes may call themselves the same."""
+        admitted = self.registry.admitted(uri, asker.address)
+
+        def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
+            itself = endpoint is asker.endpoint
+            return not itself, endpoint is not admitted, endpoint.place.address != asker.address
+
+        return min(self.registry.by_uri(uri), key=distance, default=None)
+
+    def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
+        """A service as its provider gave it, or as it must have done (rebuilt from the master)."""
+        known = self.registry.service(service)
+        if known is None or known[0] is not endpoint:
+            return None
+        if known[1].service_api is None and endpoint.tcpros_port:
+            return service_uri(HostPort(endpoint.node.host, endpoint.tcpros_port))
+        return known[1].service_api

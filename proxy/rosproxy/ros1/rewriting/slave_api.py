@@ -1,0 +1,144 @@
+"""The slave API as outside and the master call it: what is rewritten on the way in and back.
+
+Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
+clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
+"""
+
+from dataclasses import dataclass
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+
+MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
+"""What the master calls at nodes; a policy can refuse it from anybody else."""
+
+_URI_REPLIES = frozenset({"getUri", "getMasterUri"})
+_REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPort:
+    """The TCPROS port on which a node serves a topic, as it told a subscriber."""
+
+    topic: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A call at an endpoint.
+
+    ``node`` is the endpoint's node as an asker of imported addresses, ``reached`` the address and
+    port that the caller used for the endpoint, ``master_uri`` the master's URI outside.
+    """
+
+    node: Asker
+    reached: HostPort
+    master_uri: str
+
+
+def rewritten(call: Call) -> bool:
+    """Whether anything in a call or its reply is rewritten."""
+    return call.method in _REWRITTEN
+
+
+def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -> bytes:
+    """The call for the inside node: the publishers of a ``publisherUpdate`` imported.
+
+    Their order is kept; a publisher that is named twice is left out the second time.
+    """
+    named = call.params[2] if call.method == "publisherUpdate" and len(call.params) > 2 else None
+    if named is None or named.kind != "array":
+        return body
+    edits, seen = [], set()
+    for item in (item for item in named.items if item.kind == "string"):
+        uri = addressing.import_slave(item.text, visit.node)
+        edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
+        seen.add(uri)
+    return xmlrpc.apply(body, edits)
+
+
+def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing) -> bytes:
+    """The reply for outside: addresses exported."""
+    triple = _triple(reply)
+    if triple is None:
+        return reply
+    if call.method == "requestTopic":
+        edits = _export_topic(triple, visit)
+    elif call.method == "getBusInfo":
+        edits = _export_bus_info(triple, visit, addressing)
+    elif call.method in _URI_REPLIES:
+        edits = _export_uri(call.method, triple, visit, addressing)
+    else:
+        edits = []
+    return xmlrpc.apply(reply, edits)
+
+
+def topic_port(call: Call, reply: bytes) -> TopicPort | None:
+    """The port that a reply to ``requestTopic`` names, if it is one for TCPROS."""
+    triple, topic = _triple(reply), call.string(1)
+    said = tcpros_address(triple) if triple else None
+    return TopicPort(topic, said.port) if topic and said else None
+
+
+def ros_triple(value: Value | None) -> Value | None:
+    """The value of a reply if it is a ROS status triple, else None."""
+    return value if value and value.kind == "array" and len(value.items) == 3 else None
+
+
+def tcpros_address(triple: Value) -> HostPort | None:
+    """Where a reply to ``requestTopic`` sends the subscriber, if that is for TCPROS."""
+    if not _is_tcpros(triple):
+        return None
+    _, host, port = triple.items[2].items
+    number = port.integer()
+    return HostPort(host.text, number) if number and 0 < number < 65536 else None
+
+
+def send_to(triple: Value, where: HostPort) -> list[Edit]:
+    """Edits by which such a reply sends the subscriber elsewhere."""
+    _, message, protocol = triple.items
+    _, host, port = protocol.items
+    edits = [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
+    before = f"{host.text}:{port.text}"
+    if message.kind == "string" and before in message.text:
+        edits.append(xmlrpc.replace(message, message.text.replace(before, str(where))))
+    return edits
+
+
+def _triple(reply: bytes) -> Value | None:
+    return ros_triple(xmlrpc.parse_reply(reply))
+
+
+def _is_tcpros(triple: Value) -> bool:
+    protocol = triple.items[2].items
+    return len(protocol) == 3 and protocol[0].string() == "TCPROS"
+
+
+def _export_topic(triple: Value, visit: Visit) -> list[Edit]:
+    return send_to(triple, visit.reached) if _is_tcpros(triple) else []
+
+
+def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
+    edits = []
+    for row in triple.items[2].items:
+        peer = row.items[1].string() if len(row.items) > 1 else None
+        if peer and parse_slave_uri(peer):
+            edits.append(xmlrpc.replace(row.items[1], addressing.export_slave(peer, visit.node)))
+    return edits
+
+
+def _export_uri(method: str, triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
+    held, message = triple.items[2], triple.items[1]
+    if held.kind != "string" or not held.text:
+        return []
+    after = visit.master_uri
+    if method == "getUri":
+        after = addressing.export_slave(held.text, visit.node)
+    edits = [xmlrpc.replace(held, after)]
+    if message.kind == "string" and message.text == held.text:
+        edits.append(xmlrpc.replace(message, after))
+    return edits

@@ -1,0 +1,1 @@
+"""What the proxy serves: the master API inside, slave APIs and TCPROS on leased ports."""

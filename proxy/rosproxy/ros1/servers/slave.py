@@ -1,0 +1,167 @@
+"""The slave API of inside nodes, as outside and the master reach it through a lease."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_server import Call
+from rosproxy.ros1.alias import policy as alias_policy
+from rosproxy.ros1.alias.alias import Alias
+from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.uris import parse_inside_path
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import multicall
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.health import Change, ProbeResult
+from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.rewriting import slave_api
+from rosproxy.ros1.rewriting.slave_api import TopicPort, Visit
+from rosproxy.ros1.upkeep.adoption import policy as adoption_policy
+
+log = logging.getLogger(__name__)
+
+REGISTRATION_GRACE = 0.5
+"""Seconds that a publisherUpdate waits at most for a registration of the same node."""
+
+
+class SlaveApi:
+    """Forwards slave API calls to the node behind the port at which they arrive.
+
+    ``spared`` tells whether a node is to be kept from a ``shutdown`` by somebody for a reason.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases,
+        mirror: Alias,
+        spared: Callable[[Endpoint, str, str], Awaitable[bool]],
+    ) -> None:
+        self._context, self._leases, self._mirror = context, leases, mirror
+        self._spared = spared
+
+    async def __call__(self, call: Call) -> bytes:
+        """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
+        endpoint = self._context.registry.by_port.get(call.local.port)
+        if call.comes_from(self._context.instance):
+            raise Unreachable("a node's address leads back to the proxy itself")
+        if endpoint is None or not self._means(endpoint, call.path):
+            raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
+        try:
+            parsed = xmlrpc.parse_call(call.body)
+        except xmlrpc.XmlRpcError:
+            self._context.metrics.count("slave", "other", "malformed")
+            raise
+        if parsed.method != multicall.MULTICALL:
+            return await self._one(endpoint, parsed, call)
+        calls = multicall.inner_calls(parsed)
+        results = [await self._result(endpoint, inner, call) for inner in calls]
+        return multicall.results_reply(results)
+
+    def _means(self, endpoint: Endpoint, path: str) -> bool:
+        """Whether a request's path names this endpoint, or none, as roscpp's.
+
+        A port may serve another node by now; the master's ``shutdown`` for a former one must not
+        end it.
+        """
+        said = parse_inside_path(path)
+        return said is None or (said.address or said.node.host, said.node.port) == endpoint.key
+
+    async def _result(self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: Call) -> bytes:
+        """One result of a multicall, which is taken apart here: nodes get single calls only."""
+        if inner is None:
+            return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
+        single = call.with_body(multicall.single_call(inner))
+        reply = await self._one(endpoint, xmlrpc.parse_call(single.body), single)
+        return multicall.result_value(reply)
+
+    async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+        if not await self._may(parsed.method, call.source):
+            self._context.metrics.count("slave", parsed.method, "refused")
+            return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+        try:
+            reply = await self._forward(endpoint, parsed, call)
+        except Unreachable:
+            self._context.metrics.count("slave", parsed.method, "unreachable")
+            raise
+        self._context.metrics.count("slave", parsed.method, "answered")
+        return reply
+
+    async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+        if await self._is_void(endpoint, parsed):
+            return xmlrpc.dump_reply([1, "", 0])
+        if not slave_api.rewritten(parsed):
+            return await self._ask(endpoint, call.body)
+        if parsed.method == "publisherUpdate":
+            await self._after_registration(endpoint)
+            await self._mirror.hand_over(alias_policy.announced(parsed))
+        self._context.refresh_networks()
+        visit = self._visit(endpoint, call, endpoint.port)
+        addressing = self._context.addressing
+        body = self._mirror.toward_inside(call.body, parsed)
+        reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
+        said = slave_api.topic_port(parsed, reply)
+        if said is not None:
+            self._note_port(endpoint, said)
+            port = await self._leases.fast_port(endpoint, said.port) or endpoint.port
+            visit = self._visit(endpoint, call, port)
+        return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
+        """Whether a call only follows from how a node came to be behind the proxy."""
+        if parsed.method == "shutdown":
+            return await self._spared(endpoint, parsed.string(0) or "", parsed.string(1) or "")
+        if parsed.method != "publisherUpdate":
+            return False
+        topic, uris = parsed.string(1) or "", alias_policy.announced(parsed)
+        return adoption_policy.outdated(topic, uris, self._context.addressing, self._context.now())
+
+    async def _after_registration(self, endpoint: Endpoint) -> None:
+        """Let the reply to a registration that is under way reach the node first.
+
+        A node that applies an older list of publishers after a newer one loses a publisher; the
+        way through the proxy must not make that race of ROS more likely.
+        """
+        deadline = self._context.now() + REGISTRATION_GRACE
+        while endpoint.pending and self._context.now() < deadline:  # noqa: ASYNC110 - rare, short
+            await asyncio.sleep(0.002)
+
+    def _note_port(self, endpoint: Endpoint, said: TopicPort) -> None:
+        """Note a TCPROS port; by topic only for topics that the node has registered.
+
+        roscpp names its port for any topic, so anybody could have names remembered without end.
+        """
+        endpoint.tcpros_port = said.port
+        if endpoint.publishes(said.topic):
+            endpoint.topic_ports[said.topic] = said.port
+
+    async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
+        try:
+            reply = await self._context.upstream.node(endpoint.slave, body)
+        except Unreachable as error:
+            await self._suspect(endpoint, error)
+            raise
+        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
+        return reply
+
+    async def _suspect(self, endpoint: Endpoint, error: Unreachable) -> None:
+        """A refused call tells that the node has ended: its port refuses as well at once."""
+        health, now = endpoint.health, self._context.now()
+        if error.refused and health.note(error.probe, now) is Change.DOWN:
+            log.info("%s is gone: %s", endpoint.label, error)
+            self._leases.close(endpoint)
+
+    def _visit(self, endpoint: Endpoint, call: Call, port: int) -> Visit:
+        """A call at an endpoint, whose topics the caller is to find at a ``port``."""
+        reached = self._context.addressing.outside(port)
+        if call.reached_locally:
+            reached = HostPort(call.local.host, port)
+        return Visit(self._context.node_asker(endpoint), reached, self._context.settings.master_uri)
+
+    async def _may(self, method: str, source: str) -> bool:
+        anybody = self._context.settings.slave_control == "any"
+        if anybody or method not in slave_api.MASTER_ONLY:
+            return True
+        return source in await self._context.upstream.master_addresses()

@@ -1,0 +1,187 @@
+"""TCPROS through a lease: read the connection header, find the node's port, relay."""
+
+import asyncio
+import logging
+import socket
+
+from rosproxy.forwarding.relay import Relay, reset_on_close
+from rosproxy.forwarding.relay_set import OpenRelays
+from rosproxy.net.acceptor import read_header
+from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.dialing import CONNECT_TIMEOUT, dial
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.upkeep.resubscription.policy import Connection
+from rosproxy.telemetry.metrics import Traffic
+
+log = logging.getLogger(__name__)
+
+RATE_INTERVAL = 2.0
+
+
+class TcprosServer:
+    """Relays TCPROS connections to inside nodes.
+
+    The target is a port on the endpoint's own address, as that node itself named it; the host in
+    a reply or registration is never used, so none can lead to another inside host.
+    """
+
+    def __init__(self, context: Context, nodes: NodeClient) -> None:
+        self._context, self._nodes = context, nodes
+        self._may_splice = context.settings.data_plane != "copy"
+        self._relays = OpenRelays()
+        self._ended = Traffic()
+        self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
+
+    @property
+    def relays(self) -> list[Relay]:
+        """The open connections."""
+        return list(self._relays)
+
+    def topic_connections(self) -> set[Connection]:
+        """The open connections of topics: port, topic and the subscriber's name."""
+        return {(r.port, r.name, r.caller_id) for r in self._relays if r.kind == "topic"}
+
+    def traffic(self) -> Traffic:
+        """Bytes by topic and service, of ended and open connections."""
+        total = Traffic()
+        total.sent, total.received = dict(self._ended.sent), dict(self._ended.received)
+        for relay in self._relays:
+            total.add(relay.kind, relay.name, relay.sent, relay.received)
+        return total
+
+    async def sample_rates(self) -> None:
+        """Compute the rates of all connections since the last time."""
+        now = self._context.now()
+        for relay in self._relays:
+            relay.sample(now)
+
+    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+        """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
+        try:
+            header = await read_header(conn)
+            fields = decode_header(header[4:])
+        except HeaderError as error:
+            await self._answer_error(conn, f"rosproxy: {error}")
+            self._context.metrics.relay_errors.labels("bad header").inc()
+            return
+        inside = await self._connect(endpoint, fields)
+        if inside is None or not await _hand_on(header, inside):
+            self._fail(endpoint, conn, fields)
+            return
+        self._start(endpoint, fields, conn, inside, peer)
+
+    def cut(self, port: int) -> None:
+        """End the connections through a port."""
+        for relay in self._relays:
+            if relay.port == port:
+                relay.end()
+
+    async def stop(self) -> None:
+        """End all connections."""
+        await self._relays.stop()
+
+    async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
+        """A connection to the node; its port is asked for anew if the known one refuses."""
+        port = self._known_port(endpoint, fields)
+        inside = await _dial(endpoint.place.address, port) if port else None
+        if inside is not None:
+            return inside
+        learned = await self._learn_port(endpoint)
+        return await _dial(endpoint.place.address, learned) if learned else None
+
+    async def _learn_port(self, endpoint: Endpoint) -> int | None:
+        """The TCPROS port that the node names now; it is asked once for all who wait."""
+        asking = self._asking.get(endpoint)
+        if asking is None:
+            asking = self._context.tasks.spawn(
+                self._nodes.learn_tcpros_port(endpoint), f"TCPROS port of {endpoint.uri}"
+            )
+            self._asking[endpoint] = asking
+            asking.add_done_callback(lambda _: self._asking.pop(endpoint))
+        return await asyncio.shield(asking)
+
+    def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
+        service = fields.get("service")
+        if service is None:
+            return endpoint.topic_ports.get(fields.get("topic", ""), endpoint.tcpros_port)
+        return self._context.registry.service_port(endpoint, service) or endpoint.tcpros_port
+
+    def _start(
+        self,
+        endpoint: Endpoint,
+        fields: dict[str, str],
+        conn: socket.socket,
+        inside: socket.socket,
+        peer: str,
+    ) -> None:
+        kind = "service" if "service" in fields else "topic"
+        name = self._registered_name(endpoint, kind, fields.get(kind, ""))
+        caller_id = fields.get("callerid", "")
+        relay = Relay(
+            endpoint.port, kind, name, caller_id, peer, conn, inside, splice=self._may_splice
+        )
+        endpoint.connections += 1
+        endpoint.idle_since = None
+        self._relays.start(relay, lambda ended: self._finished(endpoint, ended))
+
+    def _registered_name(self, endpoint: Endpoint, kind: str, name: str) -> str:
+        """The name if the node has registered it: a label that outsiders can't multiply."""
+        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
+        return name if name in endpoint.names(wanted) else "unregistered"
+
+    def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
+        endpoint.connections -= 1
+        self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
+
+    def _fail(self, endpoint: Endpoint, conn: socket.socket, fields: dict[str, str]) -> None:
+        """Reset, as a node that is gone would: roscpp and rospy try again."""
+        self._context.metrics.relay_errors.labels("node unreachable").inc()
+        reset_on_close(conn)
+        conn.close()
+        if endpoint.registrations:
+            self._report(endpoint, fields)
+
+    def _report(self, endpoint: Endpoint, fields: dict[str, str]) -> None:
+        what = fields.get("service") or fields.get("topic") or "?"
+        text = f"no TCPROS connection to it for {what}"
+        if is_loopback(endpoint.node.host):
+            text += (
+                f": it listens on loopback only ({endpoint.uri}). Unset ROS_IP and ROS_HOSTNAME "
+                f"where it runs, or set ROS_IP={endpoint.place.address}"
+            )
+        log.warning("%s: %s", endpoint.label, text)
+        self._context.problems.add(endpoint.label, text, endpoint.port)
+
+    async def _answer_error(self, conn: socket.socket, message: str) -> None:
+        try:
+            reply = encode_header({"error": message})
+            await asyncio.get_running_loop().sock_sendall(conn, reply)
+        finally:
+            conn.close()
+
+
+async def _dial(address: str, port: int) -> socket.socket | None:
+    try:
+        return await dial(HostPort(address, port))
+    except (OSError, TimeoutError) as error:
+        log.debug("connecting to %s:%d: %s", address, port, error)
+        return None
+
+
+async def _hand_on(header: bytes, inside: socket.socket) -> bool:
+    """Send a node the header that was read; closes the connection to it if that fails."""
+    try:
+        async with asyncio.timeout(CONNECT_TIMEOUT):
+            await asyncio.get_running_loop().sock_sendall(inside, header)
+    except (OSError, TimeoutError) as error:
+        log.debug("handing a header on: %s", error)
+        inside.close()
+        return False
+    except BaseException:
+        inside.close()
+        raise
+    return True

@@ -1,0 +1,1 @@
+"""Containers that went, moved or arrived, as an operator tells it."""

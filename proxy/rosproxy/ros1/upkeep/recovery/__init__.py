@@ -1,0 +1,1 @@
+"""After a start: endpoints and leases rebuilt from what the master holds."""

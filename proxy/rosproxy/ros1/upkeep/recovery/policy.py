@@ -1,0 +1,114 @@
+"""Rebuilding the registry from what the master holds, after a start without memory.
+
+The advertised URIs at the master carry the inside addresses. Anybody can write such a URI to the
+master, so what is found there is only a claim: the shell asks the node itself before it serves it
+(see `confirmed_by`).
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import InsidePath, slave_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.rewriting.addressing import Addressing
+
+NO_MERIT = -(10**9)
+_EVERYBODYS = frozenset({"/rosout"})
+
+
+@dataclass(slots=True)
+class Claim:
+    """An endpoint that the master's data tell of: its port, its inside address, what it holds."""
+
+    port: int
+    inside: InsidePath
+    registrations: list[Registration] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        """The address to look for the node at."""
+        return self.inside.address or self.inside.node.host
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """What the endpoint would be keyed by."""
+        return self.address, self.inside.node.port
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics that the master has for it."""
+        return {held.name for held in self.registrations if held.kind is not Kind.SERVICE}
+
+    @property
+    def uri(self) -> str:
+        """The slave URI as the node must have given it."""
+        return slave_uri(self.inside.node)
+
+
+def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
+    """The endpoints of this proxy among the nodes of a master."""
+    found: dict[str, Claim] = {}
+    for node, uri in graph.uris.items():
+        ours = addressing.identify(uri)
+        if ours:
+            found.setdefault(uri, Claim(*ours)).registrations += graph.held.get(node, [])
+    return list(found.values())
+
+
+def contested(found: Sequence[Claim]) -> list[Claim]:
+    """The claims that share their port or their inside address with another."""
+    ports, keys = Counter(c.port for c in found), Counter(c.key for c in found)
+    return [claim for claim in found if ports[claim.port] > 1 or keys[claim.key] > 1]
+
+
+def settle(found: Sequence[Claim], said: Mapping[int, frozenset[str] | None]) -> list[Claim]:
+    """One claim per port and inside address: the one that its node bears out best.
+
+    ``said`` gives, by index, the topics that the node there names; nothing or None where it was
+    not asked or gave no answer.
+    """
+
+    def merit(index: int) -> tuple[int, int]:
+        claim, topics = found[index], said.get(index)
+        if topics is None:
+            return NO_MERIT, len(claim.registrations)
+        return len(claim.topics & topics) - len(claim.topics - topics), len(claim.registrations)
+
+    ports: dict[int, Claim] = {}
+    keys: set[tuple[str, int]] = set()
+    for index in sorted(range(len(found)), key=merit, reverse=True):
+        claim = found[index]
+        if claim.port not in ports and claim.key not in keys:
+            ports[claim.port] = claim
+            keys.add(claim.key)
+    return list(ports.values())
+
+
+def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
+    """Whether the topics that a node itself names bear out what the master says of it.
+
+    A forged URI that leads to something other than the node of that name finds no answer here,
+    or one of another node.
+    """
+    telling = endpoint.topics - _EVERYBODYS
+    return bool((telling or endpoint.topics) & topics)
+
+
+def lost(
+    ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
+) -> list[Registration]:
+    """Which of our registrations the master no longer has.
+
+    Those made after ``before``, the time at which the master was asked, don't count; nor do
+    parameter subscriptions, which the master's state leaves out, unless their node is unknown.
+    """
+    known = {held.key for held_list in state.values() for held in held_list}
+    gone = [h for h in ours if h.since < before and h.kind is not Kind.PARAM]
+    missing = [held for held in gone if held.key not in known]
+    lost_nodes = {held.caller_id for held in missing} - set(state)
+    return missing + [
+        held for held in ours if held.kind is Kind.PARAM and held.caller_id in lost_nodes
+    ]

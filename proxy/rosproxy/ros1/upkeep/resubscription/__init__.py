@@ -1,0 +1,1 @@
+"""Subscribers whose connection was lost unnoticed are told of their publishers again."""

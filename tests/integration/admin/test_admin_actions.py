@@ -1,0 +1,424 @@
+"""Who may change something at the admin endpoint, what is refused, and what a controller tells."""
+
+import json
+
+import pytest
+
+from rosproxy.ros1.registry.endpoint import Endpoint
+from tests.integration.admin_calls import news, post, tell
+from tests.integration.commands import admin_url, run
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.http_fake import End
+from tests.integration.master import Master
+from tests.integration.net import (
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    THIRD_NODE,
+    connect,
+    exchange,
+    free_ports,
+    refuses,
+    until,
+)
+from tests.integration.node import Node, greet, read_header, service_header, topic_header
+from tests.integration.proxy import Proxy
+
+TOKEN = "0123456789abcdef"
+PATIENT = {"cleanup_after": 0.0, "linger": 60.0}
+"""Nothing is unregistered, nor a port given up, unless a test asks for it."""
+
+
+@pytest.fixture
+def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No caller counts as one on loopback; in these tests all are."""
+    monkeypatch.setattr("rosproxy.admin.server.is_loopback", lambda _: False)
+
+
+PATHS = ["/probe", "/containers", "/master-address", "/retire"]
+
+
+@pytest.mark.usefixtures("from_afar")
+@pytest.mark.parametrize("path", PATHS)
+async def test_who_is_not_on_loopback_needs_the_token(make_proxy: MakeProxy, path: str) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    for headers in (
+        [],
+        ["Authorization: Bearer wrong-token"],
+        [f"Authorization: Basic {TOKEN}"],
+        [f"Authorization: bearer{TOKEN}"],
+        [f"Authorization: Bearer {TOKEN}x"],
+        ["Authorization: Bearer \xfc\xfc\xfc\xfc\xfc\xfc\xfc\xfc"],
+        [f"X-Token: {TOKEN}"],
+    ):
+        reply = await post(proxy, path, "{}", *headers)
+        assert reply.status == 403
+        assert b"ROSPROXY_ADMIN_TOKEN" in reply.body
+    assert not proxy.app.context.retired
+    right = await post(proxy, path, '{"x": 1}', f"Authorization: Bearer {TOKEN}")
+    assert right.status in (200, 400)
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_without_a_token_nobody_from_afar_may(proxy: Proxy) -> None:
+    for headers in ([], ["Authorization: Bearer None"], ["Authorization: Bearer "]):
+        reply = await post(proxy, "/retire", "", *headers)
+        assert reply.status == 403
+        assert b"this proxy has none" in reply.body
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_everybody_may_look(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    for path in ("/", "/healthz", "/metrics", "/status"):
+        reply = await exchange(where, f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        assert reply.status == 200
+        assert TOKEN.encode() not in reply.body
+
+
+async def test_a_page_in_a_browser_on_this_host_may_not(proxy: Proxy) -> None:
+    reply = await post(proxy, "/retire", "{}", "Origin: http://evil.example")
+    assert reply.status == 403
+    assert not proxy.app.context.retired
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_commands_send_the_token(make_proxy: MakeProxy, node: Node) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    await node.publish(proxy.master)
+    words = ("doctor", "--admin", admin_url(proxy), "--json")
+    without = await run(*words)
+    assert "HTTP 403" in without.out
+    assert "HTTP 403" not in (await run(*words, ROSPROXY_ADMIN_TOKEN=TOKEN)).out
+
+
+def test_the_token_does_not_show() -> None:
+    from tests.integration.proxy import settings_for
+
+    settings = settings_for(master_uri="http://robot:11311", admin_token=TOKEN)
+    assert settings.admin_token == TOKEN
+    assert TOKEN not in repr(settings)
+
+
+BAD = [
+    ("/containers", "nonsense", "the body: must be JSON"),
+    ("/containers", "[" * 100_000, "the body: must be JSON"),
+    ("/containers", "1" * 10_000, "the body: must be JSON"),
+    ("/containers", "[]", "the body: must be a JSON object, not a list"),
+    ("/containers", '{"gone": ["x"]}', "gone[0]: must be an IP address"),
+    ("/containers", '{"moved": {"a": "b"}}', "moved: must be an IP address"),
+    ("/containers", '{"arrived": [{"names": []}]}', "arrived[0].address: must be an IP address"),
+    ("/containers", '{"gone": [], "left": []}', "the body: unknown field 'left'"),
+    ("/retire", '{"x": 1}', "the body: unknown field 'x'; known: none"),
+]
+
+
+@pytest.mark.parametrize(("path", "body", "complaint"), BAD)
+async def test_a_bad_body_is_told_apart(proxy: Proxy, path: str, body: str, complaint: str) -> None:
+    reply = await post(proxy, path, body)
+    assert reply.status == 400
+    assert reply.body.decode().startswith(f"rosproxy: {complaint}")
+    assert not proxy.app.context.retired
+
+
+async def test_a_body_in_no_encoding(proxy: Proxy) -> None:
+    assert (await post(proxy, "/containers", b'{"gone": ["\xff\xfe"]}')).status == 400
+
+
+async def test_a_body_that_is_too_long(proxy: Proxy) -> None:
+    assert (await post(proxy, "/containers", b" " * (1024 * 1024 + 1))).status == 413
+    assert (await post(proxy, "/containers", b" " * (1024 * 1024))).status == 200
+
+
+async def test_no_news(proxy: Proxy) -> None:
+    assert await news(proxy) == (0, 0, 0)
+    assert await news(proxy, gone=[NODE], moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert await news(proxy, arrived=[{"address": NODE, "names": ["c1"]}]) == (0, 0, 0)
+
+
+async def populate(proxy: Proxy, node: Node) -> None:
+    """One of each kind."""
+    await node.publish(proxy.master)
+    await node.publish(proxy.master, "/rosout")
+    await node.subscribe(proxy.master, "/back")
+    await node.serve(proxy.master)
+    await node.call(proxy.master, "subscribeParam", node.uri, "/rate")
+
+
+def everything(master: Master) -> list[str]:
+    """All names that the master knows of."""
+    return [key for table in master.book.tables.values() for key in table.rows]
+
+
+async def test_a_container_that_is_gone(
+    make_proxy: MakeProxy, make_node: MakeNode, master: Master
+) -> None:
+    proxy = await make_proxy(**PATIENT)
+    dead, alive = await make_node(), await make_node("/alive", OTHER_NODE)
+    await populate(proxy, dead)
+    await alive.publish(proxy.master, "/news")
+    lease = proxy.lease(dead)
+    await dead.stop()
+    assert await news(proxy, gone=[NODE, OTHER_NODE, THIRD_NODE]) == (1, 0, 0)
+    assert everything(master) == ["/news"]
+    assert await refuses(lease)
+    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert await greet(proxy.lease(alive), topic_header("/news"))
+
+
+async def test_a_node_that_hangs_is_not_waited_for(
+    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "rosproxy.ros1.upkeep.containers.events.YOUNG", -1.0
+    )  # it is none that is just starting
+    proxy = await make_proxy(**PATIENT, probe_timeout=3.0)
+    await node.publish(proxy.master)
+    node.hang = True
+    before = proxy.app.context.now()
+    assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+    assert proxy.app.context.now() - before < 1.5
+    assert not everything(master)
+    node.hang = False  # the news was wrong
+    await until(lambda: master.holds("publishers", "/chatter"), "it is registered again", 8)
+
+
+async def test_a_node_that_has_just_registered_may_take_its_time(
+    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A restarted container has its address again before the news that it was gone."""
+    monkeypatch.setattr("rosproxy.ros1.upkeep.containers.events.SECOND_CHANCE", 0.6)
+    proxy = await make_proxy(**PATIENT)
+    await node.publish(proxy.master)
+    node.hang = True
+    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    assert not await refuses(proxy.lease(node))
+    assert everything(master)
+    await until(lambda: not everything(master), "it had its chance", 5)
+
+
+async def test_its_open_connections_end(make_proxy: MakeProxy, node: Node) -> None:
+    proxy = await make_proxy(**PATIENT)
+    await node.publish(proxy.master)
+    async with connect(proxy.lease(node)) as wire:
+        await wire.send(topic_header())
+        await read_header(wire)
+        await node.slave.stop()
+        assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+        assert await wire.end() == "closed"
+
+
+async def test_another_process_at_an_address_that_is_gone(
+    make_proxy: MakeProxy, node: Node, master: Master
+) -> None:
+    """It answers, but has none of the former one's topics."""
+    proxy = await make_proxy(**PATIENT, probe_interval=60.0)
+    await node.publish(proxy.master)
+    await until(lambda: proxy.endpoint(node).health.pid, "it was probed")
+    node.pid += 1
+    node.published.clear()
+    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+    await until(lambda: not everything(master), "what the former had is taken back")
+
+
+async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
+    make_proxy: MakeProxy, node: Node
+) -> None:
+    proxy = await make_proxy(cleanup_after=0.0, linger=0.2)
+    await node.publish(proxy.master)
+    node.hang = True
+    await news(proxy, gone=[NODE])
+    await until(lambda: not len(proxy.app.context.registry), "the port is free again")
+
+
+async def test_a_master_that_is_away_hears_of_it_later(
+    make_proxy: MakeProxy, node: Node, master: Master
+) -> None:
+    proxy = await make_proxy(linger=60.0, cleanup_after=60.0)
+    await node.publish(proxy.master)
+    lease = proxy.lease(node)
+    await node.stop()
+    await master.stop()
+    reply = await post(proxy, "/containers", json.dumps({"gone": [NODE]}))
+    assert reply.status == 503
+    assert reply.body.endswith(b"try again\n")
+    assert await refuses(lease)
+    await master.start()
+    await until(lambda: not everything(master), "it is unregistered by itself", 8)
+    assert await news(proxy, gone=[NODE]) == (0, 0, 0)
+
+
+class Container:
+    """A node in a container that can get another address."""
+
+    def __init__(self, node: Node, proxy: Proxy) -> None:
+        self.node, self.proxy, self.uri = node, proxy, node.uri
+
+    async def move(self, address: str) -> None:
+        """The same process at another address; it calls itself what it did."""
+        await self.node.stop()
+        self.node.host, self.node.address = self.node.host, address
+        await self.node.start()
+        assert self.node.uri == self.uri
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return self.proxy.endpoint(self.node)
+
+
+@pytest.fixture
+async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
+    """A node with one registration of each kind, known by its pid."""
+    node = await make_node(port=free_ports(1))
+    proxy = await make_proxy(**PATIENT, probe_interval=60.0)
+    await populate(proxy, node)
+    moved = Container(node, proxy)
+    await until(lambda: moved.endpoint.health.pid, "it was probed")
+    return moved
+
+
+async def test_a_container_that_has_moved(container: Container, master: Master) -> None:
+    proxy, node = container.proxy, container.node
+    lease, before = proxy.lease(node), proxy.uri(node)
+    await container.move(OTHER_NODE)
+    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
+    after = proxy.uri(node)
+    assert proxy.lease(node) == lease
+    assert after != before
+    for kind, name in [("publishers", "/chatter"), ("subscribers", "/back"), ("params", "/rate")]:
+        assert master.holds(kind, name) == [after]
+    assert master.holds("services", "/add") == [f"rosrpc://{lease[0]}:{lease[1]}"]
+    assert (await greet(lease, topic_header()))["callerid"] == "/talker"
+    assert (await greet(lease, service_header()))["callerid"] == "/talker"
+    assert not [call for call in node.calls if call[0] == "shutdown"]
+    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+
+
+async def test_it_goes_on_calling_itself_what_it_did(
+    container: Container, master: Master, make_node: MakeNode
+) -> None:
+    proxy, node = container.proxy, container.node
+    await container.move(OTHER_NODE)
+    await news(proxy, moved={NODE: OTHER_NODE})
+    await node.publish(proxy.master, "/more")
+    assert master.holds("publishers", "/more") == [proxy.uri(node)]
+    assert len(proxy.app.context.registry) == 1
+    await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
+    assert not master.holds("publishers", "/chatter")
+    neighbour = await make_node("/neighbour", THIRD_NODE)
+    found = (await neighbour.subscribe(proxy.master, "/more"))[2]
+    assert found != [node.uri]
+    assert f":{proxy.lease(node)[1]}/" in found[0]
+
+
+async def test_its_subscriptions_are_told_to_connect_again(container: Container) -> None:
+    await container.move(OTHER_NODE)
+    await news(container.proxy, moved={NODE: OTHER_NODE})
+    assert container.node.updates("/back")[:2] == [[], []]
+
+
+async def test_another_process_at_the_new_address_is_not_the_same(
+    container: Container, master: Master
+) -> None:
+    before = container.proxy.uri(container.node)
+    await container.move(OTHER_NODE)
+    container.node.pid += 1
+    assert await news(container.proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    assert master.holds("publishers", "/chatter") == [before]
+
+
+async def test_a_new_address_outside_of_all_inside_networks(container: Container) -> None:
+    await container.move(OUTSIDE)
+    assert await news(container.proxy, moved={NODE: OUTSIDE}) == (0, 0, 0)
+
+
+async def test_it_has_registered_from_its_new_address_already(
+    container: Container, master: Master
+) -> None:
+    """So it holds another port, under the same name; its topics are all registered there."""
+    proxy, node = container.proxy, container.node
+    await container.move(OTHER_NODE)
+    await node.publish(proxy.master, "/more")
+    assert master.holds("publishers", "/chatter") == []
+    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 0, 0)
+    uri = proxy.uri(node)
+    for name in ("/more", "/chatter", "/rosout"):
+        assert master.holds("publishers", name) == [uri]
+    assert master.holds("subscribers", "/back") == [uri]
+
+
+async def test_a_master_that_is_away_is_told_of_the_move_later(
+    container: Container, master: Master
+) -> None:
+    proxy, node = container.proxy, container.node
+    await container.move(OTHER_NODE)
+    await master.stop()
+    reply = await post(proxy, "/containers", json.dumps({"moved": {NODE: OTHER_NODE}}))
+    assert reply.status == 503
+    await master.start()
+    await until(lambda: not container.endpoint.unsettled, "it is settled", 8)
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+
+
+async def test_a_container_that_is_back_elsewhere(container: Container, master: Master) -> None:
+    """Gone at first, as one that is taken off its network, and then at another address."""
+    proxy, node = container.proxy, container.node
+    await node.stop()
+    assert await news(proxy, gone=[NODE]) == (1, 0, 0)
+    assert not everything(master)
+    await container.move(OTHER_NODE)
+    assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+    assert master.holds("services", "/add")
+
+
+async def test_retiring(
+    make_proxy: MakeProxy, node: Node, make_node: MakeNode, master: Master
+) -> None:
+    proxy = await make_proxy(**PATIENT)
+    await populate(proxy, node)
+    lease = proxy.lease(node)
+    assert await tell(proxy, "/retire") == {"unregistered": 1}
+    assert not everything(master)
+    assert await refuses(lease)
+    late = await make_node("/late")
+    for triple in (await late.publish(proxy.master), await node.publish(proxy.master, "/more")):
+        assert triple[0] == -1
+        assert "retired" in triple[1]
+    assert await tell(proxy, "/retire") == {"unregistered": 0}
+    await proxy.app._watch.look()
+    await proxy.app._watch._restore_lost()
+    await proxy.app._keeper.look()
+    assert not everything(master)
+    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
+    assert (ready.status, ready.body) == (503, b"retired: nothing is registered any more\n")
+
+
+async def test_retiring_waits_for_registrations_under_way(
+    make_proxy: MakeProxy, node: Node, master: Master
+) -> None:
+    import asyncio
+
+    proxy = await make_proxy(**PATIENT)
+    await until(lambda: proxy.app._watch.up, "the master is seen")
+    master.delay = 0.3
+    registering = asyncio.create_task(node.publish(proxy.master))
+    await until(lambda: len(proxy.app.context.registry), "it is admitted")
+    await tell(proxy, "/retire")
+    await registering
+    assert not everything(master)
+
+
+async def test_a_proxy_that_can_not_retire_yet(
+    make_proxy: MakeProxy, node: Node, master: Master
+) -> None:
+    proxy = await make_proxy(**PATIENT)
+    await node.publish(proxy.master)
+    master.answers["system.multicall"] = End.RESET
+    assert (await post(proxy, "/retire")).status == 503
+    assert (await node.publish(proxy.master, "/more"))[0] == -1
+    del master.answers["system.multicall"]
+    assert await tell(proxy, "/retire") == {"unregistered": 1}
+    assert not everything(master)

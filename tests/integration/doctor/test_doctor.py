@@ -1,0 +1,338 @@
+"""``rosproxy doctor`` at running proxies: what it gathers, and what it says of faults made here."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from rosproxy.cli.admin_client import AdminClient
+from rosproxy.doctor.collect import Patient, survey
+from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.rules import diagnose
+from rosproxy.ros1.protocol.tcpros import encode_header
+from tests.integration.calling_master import CallingMaster
+from tests.integration.commands import admin_url, run
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.http_fake import End, HttpFake, Request, ok, value
+from tests.integration.net import HOST, MASTER, OUTSIDE, Wire, connect, free_ports, rpc, until
+from tests.integration.node import Header, Node, read_header, topic_header
+from tests.integration.proxy import Proxy
+
+NOBODY = "http://127.0.0.1:1"
+
+
+@pytest.fixture
+async def master() -> AsyncIterator[CallingMaster]:
+    made = CallingMaster()
+    await made.start()
+    yield made
+    await made.stop()
+
+
+@pytest.fixture
+async def listener(make_node: MakeNode, master: CallingMaster) -> Node:
+    """A node outside that subscribes to /chatter."""
+    node = await make_node("/listener", OUTSIDE)
+    await register(master, node, "registerSubscriber")
+    node.subscribed["/chatter"] = "std_msgs/String"
+    return node
+
+
+async def register(master: CallingMaster, node: Node, method: str, topic: str = "/chatter") -> None:
+    """Register a node outside, at the real master."""
+    await rpc(master.uri, method, node.name, topic, "std_msgs/String", node.uri)
+
+
+async def examine(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[Finding]:
+    """All findings."""
+    admin = AdminClient(admin_url(proxy)) if proxy else None
+    return diagnose(await survey(Patient(admin, master_uri, "", names)))
+
+
+async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[Finding]:
+    """The findings that are more than notes."""
+    found = await examine(proxy, *names, master_uri=master_uri)
+    return [f for f in found if f.severity >= Severity.WARNING]
+
+
+async def only(proxy: Proxy | None, *names: str, master_uri: str = "") -> Finding:
+    """The one fault."""
+    (found,) = await faults(proxy, *names, master_uri=master_uri)
+    return found
+
+
+def bus(*rows: tuple[str, str, str]) -> bytes:
+    """An answer to getBusInfo: (peer, direction, topic) of each connection."""
+    listed = [[n, peer, way, "TCPROS", topic, True] for n, (peer, way, topic) in enumerate(rows)]
+    return value([1, "bus info", listed])
+
+
+async def test_a_sound_system(
+    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+) -> None:
+    await node.publish(proxy.master)
+    await until(lambda: proxy.endpoint(node).health.state == "ok", "the node was probed")
+    found = await examine(proxy)
+    assert {f.severity for f in found} == {Severity.OK}, found
+    texts = " ".join(f.text for f in found)
+    assert f"{master.uri} answers in" in texts
+    assert f"the master reaches {HOST}, port " in texts
+    assert "1 of 1 answer" in texts
+    assert "2 registered, none with faults" in texts
+
+
+async def test_it_leaves_nothing_behind(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+    await node.publish(proxy.master)
+    before = master.book.tables["publishers"].state(), dict(master.book.nodes)
+    await examine(proxy, "/chatter")
+    assert (master.book.tables["publishers"].state(), dict(master.book.nodes)) == before
+    assert not master.params
+
+
+async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: Node) -> None:
+    proxy = await make_proxy(cleanup_after=60)
+    await node.publish(proxy.master)
+    await node.stop()
+    await until(lambda: proxy.endpoint(node).health.down, "the node was missed")
+    found = await only(proxy)
+    assert (found.subject, found.severity) == ("/talker", Severity.ERROR)
+    assert "has ended without unregistering" in found.text
+
+
+async def test_a_node_that_hangs(make_proxy: MakeProxy, node: Node) -> None:
+    proxy = await make_proxy(cleanup_after=60)
+    await node.publish(proxy.master)
+    node.hang = True
+    await until(lambda: proxy.endpoint(node).health.down, "the node was missed", 10)
+    assert "it hangs" in (await only(proxy)).text
+
+
+async def test_an_outside_node_that_is_gone(
+    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+) -> None:
+    await node.publish(proxy.master)
+    await listener.stop()
+    # The master of the tests is on loopback, as all here: so its nodes may be, if they answer.
+    assert (await only(proxy)).subject == "/listener"
+
+
+async def test_an_outside_node_of_an_unknown_host(proxy: Proxy, master: CallingMaster) -> None:
+    await rpc(master.uri, "registerPublisher", "/far", "/t", "a/B", "http://nobody.invalid:4/")
+    found = [f for f in await faults(proxy) if f.subject == "/far"]
+    assert "the host name nobody.invalid can't be resolved" in found[0].text
+
+
+async def test_a_stale_registration(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+    await node.publish(proxy.master)
+    port = proxy.settings.ports.listen.last
+    uri = f"http://{HOST}:{port}/127.0.2.99:4/"
+    await rpc(master.uri, "registerPublisher", "/ghost", "/t", "a/B", uri)
+    await rpc(master.uri, "registerService", "/ghost", "/s", f"rosrpc://{HOST}:{port}", uri)
+    found = await faults(proxy)
+    assert [f.subject for f in found] == ["/ghost", "/ghost"]
+    assert {f.check for f in found} == {"stale registration"}
+
+
+async def test_the_master_is_away(proxy: Proxy, master: CallingMaster) -> None:
+    await master.stop()
+    found = [f for f in await faults(proxy) if f.severity is Severity.ERROR]
+    assert [f.check for f in found] == ["master"]
+    assert "refuses connections" in found[0].text
+
+
+async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
+    async def respond(request: Request) -> bytes:
+        if request.verb == "POST" and request.path == "/":
+            return value([1, "", 7])
+        return b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
+
+    fake = HttpFake(respond)
+    await fake.start(MASTER)
+    proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/ros")
+    found = [f for f in await faults(proxy) if f.check == "master"]
+    await proxy.stop()
+    await fake.stop()
+    assert "not at the path /ros" in found[0].text
+
+
+async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> None:
+    async def respond(request: Request) -> bytes:
+        return ok(b"<html>It works!</html>")
+
+    fake = HttpFake(respond)
+    await fake.start(MASTER)
+    proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/")
+    found = [f for f in await faults(proxy) if f.check == "master"]
+    await proxy.stop()
+    await fake.stop()
+    assert "is no ROS master" in found[0].text
+
+
+async def test_the_proxy_is_its_own_master(make_proxy: MakeProxy) -> None:
+    port = free_ports(1)
+    proxy = await make_proxy(master_uri=f"http://127.0.0.1:{port}", master_port=port)
+    found = [f for f in await faults(proxy) if f.check == "master"]
+    assert "leads back to this proxy itself" in found[0].text
+
+
+async def test_the_published_master(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(publish_master=free_ports(1))
+    (found,) = [f for f in await examine(proxy) if f.check == "published master"]
+    assert found.severity is Severity.OK
+
+
+async def connected_pair(proxy: Proxy, node: Node) -> None:
+    await node.publish(proxy.master)
+    node.answers["getBusInfo"] = bus(("/listener", "o", "/chatter"))
+
+
+async def test_a_topic_whose_pair_is_connected(proxy: Proxy, node: Node, listener: Node) -> None:
+    await connected_pair(proxy, node)
+    async with connect(proxy.lease(node)) as wire:
+        await wire.send(topic_header(caller="/listener"))
+        await read_header(wire)
+        found = await examine(proxy, "/chatter")
+    (pair,) = [f for f in found if f.check == "pair"]
+    assert pair.severity is Severity.OK
+    assert pair.text.startswith("connected, ")
+    assert pair.text.endswith(" just now")
+
+
+async def test_types_that_differ(proxy: Proxy, node: Node, listener: Node) -> None:
+    await node.publish(proxy.master)
+    listener.subscribed["/chatter"] = "std_msgs/Int32"
+    found = await only(proxy, "/talker", "/listener")
+    assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
+
+
+async def test_a_subscriber_that_did_not_come(proxy: Proxy, node: Node, listener: Node) -> None:
+    await node.publish(proxy.master)
+    found = await only(proxy, "/chatter")
+    assert "/listener has not come" in found.text
+
+
+async def outside_publisher(master: CallingMaster, make_node: MakeNode) -> Node:
+    """A node outside that publishes /chatter, to a subscriber that is there already."""
+    node = await make_node("/robot", OUTSIDE)
+    await register(master, node, "registerPublisher")
+    node.published["/chatter"] = "std_msgs/String"
+    return node
+
+
+async def refuse(node: Node, wire: Wire, header: Header) -> None:
+    """Answer a subscriber as a publisher does whose message definition is another."""
+    await wire.send(encode_header({"error": "md5sums do not match"}))
+
+
+async def test_data_ports_of_a_publisher_outside(
+    proxy: Proxy, node: Node, master: CallingMaster, make_node: MakeNode
+) -> None:
+    await node.subscribe(proxy.master)
+    robot = await outside_publisher(master, make_node)
+    assert "md5sum" in (await only(proxy, "/chatter")).text
+    robot.stream = refuse
+    assert "md5sums do not match" in (await only(proxy, "/chatter")).text
+    robot.answers["requestTopic"] = value([1, "", ["TCPROS", "nobody.invalid", 4]])
+    assert (
+        "nobody.invalid:4 as its data port, host name unknown"
+        in (await only(proxy, "/chatter")).text
+    )
+    robot.answers["requestTopic"] = value([1, "", ["TCPROS", OUTSIDE, 1]])
+    assert (
+        f"{OUTSIDE}:1 as its data port, connection refused" in (await only(proxy, "/chatter")).text
+    )
+    robot.answers["requestTopic"] = value([0, "no", 0])
+    assert "gives nothing as its data port" in (await only(proxy, "/chatter")).text
+
+
+@pytest.mark.parametrize("answer", [value(7), value([1, "", "x"]), ok(b"no xml"), End.RESET])
+async def test_nodes_that_talk_nonsense_do_no_harm(
+    proxy: Proxy, node: Node, listener: Node, answer: Any
+) -> None:
+    await connected_pair(proxy, node)
+    for method in ("getBusInfo", "getPublications", "requestTopic", "getSubscriptions"):
+        node.answers[method] = listener.answers[method] = answer
+    assert await examine(proxy, "/chatter")
+
+
+async def test_services(proxy: Proxy, node: Node) -> None:
+    await node.serve(proxy.master)
+    (found,) = [f for f in await examine(proxy, "/add") if f.check == "pair"]
+    assert found.severity is Severity.OK
+    assert node.headers[-1]["probe"] == "1"
+    await node.stop_tcpros()
+    found = next(f for f in await faults(proxy, "/add") if f.check == "pair")
+    assert "connection refused" in found.text
+
+
+async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
+    listener: Node, master: CallingMaster
+) -> None:
+    found = diagnose(
+        await survey(Patient(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
+    )
+    errors = {f.check for f in found if f.severity is Severity.ERROR}
+    assert errors == {"admin", "pair"}
+
+
+async def test_the_look_from_outside(
+    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+) -> None:
+    await connected_pair(proxy, node)
+    assert not await faults(None, master_uri=master.uri)
+    (pair,) = [
+        f for f in await examine(None, "/chatter", master_uri=master.uri) if f.check == "pair"
+    ]
+    assert pair.text == "connected"
+    await proxy.stop()
+    found = await only(None, master_uri=master.uri)
+    assert "registered through a rosproxy" in found.text
+
+
+async def test_the_command(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+    await node.publish(proxy.master)
+    sound = await run("doctor", "--admin", admin_url(proxy))
+    assert (sound.code, sound.err) == (0, "")
+    assert sound.out.endswith("Nothing wrong was found.\n")
+    wrong = await run("doctor", "chatter", "--json", ROSPROXY_ADMIN=admin_url(proxy))
+    assert (wrong.code, wrong.err) == (1, "")
+    told = json.loads(wrong.out)
+    assert told["ok"] is False
+    assert told["findings"][-1]["subject"] == "/chatter"
+    outside = await run("doctor", "--outside", ROS_MASTER_URI=master.uri)
+    assert outside.code == 0
+
+
+async def test_usage() -> None:
+    for words in (
+        ("doctor", "--admin", "nonsense"),
+        ("doctor", "--outside"),
+        ("doctor", "--master-uri", "robot"),
+        ("doctor", "--what"),
+    ):
+        result = await run(*words)
+        assert (result.code, result.out) == (2, ""), words
+        assert "Traceback" not in result.err
+
+
+async def test_many_nodes_are_looked_at_together(
+    proxy: Proxy, master: CallingMaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred nodes that do not answer must not take a hundred time-outs."""
+    monkeypatch.setattr("rosproxy.doctor.collect.WITHIN", 0.3)
+    silent = HttpFake(hang)
+    await silent.start(OUTSIDE)
+    for number in range(100):
+        uri = f"http://{OUTSIDE}:{silent.address[1]}/"
+        await rpc(master.uri, "registerPublisher", f"/n{number}", "/t", "a/B", uri)
+    started = asyncio.get_running_loop().time()
+    found = await faults(proxy)
+    await silent.stop()
+    assert len([f for f in found if f.subject.startswith("/n")]) == 100
+    assert asyncio.get_running_loop().time() - started < 5
+
+
+async def hang(_request: Request) -> End:
+    return End.HANG

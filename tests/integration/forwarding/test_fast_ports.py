@@ -1,0 +1,162 @@
+"""Fast ports as nodes and subscribers see them; the kernel is made up and forwards nothing."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.forwarding.kernel import plane as kernel_plane
+from rosproxy.forwarding.kernel import policy as decisions
+from rosproxy.forwarding.kernel import targets as kernel_targets
+from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.targets import KernelTargets
+from rosproxy.forwarding.kernel.tools import Tools
+from tests.integration.admin_calls import tell
+from tests.integration.kernel_fake import FakeTools
+from tests.integration.net import NODE, OTHER_NODE, THIRD_NODE, Where, refuses, rpc, until
+from tests.integration.node import greet, topic_header
+
+TCPROS = [["TCPROS"]]
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
+    """A kernel that may forward to the nodes of these tests, which live on loopback."""
+    made = FakeTools()
+
+    async def nothing(mode: str, tools: Tools) -> None:
+        return None
+
+    monkeypatch.setattr(kernel_plane, "Tools", lambda: made)
+    monkeypatch.setattr(kernel_plane, "why_not", nothing)
+    monkeypatch.setattr(kernel_targets, "forwarding", World)
+    monkeypatch.setattr(KernelTargets, "_is_own", lambda targets, address: False)
+    monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
+    return made
+
+
+@pytest.fixture
+def no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def something(mode: str, tools: Tools) -> str:
+        return "not in this test"
+
+    monkeypatch.setattr(kernel_plane, "why_not", something)
+
+
+async def ask(proxy: Any, node: Any) -> Where:
+    """Where a subscriber outside is sent for a node's topic."""
+    _, _, (protocol, host, port) = await rpc(
+        proxy.uri(node), "requestTopic", "/x", "/chatter", TCPROS
+    )
+    assert protocol == "TCPROS"
+    return host, port
+
+
+async def test_a_subscriber_is_sent_to_the_fast_port(make_proxy, make_node, kernel):
+    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    await node.publish(proxy.master)
+    host, lease = proxy.lease(node)
+    assert await ask(proxy, node) == (host, lease + 4)
+    assert kernel.forwards == {lease + 4: (NODE, node.tcpros_port)}
+    assert (await greet((host, lease + 4), topic_header()))["callerid"] == "/a"
+    assert (await greet((host, lease), topic_header()))["callerid"] == "/a"
+    status = proxy.app.status()
+    assert status["ports"]["free"] == 7
+    assert status["data_plane"]["plane"] == "kernel"
+    assert status["nodes"][0]["data_plane"]["port"] == lease + 4
+    await proxy.stop()
+    assert kernel.table is None
+
+
+async def test_a_service_keeps_to_the_lease(make_proxy, make_node, kernel, master):
+    proxy, node = await make_proxy(data_plane="kernel"), await make_node("/a")
+    await node.publish(proxy.master)
+    await node.serve(proxy.master)
+    host, lease = proxy.lease(node)
+    await ask(proxy, node)
+    found = await rpc(master.uri, "lookupService", "/x", "/add")
+    assert found[2] == f"rosrpc://{host}:{lease}"
+
+
+async def test_the_fast_port_of_a_node_that_ended_refuses(make_proxy, make_node, kernel):
+    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    await node.publish(proxy.master)
+    fast = await ask(proxy, node)
+    await node.stop()
+    await until(lambda: refuses(fast), "the fast port refuses")
+    await until(lambda: not kernel.forwards, "nothing is forwarded")
+
+
+async def test_fast_ports_go_before_a_node_is_refused(make_proxy, make_node, kernel):
+    proxy = await make_proxy(data_plane="auto", ports=4)
+    nodes = [
+        await make_node("/a"),
+        await make_node("/b", OTHER_NODE),
+        await make_node("/c", THIRD_NODE),
+        await make_node("/d", THIRD_NODE),
+    ]
+    for node in nodes[:2]:
+        await node.publish(proxy.master, node.name)
+        await node.publish(proxy.master)
+        assert (await ask(proxy, node))[1] == proxy.lease(node)[1] + 2
+    assert len(kernel.forwards) == 2
+    for node in nodes[2:]:
+        assert (await node.publish(proxy.master))[0] == 1
+        assert proxy.lease(node)[1] not in kernel.forwards
+    assert kernel.forwards == {}
+    for node in nodes:
+        assert await ask(proxy, node) == proxy.lease(node)
+        assert (await greet(proxy.lease(node), topic_header()))["callerid"] == node.name
+
+
+async def test_a_range_full_of_fast_ports_is_probed_through_one_of_them(
+    make_proxy, make_node, kernel, monkeypatch
+):
+    """They counted as taken: nothing was tried."""
+    monkeypatch.setattr("rosproxy.admin.range_probe.MASTER_WAIT", 0.3)
+    proxy = await make_proxy(data_plane="auto", ports=4)
+    nodes = [await make_node("/a"), await make_node("/b", OTHER_NODE)]
+    for node in nodes:
+        await node.publish(proxy.master)
+        await ask(proxy, node)
+    lost, kept = kernel.forwards
+    told = await tell(proxy, "/probe")
+    assert [(p["port"], p["from_proxy"]) for p in told["probes"]] == [(lost, "ok")]
+    assert set(kernel.forwards) == {kept}
+    assert proxy.app.status()["ports"]["free"] == 2
+    for node in nodes:
+        assert (await ask(proxy, node))[1] == proxy.lease(node)[1] + 2
+    assert set(kernel.forwards) == {lost, kept}
+
+
+async def test_a_range_without_partners_has_no_fast_ports(make_proxy, make_node, kernel, caplog):
+    caplog.set_level("INFO")
+    proxy, node = await make_proxy(data_plane="auto", ports=1), await make_node("/a")
+    await node.publish(proxy.master)
+    for _ in range(2):
+        assert await ask(proxy, node) == proxy.lease(node)
+    assert caplog.text.count("the proxy forwards its topics: no port of the range goes with") == 1
+
+
+async def test_without_the_kernel_nobody_is_sent_to_a_fast_port(make_proxy, make_node, no_kernel):
+    proxy, node = await make_proxy(data_plane="auto"), await make_node("/a")
+    await node.publish(proxy.master)
+    assert await ask(proxy, node) == proxy.lease(node)
+    assert proxy.app.status()["data_plane"]["reason"] == "not in this test"
+
+
+async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
+    make_proxy, make_node, no_kernel
+):
+    proxy, node = await make_proxy(data_plane="auto", ports=4), await make_node("/a")
+    await node.publish(proxy.master)
+    host, lease = proxy.lease(node)
+    assert await refuses((host, lease + 2))
+    await proxy.restart()
+    leases, registry = proxy.app._leases, proxy.app.context.registry
+    await until(lambda: any(map(leases.is_open, registry)), "the node is recovered")
+    assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
+    assert proxy.app.status()["ports"]["free"] == 3
+    others = [await make_node(f"/n{number}", OTHER_NODE) for number in range(3)]
+    for other in others:
+        assert (await other.publish(proxy.master))[0] == 1
+    assert (await greet((host, lease + 2), topic_header()))["callerid"] != "/a"

@@ -1,0 +1,302 @@
+"""The kernel plane with a kernel made up: what it does when things go wrong."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+
+from rosproxy.forwarding.kernel import plane as kernel_plane
+from rosproxy.forwarding.kernel import targets
+from rosproxy.forwarding.kernel.nft import Marks
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.tools import Tools
+from rosproxy.leases import fast_ports
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.context import Context, make_context
+from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.settings import parse_settings
+from tests.integration.kernel_fake import FakeTools
+
+NODE = "192.0.2.5"
+FLOW = (
+    "tcp 6 431999 {state} src=198.51.100.2 dst=192.0.2.1 sport=1 dport={port} "
+    "src=192.0.2.5 dst=192.0.2.1 sport=50000 dport=1 [ASSURED] mark={mark} use=1\n"
+)
+
+
+def settings(mode: str) -> dict[str, Any]:
+    return {
+        "master_uri": "http://robot:11311",
+        "advertise_host": "host",
+        "port_range": "45000-45003",
+        "master_port": 11311,
+        "bind": "127.0.0.1",
+        "admin_bind": "127.0.0.1:11312",
+        "slave_control": "any",
+        "data_plane": mode,
+        "probe_interval": 5.0,
+        "probe_timeout": 3.0,
+        "cleanup_after": 30.0,
+        "linger": 30.0,
+        "master_interval": 2.0,
+    }
+
+
+class Bench:
+    """A plane over a made-up kernel; nothing listens."""
+
+    def __init__(self, mode: str = "auto", tools: FakeTools | None = None) -> None:
+        self.context: Context = make_context(parse_settings(settings(mode)))
+        self.tools = tools or FakeTools()
+        self.plane = KernelPlane(self.context, self.tools)
+
+    def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
+        node = HostPort(NODE, 40000 + number)
+        endpoint = self.context.registry.admit(f"http://{node}/", node, Place(NODE, True), NODE)
+        endpoint.tcpros_port = tcpros_port
+        return endpoint
+
+    async def forwarded(self, number: int = 0) -> Endpoint:
+        endpoint = self.node(number)
+        assert fast_ports.claim(self.context.registry, endpoint)
+        assert await self.plane.forwards(endpoint, 50000)
+        return endpoint
+
+    def flow(self, port: int, state: str = "ESTABLISHED") -> str:
+        return FLOW.format(port=port, state=state, mark=Marks(11311).of(port))
+
+
+@pytest.fixture
+def sound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network namespace in which nothing is in the way."""
+
+    async def nothing(mode: str, tools: Tools) -> None:
+        return None
+
+    monkeypatch.setattr(kernel_plane, "why_not", nothing)
+    monkeypatch.setattr(targets, "forwarding", World)
+
+
+@pytest.fixture
+async def bench(sound: None) -> AsyncIterator[Bench]:
+    one = Bench()
+    await one.plane.start()
+    one.plane.recovered([])
+    yield one
+    await one.context.tasks.cancel()
+    await one.plane.stop()
+
+
+async def until(check: Callable[[], bool]) -> None:
+    async with asyncio.timeout(5):
+        while not check():
+            await asyncio.sleep(0.01)
+
+
+async def test_an_endpoint_is_forwarded_when_it_is_asked_for(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    assert bench.tools.forwards == {45002: (NODE, 50000)}
+    told = bench.plane.status_of(endpoint)
+    assert (told["plane"], told["port"], told["reason"]) == ("kernel", 45002, "")
+    assert bench.plane.status() == {"mode": "auto", "plane": "kernel", "reason": ""}
+
+
+async def test_another_tcpros_port_is_followed(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    endpoint.tcpros_port = 50009
+    assert await bench.plane.forwards(endpoint, 50009)
+    assert bench.tools.forwards == {45002: (NODE, 50009)}
+    assert not await bench.plane.forwards(endpoint, 50000)
+
+
+async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> None:
+    endpoint, other = await bench.forwarded(), await bench.forwarded(1)
+    endpoint.health.end(1.0)
+    bench.plane.wake(endpoint)
+    await bench.plane.cleared(45002)
+    assert set(bench.tools.forwards) == {45003}
+    fast_ports.give_back(bench.context.registry, other)
+    bench.context.registry.remove(other)
+    bench.plane.wake(other)
+    await bench.plane.cleared(45003)
+    assert bench.tools.forwards == {}
+    assert bench.plane.status_of(endpoint)["reason"] == "the node does not answer"
+
+
+async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
+    first, second = await bench.forwarded(), await bench.forwarded(1)
+    first.tcpros_port = second.tcpros_port = 50001
+    assert await bench.plane.forwards(second, 50001)
+    assert bench.tools.forwards == {45002: (NODE, 50000), 45003: (NODE, 50001)}
+    await bench.plane.look()
+    await until(lambda: bench.tools.forwards[45002] == (NODE, 50001))
+
+
+async def test_a_node_on_the_proxys_own_machine_is_not_forwarded(bench: Bench) -> None:
+    endpoint = bench.node()
+    endpoint.place = Place("127.0.0.1", True)
+    assert not bench.plane.may_forward(endpoint)
+    assert not await bench.plane.forwards(endpoint, 50000)
+    assert "the proxy itself" in bench.plane.status_of(endpoint)["reason"]
+
+
+async def test_connections_and_bytes_are_taken_in(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    bench.tools.flows = bench.flow(45002) + bench.flow(45002, "TIME_WAIT") + bench.flow(45003)
+    await bench.plane.look()
+    assert endpoint.fast_peers == {"198.51.100.2": 1}
+    told = bench.plane.status_of(endpoint)
+    assert (told["connections"], told["sent"], told["received"]) == (1, 1000, 1000)
+    tally = bench.plane.tally()
+    assert (tally.usable, tally.connections) == (True, 1)
+    assert tally.traffic.sent == {("node", "unnamed"): 1000}
+
+
+async def test_a_table_that_is_gone_is_made_again(bench: Bench) -> None:
+    await bench.forwarded()
+    bench.tools.table = None
+    await bench.plane.look()
+    assert bench.tools.forwards == {45002: (NODE, 50000)}
+    bench.tools.table = None
+    await bench.forwarded(1)
+    assert set(bench.tools.forwards) == {45002, 45003}
+
+
+async def test_what_somebody_else_changed_is_put_right(bench: Bench) -> None:
+    await bench.forwarded()
+    assert bench.tools.table is not None
+    for name in ("marks", "hosts4", "ports"):
+        bench.tools.table[name].clear()
+    await bench.plane.look()
+    await until(lambda: bench.tools.forwards == {45002: (NODE, 50000)})
+
+
+async def test_a_plane_that_is_lost_is_told_and_comes_back(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_plane, "RETRY_LOST", 0.0)
+    endpoint = await bench.forwarded()
+    endpoint.fast_peers = {"198.51.100.2": 1}
+    bench.tools.failing, endpoint.tcpros_port = 2, 50001
+    assert not await bench.plane.forwards(endpoint, 50001)
+    assert not bench.plane.usable
+    assert endpoint.fast_peers == {}
+    assert bench.plane.status()["plane"] in ("splice", "copy")
+    assert "not permitted" in bench.context.problems.all()[0].text
+    await bench.plane.look()
+    assert bench.plane.status()["plane"] == "kernel"
+    assert bench.context.problems.all() == []
+    assert await bench.plane.forwards(endpoint, 50001)
+
+
+async def test_a_plane_that_stays_lost_is_tried_again_later(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    bench.tools.failing, endpoint.tcpros_port = 10, 50001
+    assert not await bench.plane.forwards(endpoint, 50001)
+    left = bench.tools.failing
+    await bench.plane.look()
+    assert bench.tools.failing == left
+
+
+async def test_who_is_not_answered_gets_back_to_user_space(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoint = await bench.forwarded()
+    bench.tools.flows = bench.flow(45002, "SYN_SENT")
+    await bench.plane.look()
+    assert bench.plane.may_forward(endpoint)
+    now = bench.context.now() + kernel_plane.UNANSWERED_PATIENCE
+    monkeypatch.setattr(Context, "now", lambda _: now)
+    await bench.plane.look()
+    assert bench.tools.forwards == {}
+    assert (Marks(11311).one(45002), False, "SYN_SENT") in bench.tools.forgotten
+    assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
+    bench.tools.flows = ""
+    monkeypatch.setattr(Context, "now", lambda _: now + 6)
+    assert await bench.plane.forwards(endpoint, 50000)
+
+
+async def test_cutting_forgets_the_connections(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    bench.plane.cut(endpoint)
+    await until(lambda: bench.tools.forgotten == [(Marks(11311).one(45002), False, "")])
+
+
+async def test_stopping_leaves_nothing(bench: Bench) -> None:
+    endpoint = await bench.forwarded()
+    await bench.plane.stop()
+    assert bench.tools.table is None
+    assert {(mark, ipv6) for mark, ipv6, _ in bench.tools.forgotten} == {
+        (Marks(11311).all, False),
+        (Marks(11311).all, True),
+    }
+    assert not await bench.plane.forwards(endpoint, 50001)
+
+
+async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
+    bench: Bench,
+) -> None:
+    await bench.forwarded()
+    later = Bench(tools=bench.tools)
+    await later.plane.start()
+    later.plane.wake()
+    await asyncio.sleep(0.05)
+    assert later.tools.forwards == {45002: (NODE, 50000)}
+    node = HostPort(NODE, 40000)
+    place = Place(NODE, True, confirmed=False)
+    endpoint = later.context.registry.restore(f"http://{node}/", node, place, 45000)
+    assert endpoint is not None
+    later.plane.recovered([endpoint])
+    await asyncio.sleep(0.05)
+    assert later.tools.forwards == {45002: (NODE, 50000)}
+    endpoint.tcpros_port, endpoint.trusted = 50001, True
+    assert await later.plane.forwards(endpoint, 50001)
+    assert later.tools.forwards == {45002: (NODE, 50001)}
+    assert later.plane.status_of(endpoint)["plane"] == "kernel"
+    await later.context.tasks.cancel()
+
+
+async def test_forwards_that_nobody_claims_are_removed(bench: Bench) -> None:
+    await bench.forwarded()
+    later = Bench(tools=bench.tools)
+    await later.plane.start()
+    later.plane.recovered([])
+    await until(lambda: later.tools.forwards == {})
+    await later.context.tasks.cancel()
+
+
+@pytest.mark.parametrize(
+    ("mode", "level", "problems"), [("auto", "INFO", 0), ("kernel", "ERROR", 1)]
+)
+async def test_what_is_missing_is_said(
+    sound: None, caplog: pytest.LogCaptureFixture, mode: str, level: str, problems: int
+) -> None:
+    caplog.set_level("INFO")
+    bench = Bench(mode)
+    bench.tools.failing = 2
+    await bench.plane.start()
+    assert not bench.plane.usable
+    assert caplog.records[-1].levelname == level
+    assert "not permitted" in caplog.text
+    found = bench.context.problems.all()
+    assert [problem.subject for problem in found] == ["--data-plane"] * problems
+    endpoint = bench.node()
+    bench.plane.recovered([endpoint])
+    assert endpoint.fast_port == 45002
+    assert not await bench.plane.forwards(endpoint, 50000)
+    assert bench.plane.status_of(endpoint)["port"] == 45002
+
+
+@pytest.mark.parametrize("mode", ["splice", "copy"])
+async def test_other_modes_leave_the_kernel_alone(mode: str) -> None:
+    bench = Bench(mode)
+    await bench.plane.start()
+    endpoint = bench.node()
+    bench.plane.recovered([endpoint])
+    await bench.plane.look()
+    assert bench.plane.status()["reason"] == f"--data-plane {mode}"
+    await bench.plane.stop()
+    assert endpoint.fast_port is None
+    assert bench.tools.documents == []

@@ -1,0 +1,158 @@
+"""What the kernel plane needs: conditions as files and firewalls tell them, and its programs."""
+
+import asyncio
+import stat
+from pathlib import Path
+
+import pytest
+
+from rosproxy.forwarding.kernel import preflight
+from rosproxy.forwarding.kernel import tools as kernel_tools
+from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.tools import ToolError, Tools
+from tests.integration.kernel_fake import FakeTools
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A container's view of /proc and /sys."""
+    for name, text in (("ipv4", "1\n"), ("ipv6", "0\n"), ("tables", "")):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "net" / "eth0").mkdir(parents=True)
+    for attribute, name in (
+        ("_IPV4", "ipv4"),
+        ("_IPV6", "ipv6"),
+        ("_LEGACY_TABLES", "tables"),
+        ("_INTERFACES", "net"),
+    ):
+        monkeypatch.setattr(preflight, attribute, tmp_path / name)
+    return tmp_path
+
+
+class ChainTools(FakeTools):
+    """Lists chains only."""
+
+    chains = '{"nftables": []}'
+
+    async def nft(self, *words: str, document: str = "") -> str:
+        """The chains."""
+        assert words == ("list", "chains")
+        return self.chains
+
+
+async def test_a_sound_container_has_nothing_in_the_way(place: Path) -> None:
+    for mode in ("auto", "kernel"):
+        assert await preflight.why_not(mode, ChainTools()) is None
+    assert preflight.forwarding() == World(ipv4=True, ipv6=False)
+
+
+async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
+    (place / "net" / "eth0" / "device").mkdir()
+    said = await preflight.why_not("auto", ChainTools())
+    assert said is not None
+    assert "eth0" in said
+    assert "--data-plane kernel" in said
+    assert await preflight.why_not("kernel", ChainTools()) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [("ipv4", "0", "net.ipv4.ip_forward"), ("tables", "nat\nfilter\n", "iptables-legacy")],
+)
+async def test_what_is_in_the_way(place: Path, name: str, text: str, said: str) -> None:
+    (place / name).write_text(text)
+    assert said in (await preflight.why_not("kernel", ChainTools()) or "")
+
+
+async def test_a_file_that_is_not_there_is_not_in_the_way(place: Path) -> None:
+    (place / "tables").unlink()
+    (place / "net" / "eth0").rmdir()
+    (place / "net").rmdir()
+    assert await preflight.why_not("auto", ChainTools()) is None
+
+
+async def test_a_firewall_that_drops_is_in_the_way(place: Path) -> None:
+    tools = ChainTools()
+    tools.chains = (
+        '{"nftables": [{"chain": {"family": "ip", "table": "filter", "name": "FORWARD", '
+        '"hook": "forward", "policy": "drop"}}]}'
+    )
+    assert "ip filter FORWARD" in (await preflight.why_not("kernel", tools) or "")
+    tools.chains = "what?"
+    assert "nft printed" in (await preflight.why_not("kernel", tools) or "")
+
+
+def program(folder: Path, name: str, script: str, mode: int = 0o755) -> None:
+    (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+    (folder / name).chmod(mode)
+
+
+@pytest.fixture
+def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for made-up programs, which are found before all others."""
+    monkeypatch.setattr(kernel_tools, "IMAGE_FOLDER", tmp_path)
+    return tmp_path
+
+
+async def test_programs_get_their_words_and_document(programs: Path) -> None:
+    program(programs, "nft", 'echo "$@"; /bin/cat')
+    program(programs, "conntrack", 'echo "$@"')
+    assert await Tools().nft("-f", "-", document="{}") == "-j -f -\n{}"
+    assert await Tools().list_flows("1/2", True) == "-L -f ipv6 -p tcp --mark 1/2\n"
+    await Tools().forget_flows("1/2", False, "SYN_SENT")
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo cache initialization failed: Operation not permitted >&2; exit 1", "NET_ADMIN"),
+        ("echo sorry, you must be root >&2; exit 1", "no-new-privileges"),
+        ("echo Error: syntax >&2; exit 1", "Error: syntax"),
+    ],
+)
+async def test_complaints_say_what_to_do(programs: Path, script: str, said: str) -> None:
+    program(programs, "nft", script)
+    with pytest.raises(ToolError, match=said):
+        await Tools().nft("list", "chains")
+
+
+async def test_deleting_nothing_is_no_failure(programs: Path) -> None:
+    program(programs, "conntrack", "echo 0 flow entries have been deleted. >&2; exit 1")
+    await Tools().forget_flows("1/2", False)
+    program(programs, "conntrack", "echo something else >&2; exit 1")
+    with pytest.raises(ToolError, match="something else"):
+        await Tools().forget_flows("1/2", False)
+
+
+async def test_a_program_that_hangs_is_ended(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_tools, "TIMEOUT", 0.2)
+    program(programs, "nft", "exec /bin/sleep 30")
+    with pytest.raises(ToolError, match="did not end"):
+        await Tools().nft("list", "chains")
+
+
+async def test_what_a_cancelled_task_began_is_finished(programs: Path) -> None:
+    program(programs, "nft", f"/bin/sleep 0.3; echo done >{programs}/said; exit 1")
+    tools = Tools()
+    task = asyncio.ensure_future(tools.nft("list", "chains"))
+    await asyncio.sleep(0.1)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    await tools.settled()
+    assert (programs / "said").read_text() == "done\n"
+
+
+async def test_a_program_that_is_missing_or_broken_is_told(
+    programs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_tools, "SYSTEM_FOLDERS", ())
+    monkeypatch.setenv("PATH", str(programs))
+    with pytest.raises(ToolError, match="install nftables"):
+        await Tools().nft("list", "chains")
+    (programs / "nft").write_text("#!/no/such/shell\n")
+    (programs / "nft").chmod(stat.S_IRWXU)
+    with pytest.raises(ToolError, match="can't run"):
+        await Tools().nft("list", "chains")

@@ -1,0 +1,398 @@
+"""The relay: every byte, in order, both ways; ends, resets and back-pressure passed on."""
+
+import asyncio
+import errno
+import fcntl
+import hashlib
+import os
+import random
+import socket
+import threading
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from typing import Any
+
+import pytest
+
+from rosproxy.forwarding import relay, relay_set
+from tests.integration.net import Wire, connect, refuses, until
+from tests.integration.node import read_header, topic_header
+
+BOTH_LOOPS = True
+THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.BLOCK_SIZE, relay.PIPE_SIZE]
+
+
+class Ends:
+    """Both ends of a relayed connection, as raw connections of the test."""
+
+    def __init__(self, outside: Wire, inside: Wire) -> None:
+        self.outside, self.inside = outside, inside
+
+
+@pytest.fixture
+async def lease(proxy, node) -> Any:
+    await node.publish(proxy.master)
+    return proxy.lease(node)
+
+
+@asynccontextmanager
+async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
+    """A relayed connection; the node's end stays in the hands of the test."""
+    arrived: asyncio.Future[Wire] = asyncio.get_running_loop().create_future()
+    over = asyncio.Event()
+
+    async def hold(node: Any, wire: Wire, header: Any) -> None:
+        arrived.set_result(wire)
+        await over.wait()
+
+    before, node.stream = node.stream, hold
+    async with connect(lease) as outside:
+        await outside.send(topic_header())
+        try:
+            yield Ends(outside, await arrived)
+        finally:
+            node.stream = before
+            over.set()
+
+
+async def quiet(proxy: Any) -> None:
+    """Wait until all relays have ended."""
+    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
+
+
+async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lease):
+    async with relayed(node, lease) as ends:
+        for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+            await one.send(b"last words")
+            await one.half_close()
+            async with asyncio.timeout(5):
+                assert await other.reader.read() == b"last words"
+            if one is ends.outside:
+                await ends.inside.send(b"still here")
+                assert await ends.outside.exactly(10) == b"still here"
+    await quiet(proxy)
+
+
+@pytest.mark.parametrize("who", ["outside", "inside"])
+@pytest.mark.parametrize("after", ["nothing", "data", "a half close"])
+async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
+    async with relayed(node, lease) as ends:
+        one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        if after == "data":
+            await one.send(b"x" * 100_000)
+            assert await other.exactly(100_000) == b"x" * 100_000
+        elif after == "a half close":
+            await other.half_close()
+            await one.exactly(0)
+            await asyncio.sleep(0.05)
+        one.reset()
+        assert await other.end() == "reset"
+    await quiet(proxy)
+
+
+@pytest.mark.parametrize("who", ["outside", "inside"])
+async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, who):
+    async with relayed(node, lease) as ends:
+        one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
+        one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
+        flood = asyncio.create_task(one.send(b"x" * 50_000_000))
+        await asyncio.sleep(0.3)
+        assert not flood.done()
+        one.reset()
+        await asyncio.gather(flood, return_exceptions=True)
+        with pytest.raises(ConnectionResetError):
+            await digest(other)
+    await quiet(proxy)
+
+
+@pytest.mark.parametrize("stalled", ["outside", "inside"])
+async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, lease, stalled):
+    async with relayed(node, lease) as ends:
+        reader = getattr(ends, stalled)
+        writer = ends.inside if stalled == "outside" else ends.outside
+        flood = asyncio.create_task(writer.send(b"x" * 50_000_000))
+        await asyncio.sleep(0.2)
+        reader.reset()
+        with pytest.raises(ConnectionError):
+            await flood
+    await quiet(proxy)
+
+
+def slices(data: bytes, seed: int) -> list[bytes]:
+    """The same bytes in pieces of random sizes, most near where the relay changes its ways."""
+    chooser, parts, start = random.Random(seed), [], 0
+    while start < len(data):
+        near = chooser.choice([1, 100, 3000, *THRESHOLDS])
+        size = max(1, near + chooser.choice([-1, 0, 1, chooser.randrange(50)]))
+        parts.append(data[start : start + size])
+        start += size
+    return parts
+
+
+async def write(wire: Wire, parts: list[bytes]) -> None:
+    for part in parts:
+        await wire.send(part)
+        if len(part) % 3 == 0:
+            await asyncio.sleep(0.0005)
+    await wire.half_close()
+
+
+async def digest(wire: Wire) -> str:
+    seen = hashlib.sha256()
+    while data := await wire.reader.read(1 << 20):
+        seen.update(data)
+    return seen.hexdigest()
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("least_pipe", [relay.LEAST_PIPE, 1 << 40], ids=["splice", "copies"])
+async def test_bytes_arrive_intact_both_ways_at_once(
+    proxy, node, lease, seed, least_pipe, monkeypatch
+):
+    monkeypatch.setattr(relay, "LEAST_PIPE", least_pipe)
+    outward, inward = random.Random(seed).randbytes(3_000_001), os.urandom(2_000_003)
+    async with relayed(node, lease) as ends, asyncio.timeout(10):
+        *_, got_outside, got_inside = await asyncio.gather(
+            write(ends.inside, slices(outward, seed)),
+            write(ends.outside, slices(inward, seed + 100)),
+            digest(ends.outside),
+            digest(ends.inside),
+        )
+    assert got_outside == hashlib.sha256(outward).hexdigest()
+    assert got_inside == hashlib.sha256(inward).hexdigest()
+    await quiet(proxy)
+    traffic = proxy.app._tcpros.traffic()
+    assert traffic.sent[("topic", "/chatter")] == len(outward)
+    assert traffic.received[("topic", "/chatter")] == len(inward)
+
+
+async def test_without_a_descriptor_for_a_pipe_bytes_are_copied(node, lease, monkeypatch):
+    def fail() -> None:
+        raise OSError(errno.EMFILE, "no descriptor left")
+
+    monkeypatch.setattr(os, "pipe", fail)
+    async with relayed(node, lease) as ends:
+        data = os.urandom(500_000)
+        _, got = await asyncio.gather(ends.inside.send(data), ends.outside.exactly(len(data)))
+        assert got == data
+
+
+async def test_single_messages_of_every_size_around_the_thresholds(node, lease):
+    async with relayed(node, lease) as ends:
+        for size in sorted({t + d for t in THRESHOLDS for d in (-1, 0, 1)} | {1, 1_000_000}):
+            data = os.urandom(size)
+            for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+                _, got = await asyncio.gather(one.send(data), other.exactly(size))
+                assert got == data, size
+
+
+async def test_a_port_that_many_want_is_asked_for_once(node, lease):
+    async with AsyncExitStack() as stack:
+        wires = [await stack.enter_async_context(connect(lease)) for _ in range(20)]
+        await asyncio.gather(*(wire.send(topic_header()) for wire in wires))
+        await asyncio.gather(*(read_header(wire) for wire in wires))
+    assert [name for name, _ in node.calls].count("requestTopic") == 1
+
+
+async def test_the_status_tells_of_open_connections(proxy, node, lease):
+    async with relayed(node, lease) as ends:
+        await ends.inside.send(b"x" * 1000)
+        await ends.outside.exactly(1000)
+        await until(lambda: proxy.app._tcpros.relays[0].sent, "the bytes are counted")
+        (shown,) = proxy.app.status()["nodes"][0]["connections"]
+        assert {**shown, "sent_rate": 0, "received_rate": 0} == {
+            "kind": "topic",
+            "name": "/chatter",
+            "caller_id": "/outside",
+            "peer": "127.0.1.9",
+            "sent": 1000,
+            "received": 0,
+            "sent_rate": 0,
+            "received_rate": 0,
+        }
+
+
+async def test_connections_leave_neither_descriptors_nor_threads(proxy, node, lease):
+    async def once(i: int) -> None:
+        async with connect(lease) as wire:
+            await wire.send(topic_header())
+            await read_header(wire)
+            await wire.send(b"x" * 40_000)
+            await wire.exactly(40_000)
+            if i % 3 == 0:
+                wire.reset()
+
+    for round_ in range(2):
+        await quiet(proxy)
+        before = len(os.listdir("/proc/self/fd")), threading.active_count()
+        for _ in range(4):
+            await asyncio.gather(*(once(i) for i in range(30 * (1 + round_))))
+        await quiet(proxy)
+    await asyncio.sleep(0.1)
+    assert len(os.listdir("/proc/self/fd")) <= before[0] + 2
+    assert threading.active_count() <= before[1]
+    assert proxy.endpoint(node).connections == 0
+
+
+@pytest.mark.parametrize("started", [0, 1])
+async def test_without_a_thread_left_a_connection_is_reset(
+    proxy, node, lease, monkeypatch, started
+):
+    async with relayed(node, lease):
+        pass
+    await quiet(proxy)
+    real, budget = threading.Thread.start, [started]
+
+    def start(thread: threading.Thread) -> None:
+        if thread.name.startswith("relay"):
+            if not budget[0]:
+                raise RuntimeError("can't start new thread")
+            budget[0] -= 1
+        real(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    before = len(os.listdir("/proc/self/fd"))
+    async with connect(lease) as wire:
+        await wire.send(topic_header() + b"says more")
+        assert await wire.end() == "reset"
+    await quiet(proxy)
+    assert proxy.endpoint(node).connections == 0
+    await until(lambda: len(os.listdir("/proc/self/fd")) <= before, "all is closed")
+
+
+async def test_a_lease_that_closes_keeps_its_connections(proxy, node, lease):
+    async with relayed(node, lease) as ends:
+        await node.slave.stop()
+        await until(lambda: refuses(lease), "the port refuses")
+        await ends.inside.send(b"still here")
+        assert await ends.outside.exactly(10) == b"still here"
+
+
+async def test_stopping_the_proxy_ends_its_connections(make_proxy, node):
+    proxy = await make_proxy()
+    await node.publish(proxy.master)
+    async with AsyncExitStack() as stack:
+        both = [await stack.enter_async_context(relayed(node, proxy.lease(node))) for _ in range(3)]
+        flood = asyncio.create_task(both[0].inside.send(b"x" * 50_000_000))
+        started = asyncio.get_running_loop().time()
+        await proxy.stop()
+        assert asyncio.get_running_loop().time() - started < 2
+        for ends in both[1:]:
+            assert await ends.outside.end() == "closed"
+            assert await ends.inside.end() == "closed"
+        await asyncio.gather(flood, return_exceptions=True)
+
+
+async def test_in_copy_mode_nothing_is_spliced(make_proxy, node, monkeypatch):
+    def fail(*_: Any) -> None:
+        raise AssertionError("spliced")
+
+    monkeypatch.setattr(os, "pipe", fail)
+    monkeypatch.setattr(os, "splice", fail)
+    proxy = await make_proxy(data_plane="copy")
+    await node.publish(proxy.master)
+    async with relayed(node, proxy.lease(node)) as ends:
+        data = random.Random(8).randbytes(3 * relay.BLOCK_SIZE + 17)
+        for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
+            _, got = await asyncio.gather(one.send(data), other.exactly(len(data)))
+            assert got == data
+
+
+async def test_a_subscriber_that_says_nothing_costs_one_thread(proxy, node, lease):
+    before = threading.active_count()
+    async with relayed(node, lease) as ends:
+        await ends.inside.send(b"message")
+        assert await ends.outside.exactly(7) == b"message"
+        assert threading.active_count() == before + 1
+        await ends.outside.send(b"says something")
+        assert await ends.inside.exactly(14) == b"says something"
+        assert threading.active_count() == before + 2
+    await quiet(proxy)
+
+
+async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, lease, monkeypatch):
+    monkeypatch.setattr(relay_set, "STARTS_PER_TURN", 3)
+    async with AsyncExitStack() as stack:
+        for _ in range(10):
+            await stack.enter_async_context(relayed(node, lease))
+        assert len(proxy.app._tcpros.relays) == 10
+    await quiet(proxy)
+
+
+async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
+    """The user's pages for pipes are not used up by the first streams."""
+    monkeypatch.setattr(relay, "LARGE_PIPES", 1)
+    sizes: list[int] = []
+    real = os.splice
+
+    def splice(source: int, target: int, size: int) -> int:
+        with suppress(OSError):
+            sizes.append(fcntl.fcntl(target, fcntl.F_GETPIPE_SZ))
+        return real(source, target, size)
+
+    monkeypatch.setattr(os, "splice", splice)
+    async with AsyncExitStack() as stack:
+        floods = []
+        for _ in range(3):
+            ends = await stack.enter_async_context(relayed(node, lease))
+            floods.append(asyncio.create_task(ends.inside.send(b"x" * 50_000_000)))
+        await until(lambda: len(set(sizes)) > 1, "a second stream is spliced")
+        for flood in floods:
+            flood.cancel()
+        await asyncio.gather(*floods, return_exceptions=True)
+    assert set(sizes) == {relay.PIPE_SIZE, relay.SHARED_PIPE}
+
+
+@pytest.mark.parametrize("plane", ["splice", "copy"])
+async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
+    make_proxy, node, monkeypatch, plane
+):
+    """At 1,000 saturated streams Linux dropped packets, and some streams got nothing."""
+    monkeypatch.setattr(relay, "CROWD", 1)
+    proxy = await make_proxy(data_plane=plane)
+    await node.publish(proxy.master)
+    async with AsyncExitStack() as stack:
+        streams = [await stack.enter_async_context(relayed(node, proxy.lease(node)))]
+        floods = [asyncio.create_task(flood(streams[0]))]
+        await until(lambda: buffers(proxy) != set(), "a stream runs")
+        assert buffers(proxy) != {SHARED}
+        streams.append(await stack.enter_async_context(relayed(node, proxy.lease(node))))
+        floods.append(asyncio.create_task(flood(streams[1])))
+        await until(lambda: buffers(proxy) == {SHARED}, "both share")
+        assert await asyncio.gather(*floods) == [FLOOD, FLOOD]
+    await quiet(proxy)
+
+
+SHARED = (2 * relay.SHARED_RECEIVE, 2 * relay.SHARED_SEND)
+"""Linux doubles what is asked for."""
+FLOOD = 100_000_000
+
+
+async def flood(ends: Ends) -> int:
+    """Many bytes from inside; how many arrive outside, where nobody hurries."""
+    sending = asyncio.create_task(ends.inside.send(bytes(FLOOD)))
+    await asyncio.sleep(1)
+    size = len(await ends.outside.exactly(FLOOD))
+    await sending
+    return size
+
+
+def buffers(proxy: Any) -> set[tuple[int, int]]:
+    """The sizes of the buffers towards outside of all relays, as (receive, send)."""
+    return {
+        (
+            one.inside.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF),
+            one.outside.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF),
+        )
+        for one in proxy.app._tcpros.relays
+    }
+
+
+async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):
+    """An unprivileged user's pipes shrink to two pages; splicing through them would crawl."""
+    monkeypatch.setattr(relay, "LEAST_PIPE", 2 * relay.PIPE_SIZE)
+    payload = random.Random(7).randbytes(3 * relay.BLOCK_SIZE + 17)
+    async with relayed(node, lease) as ends:
+        sending = asyncio.create_task(ends.inside.send(payload))
+        assert await ends.outside.exactly(len(payload)) == payload
+        await sending

@@ -1,0 +1,514 @@
+"""Nodes on the master's host, whose name leads to the proxy: reached at the same ports there."""
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from typing import Any
+
+import pytest
+
+from tests.integration.admin.test_admin import metrics
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.http_fake import End, ok
+from tests.integration.master import Master
+from tests.integration.net import (
+    MASTER,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    PROXY,
+    Where,
+    connect,
+    exchange,
+    knock,
+    post,
+    refuses,
+    rpc,
+    until,
+    where,
+    xml,
+)
+from tests.integration.node import Node, read_header, service_header, topic_header
+from tests.integration.proxy import Proxy
+
+BOTH_LOOPS = True
+MOVED = "127.0.1.2"
+"""Another address of the master's host."""
+
+
+def behind_its_name(master: Master, **options: Any) -> dict[str, Any]:
+    """Options of a proxy that stands in for the master's host; nodes there have its ports."""
+    port = where(master.uri)[1]
+    named = {"master_uri": f"http://robot:{port}", "master_address": MASTER}
+    return {**named, "bind": PROXY, "advertise_host": PROXY, **options}
+
+
+@pytest.fixture
+async def proxy(make_proxy: MakeProxy, master: Master) -> Proxy:
+    return await make_proxy(**behind_its_name(master))
+
+
+@pytest.fixture
+async def robot(make_node: MakeNode, master: Master) -> Node:
+    """A node on the master's host that publishes and serves."""
+    made = await make_node("/robot", MASTER, host="robot")
+    await made.publish(where(master.uri))
+    await made.serve(where(master.uri))
+    return made
+
+
+def slave(node: Node, address: str = PROXY) -> Where:
+    """Where inside finds a node's slave API."""
+    return address, node.slave.address[1]
+
+
+def service(node: Node, address: str = PROXY) -> Where:
+    """Where inside finds a node's services."""
+    return address, node.tcpros_port
+
+
+def mirrored(proxy: Proxy) -> dict[int, int]:
+    """The mirrored ports with their connections."""
+    return {row["port"]: row["connections"] for row in proxy.app.status()["mirrored"]}
+
+
+def problems(proxy: Proxy) -> dict[str, str]:
+    return {row["subject"]: row["text"] for row in proxy.app.status()["problems"]}
+
+
+async def look_up(proxy: Proxy, node: Node) -> Any:
+    """A node's slave URI as inside is given it."""
+    return (await rpc(proxy.master, "lookupNode", "/tool", node.name, source=NODE))[2]
+
+
+async def look_up_service(proxy: Proxy) -> Any:
+    return (await rpc(proxy.master, "lookupService", "/tool", "/add", source=NODE))[2]
+
+
+def real_master(proxy: Proxy) -> Where:
+    return MASTER, where(proxy.settings.master_uri)[1]
+
+
+async def by_subscribing(proxy: Proxy, robot: Node, node: Node) -> Any:
+    return (await node.subscribe(proxy.master))[2][0]
+
+
+async def by_publishing(proxy: Proxy, robot: Node, node: Node) -> Any:
+    await robot.subscribe(real_master(proxy))
+    return (await node.publish(proxy.master))[2][0]
+
+
+async def by_lookup(proxy: Proxy, robot: Node, node: Node) -> Any:
+    return await look_up(proxy, robot)
+
+
+async def by_multicall(proxy: Proxy, robot: Node, node: Node) -> Any:
+    calls = [
+        {"methodName": "getPid", "params": ["/tool"]},
+        {"methodName": "lookupNode", "params": ["/tool", "/robot"]},
+    ]
+    return (await rpc(proxy.master, "system.multicall", calls, source=NODE))[1][0][2]
+
+
+async def by_update(proxy: Proxy, robot: Node, node: Node) -> Any:
+    await node.subscribe(proxy.master, "/later")
+    await robot.publish(real_master(proxy), "/later")
+    await until(lambda: node.updates("/later"), "a publisherUpdate")
+    return node.updates("/later")[0][0]
+
+
+WAYS = [by_subscribing, by_publishing, by_lookup, by_multicall, by_update]
+
+
+@pytest.mark.parametrize("way", WAYS)
+async def test_whatever_way_a_uri_is_given_it_is_unchanged_and_its_port_is_open(
+    proxy: Proxy, robot: Node, node: Node, way: Callable[..., Awaitable[Any]]
+) -> None:
+    assert mirrored(proxy) == {}
+    assert await refuses(slave(robot), NODE)
+    assert await way(proxy, robot, node) == robot.uri
+    assert slave(robot)[1] in mirrored(proxy)
+    assert (await rpc(slave(robot), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
+
+
+async def test_the_port_is_open_before_the_update_arrives(
+    proxy: Proxy, robot: Node, node: Node, master: Master
+) -> None:
+    refused: list[bool] = []
+    run = node._run
+
+    def look(method: str, params: tuple[Any, ...]) -> list[Any]:
+        if method == "publisherUpdate":
+            with socket.socket() as probe:
+                refused.append(probe.connect_ex(slave(robot)) != 0)
+        return run(method, params)
+
+    node._run = look  # type: ignore[method-assign]
+    await node.subscribe(proxy.master, "/later")
+    await robot.publish(where(master.uri), "/later")
+    await until(lambda: refused, "a publisherUpdate")
+    assert refused == [False]
+
+
+async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: Node) -> None:
+    assert await look_up_service(proxy) == robot.service_api
+    assert mirrored(proxy) == {robot.tcpros_port: 0}
+    async with connect(service(robot), NODE) as wire:
+        await wire.send(service_header(caller="/tool"))
+        assert (await read_header(wire))["callerid"] == "/robot"
+        await wire.send(b"x" * 300_000)
+        assert await wire.exactly(300_000) == b"x" * 300_000
+        assert mirrored(proxy) == {robot.tcpros_port: 1}
+    assert robot.headers == [{"callerid": "/tool", "service": "/add", "md5sum": "*"}]
+    await until(lambda: mirrored(proxy) == {robot.tcpros_port: 0}, "the relay ends")
+
+
+async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
+    proxy: Proxy, robot: Node
+) -> None:
+    await look_up(proxy, robot)
+    asked = await rpc(slave(robot), "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
+    port = robot.tcpros_port
+    assert asked == [1, f"ready on {MASTER}:{port}", ["TCPROS", MASTER, port]]
+    assert port not in mirrored(proxy)
+    asked = await rpc(slave(robot), "requestTopic", "/n", "/no", [["TCPROS"]], source=NODE)
+    assert asked == [-1, "Not a publisher of [/no]", []]
+
+
+async def test_calls_pass_byte_for_byte_with_their_path(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    body = xml("anything", "/tool", {"a": [1, 2.5]}).replace(b"\n", b" ")
+    robot.answers["anything"] = ok(b"<methodResponse>whatever")
+    reply = await exchange(slave(robot), post(body, path="/10.0.0.5:40001/a%20b/?c=d"), NODE)
+    assert reply.body == b"<methodResponse>whatever"
+    sent = robot.requests[-1]
+    assert (sent.body, sent.path) == (body, "/10.0.0.5:40001/a%20b/?c=d")
+    assert sent.headers["host"] == f"robot:{slave(robot)[1]}"
+
+
+async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    for request in (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"PUT / HTTP/1.1\r\nHost: x\r\n\r\n"):
+        assert (await exchange(slave(robot), request, NODE)).status in (200, 405)
+    assert (await exchange(slave(robot), post(b"<a"), NODE)).fault == -32700
+    assert robot.requests == []
+
+
+async def test_a_body_beyond_the_bound_is_refused(
+    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await look_up(proxy, robot)
+    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
+    assert (await exchange(slave(robot), post(b"x" * 100_001), NODE)).status == 413
+    robot.answers["getPid"] = ok(b"x" * 100_001)
+    assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
+
+
+async def test_ends_and_resets_pass(proxy: Proxy, robot: Node) -> None:
+    ends: asyncio.Queue[Any] = asyncio.Queue()
+    over = asyncio.Event()
+
+    async def hold(node: Node, wire: Any, header: Any) -> None:
+        ends.put_nowait(wire)
+        await over.wait()
+
+    robot.stream = hold
+    await look_up_service(proxy)
+    async with connect(service(robot), NODE) as inside:
+        await inside.send(service_header())
+        outside = await ends.get()
+        await inside.half_close()
+        assert await outside.reader.read() == b""
+        await outside.send(b"still here")
+        assert await inside.exactly(10) == b"still here"
+        outside.reset()
+        assert await inside.end() == "reset"
+    async with connect(service(robot), NODE) as inside:
+        await inside.send(service_header())
+        outside = await ends.get()
+        inside.reset()
+        assert await outside.end() == "reset"
+    over.set()
+
+
+async def test_only_inside_is_let_in(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    await look_up_service(proxy)
+    for source in (OUTSIDE, MASTER, "127.0.0.1"):
+        assert await knock(slave(robot), post(xml("getPid", "/tool")), source) in _CLOSED
+        assert await knock(service(robot), service_header(), source) in _CLOSED
+    assert robot.calls == []
+    assert robot.headers == []
+
+
+_CLOSED = ("closed", "reset")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"master_address": None}, {"master_uri": "http://127.0.1.1:{port}"}],
+    ids=["no master address", "the master's host is an address"],
+)
+async def test_nothing_happens_without_need(
+    make_proxy: MakeProxy,
+    master: Master,
+    robot: Node,
+    options: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def resolve(host: str) -> list[str]:
+        return [MASTER]
+
+    monkeypatch.setattr("rosproxy.net.resolver.resolve", resolve)
+    port = where(master.uri)[1]
+    changed = {name: text and text.format(port=port) for name, text in options.items()}
+    proxy = await make_proxy(**behind_its_name(master, **changed))
+    assert await look_up(proxy, robot) == robot.uri
+    assert await look_up_service(proxy) == robot.service_api
+    assert mirrored(proxy) == {}
+    assert await refuses(slave(robot), NODE)
+
+
+async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
+    proxy: Proxy, master: Master, make_node: MakeNode
+) -> None:
+    for name, host in (("/one", MASTER), ("/two", "laptop")):
+        node = await make_node(name, MASTER, host=host)
+        await node.publish(where(master.uri))
+        assert await look_up(proxy, node) == node.uri
+    assert mirrored(proxy) == {}
+
+
+async def gone(proxy: Proxy, robot: Node) -> None:
+    """End a node whose ports are mirrored, and let inside find out."""
+    await robot.stop()
+    assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert await knock(service(robot), service_header(), NODE) == "reset"
+
+
+async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    await look_up_service(proxy)
+    await gone(proxy, robot)
+    for _ in range(2):
+        assert await refuses(slave(robot), NODE)
+        assert await refuses(service(robot), NODE)
+        assert mirrored(proxy) == {}
+        assert await look_up(proxy, robot) == robot.uri
+        assert await look_up_service(proxy) == robot.service_api
+    await robot.start()
+    assert await look_up(proxy, robot) == robot.uri
+    assert mirrored(proxy) == {slave(robot)[1]: 0}
+    assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == robot.pid
+
+
+async def test_open_relays_outlive_the_port(proxy: Proxy, robot: Node) -> None:
+    await look_up_service(proxy)
+    async with connect(service(robot), NODE) as wire:
+        await wire.send(service_header())
+        await read_header(wire)
+        assert robot._tcpros
+        robot._tcpros.close()
+        assert await knock(service(robot), service_header(), NODE) == "reset"
+        assert await refuses(service(robot), NODE)
+        await wire.send(b"hello")
+        assert await wire.exactly(5) == b"hello"
+
+
+async def test_a_node_that_does_not_answer_is_no_node_that_is_gone(
+    proxy: Proxy, robot: Node
+) -> None:
+    await look_up(proxy, robot)
+    robot.answers["getPid"] = End.RESET
+    assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert mirrored(proxy) == {slave(robot)[1]: 0}
+
+
+async def test_ports_that_the_proxy_needs_itself_are_a_problem(
+    proxy: Proxy, master: Master
+) -> None:
+    settings = proxy.settings
+    own = [settings.ports.listen.last, settings.master_port, settings.admin.port]
+    uris = [f"http://robot:{port}/" for port in own]
+    for uri in uris:
+        await rpc(master.uri, "registerPublisher", f"/{uri[-6:-1]}", "/t", "x/Y", uri)
+    seen = (await rpc(proxy.master, "registerSubscriber", "/n", "/t", "*", uris[0], source=NODE))[2]
+    assert seen == uris
+    assert mirrored(proxy) == {}
+    told = problems(proxy)
+    options = ("--port-range", "--master-port", "--admin-bind")
+    for uri, port, option in zip(uris, own, options, strict=True):
+        assert f"port {port} " in told[uri]
+        assert option in told[uri]
+        assert f"ROS_IP={MASTER}" in told[uri]
+
+
+async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(
+    proxy: Proxy, robot: Node, caplog: pytest.LogCaptureFixture
+) -> None:
+    with socket.socket() as other:
+        other.bind(slave(robot))
+        other.listen()
+        for _ in range(3):
+            assert await look_up(proxy, robot) == robot.uri
+        assert "in use" in problems(proxy)[robot.uri]
+        assert [record.message for record in caplog.records if robot.uri in record.message]
+    assert sum(robot.uri in record.message for record in caplog.records) == 1
+    await look_up(proxy, robot)
+    assert robot.uri not in problems(proxy)
+    assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == robot.pid
+
+
+async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
+    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as one, socket.socket() as other:
+        for taken, where_ in ((one, slave(robot)), (other, service(robot))):
+            taken.bind(where_)
+            taken.listen()
+        await look_up(proxy, robot)
+        await look_up_service(proxy)
+        await proxy.app._mirror.tidy()
+        assert set(problems(proxy)) == {robot.uri, robot.service_api}
+        await robot.stop()
+        await proxy.app._mirror.tidy()
+        assert set(problems(proxy)) == {robot.service_api}
+        monkeypatch.setattr("rosproxy.ros1.alias.alias.SERVICE_PROBLEM", 0.0)
+        await proxy.app._mirror.tidy()
+        assert problems(proxy) == {}
+
+
+async def test_the_proxys_own_ports_are_not_mirrored_where_it_shares_the_name(
+    make_proxy: MakeProxy, master: Master, node: Node
+) -> None:
+    proxy = await make_proxy(**behind_its_name(master, advertise_host="robot"))
+    await node.publish(proxy.master)
+    assert await look_up(proxy, node) == node.uri
+    assert mirrored(proxy) == {}
+    assert problems(proxy) == {}
+
+
+@pytest.fixture
+async def crowd(make_node: MakeNode, master: Master) -> list[Node]:
+    """Three nodes on the master's host."""
+    made = [await make_node(f"/r{i}", MASTER, host="robot") for i in range(3)]
+    for node in made:
+        await node.publish(where(master.uri), node.name)
+        await node.serve(where(master.uri), node.name)
+    return made
+
+
+async def test_ports_are_bounded_and_the_least_used_goes_first(
+    proxy: Proxy, crowd: list[Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
+    first, second, third = crowd
+    await look_up(proxy, first)
+    await look_up(proxy, second)
+    await look_up(proxy, first)
+    await look_up(proxy, third)
+    assert set(mirrored(proxy)) == {slave(first)[1], slave(third)[1]}
+    assert await refuses(slave(second), NODE)
+
+
+async def test_ports_in_use_are_kept(
+    proxy: Proxy, crowd: list[Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
+    async with AsyncExitStack() as stack:
+        for node in crowd[:2]:
+            await rpc(proxy.master, "lookupService", "/tool", node.name, source=NODE)
+            wire = await stack.enter_async_context(connect(service(node), NODE))
+            await wire.send(service_header())
+            await read_header(wire)
+        assert await look_up(proxy, crowd[2]) == crowd[2].uri
+        assert set(mirrored(proxy)) == {node.tcpros_port for node in crowd[:2]}
+        assert "one too many" in problems(proxy)[crowd[2].uri]
+    await until(lambda: set(mirrored(proxy).values()) == {0}, "the relays end")
+    await look_up(proxy, crowd[2])
+    assert crowd[2].uri not in problems(proxy)
+    assert slave(crowd[2])[1] in mirrored(proxy)
+
+
+async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    await look_up_service(proxy)
+    moved = Node("/moved", MOVED, host="robot")
+    moved.slave.address = MOVED, slave(robot)[1]
+    await moved.start()
+    moved.pid = 77
+    try:
+        proxy.app.context.upstream.master_address = MOVED
+        assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == 77
+        moved.published["/chatter"] = "std_msgs/String"
+        asked = await rpc(slave(robot), "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
+        assert asked[2] == ["TCPROS", MOVED, moved.tcpros_port]
+        assert await knock(service(robot), service_header(), NODE) == "reset"
+    finally:
+        await moved.stop()
+
+
+async def test_an_address_that_leads_back_makes_no_loop(
+    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await look_up(proxy, robot)
+    await look_up_service(proxy)
+    monkeypatch.setattr("rosproxy.ros1.alias.alias.address_towards", lambda address: address)
+    proxy.app.context.upstream.master_address = PROXY
+    assert await knock(service(robot), service_header(), NODE) == "reset"
+    assert await refuses(service(robot), NODE)
+    assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert robot.headers == []
+
+
+async def test_a_recovered_subscriber_is_given_open_ports(
+    proxy: Proxy, robot: Node, node: Node
+) -> None:
+    await node.subscribe(proxy.master)
+    node.calls.clear()
+    await proxy.restart()
+    assert mirrored(proxy) == {}
+    await until(node.updates, "a publisherUpdate by the proxy")
+    assert node.updates()[0] == [robot.uri]
+    assert mirrored(proxy) == {slave(robot)[1]: 0}
+
+
+async def test_nodes_on_the_masters_host_are_told_at_its_address(
+    proxy: Proxy, robot: Node, node: Node, master: Master
+) -> None:
+    """What the proxy itself tells outside subscribers goes to the master's address as well."""
+    await robot.subscribe(where(master.uri))
+    await node.publish(proxy.master)
+    robot.calls.clear()
+    await proxy.restart()
+    await until(robot.updates, "a publisherUpdate by the proxy")
+    assert robot.updates()[0] == [robot.uri]
+    assert mirrored(proxy) == {}
+
+
+async def test_mirrored_ports_are_measured(proxy: Proxy, robot: Node) -> None:
+    assert (await metrics(proxy))["rosproxy_mirrored_ports"] == 0
+    await look_up(proxy, robot)
+    await rpc(slave(robot), "getPid", "/tool", source=NODE)
+    found = await metrics(proxy)
+    assert found["rosproxy_mirrored_ports"] == 1
+    label = "{api=mirror,method=getPid,outcome=answered}"
+    assert found[f"rosproxy_xmlrpc_calls_total{label}"] == 1
+
+
+async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot: Node) -> None:
+    await look_up(proxy, robot)
+    await look_up_service(proxy)
+    async with connect(service(robot), NODE) as relayed, connect(slave(robot), NODE) as caller:
+        await relayed.send(topic_header())
+        await read_header(relayed)
+        await caller.send(post(xml("getPid", "/tool")))
+        await caller.reply()
+        await proxy.stop()
+        assert await relayed.outcome() in _CLOSED
+        assert await caller.outcome() in _CLOSED
+    assert await refuses(slave(robot), NODE)
+    assert await refuses(service(robot), OTHER_NODE)
+    await proxy.app._mirror.hand_over([robot.uri])
+    assert await refuses(slave(robot), NODE)

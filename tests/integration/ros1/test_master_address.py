@@ -1,0 +1,157 @@
+"""The master at a given address, whatever its name leads to; and that it may change."""
+
+import json
+
+import pytest
+
+from rosproxy.cli.admin_client import AdminClient
+from rosproxy.doctor.collect import Patient, survey
+from rosproxy.doctor.facts import Reach
+from tests.integration.admin_calls import post, tell
+from tests.integration.commands import admin_url, run
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.master import Master
+from tests.integration.net import MASTER, OUTSIDE, exchange, rpc, until, where
+from tests.integration.node import Node
+from tests.integration.proxy import Proxy
+
+ELSEWHERE = "127.0.1.2"
+NAME = "robot.invalid"
+
+
+def uri_by_name(master: Master) -> str:
+    return f"http://{NAME}:{where(master.uri)[1]}"
+
+
+async def master_status(proxy: Proxy) -> dict[str, object]:
+    address = (proxy.settings.admin.host, proxy.settings.admin.port)
+    reply = await exchange(address, b"GET /status HTTP/1.1\r\nHost: x\r\n\r\n")
+    found: dict[str, object] = json.loads(reply.body)["master"]
+    return found
+
+
+async def test_the_name_is_not_resolved_but_told(
+    make_proxy: MakeProxy, master: Master, node: Node
+) -> None:
+    proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
+    assert (await node.publish(proxy.master))[0] == 1
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+    told = {request.headers["host"] for request in master.requests}
+    assert told == {f"{NAME}:{where(master.uri)[1]}"}
+    found = await master_status(proxy)
+    assert (found["address"], found["pinned"], found["up"]) == (MASTER, True, True)
+
+
+async def test_without_it_the_status_tells_where_the_name_led(proxy: Proxy) -> None:
+    await until(lambda: proxy.app._watch.up, "the master is seen")
+    found = await master_status(proxy)
+    assert (found["address"], found["pinned"]) == (MASTER, False)
+
+
+async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: Master) -> None:
+    await master.stop()
+    port = where(master.uri)[1]
+    await master.start("127.0.0.1")
+    proxy = await make_proxy(master_uri=f"http://localhost:{port}")
+    await until(lambda: proxy.app._watch.up, "the master is seen")
+    assert (await master_status(proxy))["address"] in ("127.0.0.1", "::1")
+
+
+async def test_the_master_moves(
+    make_proxy: MakeProxy, master: Master, node: Node, make_node: MakeNode
+) -> None:
+    proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
+    await node.publish(proxy.master)
+    await master.stop()
+    await master.start(ELSEWHERE)
+    await until(lambda: not proxy.app._watch.up, "the master is missed")
+    assert await tell(proxy, "/master-address", address=ELSEWHERE) == {"address": ELSEWHERE}
+    await until(lambda: proxy.app._watch.up, "the master is found again")
+    assert (await master_status(proxy))["address"] == ELSEWHERE
+    late = await make_node("/late")
+    assert (await late.publish(proxy.master))[0] == 1
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node), proxy.uri(late)]
+
+
+async def test_two_masters_and_the_one_that_is_named_is_asked(
+    make_proxy: MakeProxy, master: Master, make_node: MakeNode
+) -> None:
+    """The connections that are kept to the former one are not used for the next."""
+    other = Master()
+    other._http.address = ("", where(master.uri)[1])
+    await other.start(ELSEWHERE)
+    try:
+        proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
+        await (await make_node("/one")).publish(proxy.master, "/a")
+        await tell(proxy, "/master-address", address=ELSEWHERE)
+        await (await make_node("/two")).publish(proxy.master, "/b")
+        assert not master.holds("publishers", "/b")
+        assert other.holds("publishers", "/b")
+        await until(lambda: other.holds("publishers", "/a"), "what it lacks is registered")
+    finally:
+        await other.stop()
+
+
+@pytest.mark.parametrize(
+    "body", ['{"address": "robot"}', "{}", '{"adress": "192.0.2.7"}', "nonsense"]
+)
+async def test_no_address(proxy: Proxy, body: str) -> None:
+    reply = await post(proxy, "/master-address", body)
+    assert reply.status == 400
+    assert b"address" in reply.body or b"the body: must be JSON" in reply.body
+    assert proxy.app.context.upstream.master_address is None
+
+
+async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(
+    make_proxy: MakeProxy, master: Master, node: Node
+) -> None:
+    proxy = await make_proxy(
+        master_uri=uri_by_name(master), master_address=MASTER, slave_control="master"
+    )
+    await node.publish(proxy.master)
+    assert (await rpc(proxy.lease(node), "paramUpdate", "/master", "/x", 1, source=MASTER))[0] == 1
+    assert (await rpc(proxy.lease(node), "paramUpdate", "/x", "/x", 1, source=OUTSIDE))[0] == -1
+
+
+async def test_an_outside_subscriber_on_the_masters_host_is_told_at_its_address(
+    make_proxy: MakeProxy, master: Master, node: Node, make_node: MakeNode
+) -> None:
+    """Its URI names the master's host: as the proxy starts again, it is told of the publisher."""
+    listener = await make_node("/listener", MASTER, NAME)
+    await listener.subscribe(where(master.uri))
+    proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
+    await node.publish(proxy.master)
+    await proxy.restart()
+    await until(lambda: [] in listener.updates(), "it is told that the publisher has gone")
+
+
+async def test_the_doctor_asks_the_master_at_its_address(
+    make_proxy: MakeProxy, master: Master, make_node: MakeNode
+) -> None:
+    on_its_host = await make_node("/on_robot", MASTER, NAME)
+    await on_its_host.publish(where(master.uri))
+    proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
+    facts = await survey(Patient(AdminClient(admin_url(proxy))))
+    assert facts.master is not None
+    assert (facts.master.addresses, facts.master.attempt.reach) == ((MASTER,), Reach.ANSWERED)
+    assert facts.nodes["/on_robot"].addresses == (MASTER,)
+    assert facts.nodes["/on_robot"].attempt.reach is Reach.ANSWERED
+
+
+async def test_the_doctor_without_a_proxy_is_told_the_address(master: Master) -> None:
+    patient = Patient(AdminClient("127.0.0.1:9"), uri_by_name(master), master_address=MASTER)
+    facts = await survey(patient)
+    assert facts.admin_error
+    assert facts.master is not None
+    assert facts.master.attempt.reach is Reach.ANSWERED
+
+
+async def test_the_doctors_option(master: Master) -> None:
+    words = ("doctor", "--admin", "127.0.0.1:9", "--master-uri", uri_by_name(master))
+    found = await run(*words, ROSPROXY_MASTER_ADDRESS=MASTER)
+    assert "resolve" not in found.out
+    wrong = await run(*words, ROSPROXY_MASTER_ADDRESS="robot")
+    assert (wrong.code, wrong.err) == (
+        2,
+        "rosproxy: --master-address: 'robot' is not an IP address\n",
+    )

@@ -1,0 +1,184 @@
+"""Inside nodes among themselves and with outside: whose address is given to whom."""
+
+import asyncio
+from ipaddress import ip_network
+
+import pytest
+
+from tests.integration.http_fake import HttpFake, value
+from tests.integration.net import (
+    HOST,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    PROXY,
+    THIRD_NODE,
+    connect,
+    knock,
+    post,
+    refuses,
+    rpc,
+    until,
+    xml,
+)
+from tests.integration.node import Node, greet, service_header, topic_header
+
+
+@pytest.fixture
+async def twins(make_node):
+    """Two nodes in containers of their own that give the very same URI."""
+    first = await make_node("/first", NODE, host="localhost")
+    second = Node("/second", OTHER_NODE, host="localhost")
+    second.slave.address = OTHER_NODE, first.slave.address[1]
+    await second.start()
+    yield first, second
+    await second.stop()
+
+
+async def test_nodes_that_give_the_same_uri_are_told_apart(proxy, master, twins):
+    first, second = twins
+    assert first.uri == second.uri
+    for node in twins:
+        await node.publish(proxy.master, f"{node.name}/out")
+        await node.serve(proxy.master, f"{node.name}/add")
+    assert proxy.uri(first) != proxy.uri(second)
+    for node in twins:
+        assert master.holds("publishers", f"{node.name}/out") == [proxy.uri(node)]
+        assert (await rpc(proxy.uri(node), "getPid", "/outside"))[2] == node.pid
+        header = await greet(proxy.lease(node), service_header(f"{node.name}/add"))
+        assert header["callerid"] == node.name
+
+
+async def test_each_sees_itself_literally_and_the_other_through_the_proxy(proxy, twins):
+    first, second = twins
+    await first.publish(proxy.master)
+    await second.publish(proxy.master)
+    seen = (await second.subscribe(proxy.master))[2]
+    port = proxy.endpoint(first).port
+    relayed = f"http://{PROXY}:{port}/localhost:{first.slave.address[1]}/{NODE}/"
+    assert seen == [relayed, second.uri]
+    asked = await rpc(relayed, "requestTopic", "/second", "/chatter", [["TCPROS"]], source=NODE)
+    assert asked[2] == ["TCPROS", PROXY, port]
+    assert (await greet((PROXY, port), topic_header()))["callerid"] == "/first"
+
+
+async def test_a_service_of_a_neighbour_without_a_usable_name_is_relayed(proxy, twins, make_node):
+    first, _ = twins
+    asker = await make_node("/asker", THIRD_NODE)
+    await first.serve(proxy.master)
+    found = await asker.call(proxy.master, "lookupService", "/add")
+    assert found[2] == f"rosrpc://{PROXY}:{proxy.endpoint(first).port}"
+    assert (await first.call(proxy.master, "lookupService", "/add"))[2] == first.service_api
+
+
+async def test_a_tool_inside_can_unregister_whatever_it_was_told_of(proxy, master, make_node):
+    tool = await make_node("/tool", THIRD_NODE)
+    direct, relayed = (
+        await make_node("/direct"),
+        await make_node("/relayed", OTHER_NODE, "x.invalid"),
+    )
+    for node in (direct, relayed):
+        await node.publish(proxy.master)
+        await node.serve(proxy.master, f"{node.name}/add")
+    far = f"http://{OUTSIDE}:4000/"
+    await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
+    for name in ("/direct", "/relayed", "/far"):
+        uri = (await tool.call(proxy.master, "lookupNode", name))[2]
+        gone = await rpc(
+            proxy.master, "unregisterPublisher", name, "/chatter", uri, source=tool.address
+        )
+        assert gone[2] == 1, (name, uri)
+    for name in ("/direct", "/relayed"):
+        api = (await tool.call(proxy.master, "lookupService", f"{name}/add"))[2]
+        gone = await rpc(
+            proxy.master, "unregisterService", name, f"{name}/add", api, source=tool.address
+        )
+        assert gone[2] == 1, (name, api)
+    assert master.book.nodes == {}
+    assert not any(e.registrations for e in proxy.app.context.registry)
+
+
+async def test_an_offer_of_udpros_passes_unharmed(proxy, node):
+    await node.publish(proxy.master)
+    reply = [1, "", ["UDPROS", NODE, 4321, 7, 1500, b"header"]]
+    node.answers["requestTopic"] = value(reply)
+    offer = [["UDPROS", b"\0\1binary", OUTSIDE, 1234, 1500], ["TCPROS"]]
+    asked = await rpc(proxy.uri(node), "requestTopic", "/outside", "/chatter", offer)
+    assert asked[:2] == reply[:2]
+    assert asked[2][:3] == ["UDPROS", NODE, 4321]
+    assert asked[2][5].data == b"header"
+    seen = node.calls[-1][1][2]
+    assert (seen[0][1].data, seen[0][2:], seen[1]) == (
+        b"\0\1binary",
+        [OUTSIDE, 1234, 1500],
+        ["TCPROS"],
+    )
+
+
+async def test_a_parameter_reaches_its_subscriber(proxy, node):
+    await node.call(proxy.master, "subscribeParam", node.uri, "/p")
+    await rpc(proxy.uri(node), "paramUpdate", "/master", "/p", {"a": [1, 2.5, True]})
+    assert node.calls[-1] == ("paramUpdate", ("/master", "/p", {"a": [1, 2.5, True]}))
+
+
+async def test_an_update_does_not_overtake_the_registration_before_it(proxy, master, node):
+    await node.subscribe(proxy.master, "/other")
+    uri, master.delay = proxy.uri(node), 0.2
+    registering = asyncio.create_task(node.subscribe(proxy.master))
+    await until(lambda: proxy.endpoint(node).pending, "the registration is on its way")
+    far = f"http://{OUTSIDE}:4000/"
+    await rpc(uri, "publisherUpdate", "/master", "/chatter", [far])
+    assert registering.done()
+    assert await registering == [1, "subscribed", []]
+    assert node.updates() == [[far]]
+
+
+async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_proxy, make_node):
+    proxy = await make_proxy(ports=1, linger=0.0)
+    former, next_ = await make_node("/former"), await make_node("/next", OTHER_NODE)
+    await former.publish(proxy.master)
+    old, lease = proxy.uri(former), proxy.lease(former)
+    async with connect(lease) as kept:
+        await kept.send(post(xml("getPid", "/outside")))
+        await kept.reply()
+        await former.call(proxy.master, "unregisterPublisher", "/chatter", former.uri)
+        await until(lambda: refuses(lease), "the lease ends")
+        assert await kept.end() in ("closed", "reset")
+    await next_.publish(proxy.master)
+    assert proxy.lease(next_) == lease
+    path = old.partition(str(lease[1]))[2]
+    assert await knock(lease, post(xml("shutdown", "/master", "moved"), path=path)) == "reset"
+    assert "shutdown" not in dict(next_.calls)
+    # roscpp gives no path: then the port alone counts.
+    assert (await rpc(lease, "getPid", "/outside"))[2] == next_.pid
+
+
+async def test_outside_nodes_are_never_touched(proxy, master, node):
+    """What has nothing to do with the proxy passes as it is: URIs, services, other hosts."""
+    stranger = HttpFake(node._respond)
+    await stranger.start(OUTSIDE)
+    far = f"http://{OUTSIDE}:{stranger.address[1]}/"
+    await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
+    await rpc(master.uri, "registerService", "/far", "/far/add", f"rosrpc://{OUTSIDE}:5", far)
+    near_miss = f"http://{HOST}:{proxy.settings.ports.listen.first}/elsewhere/"
+    await rpc(master.uri, "registerPublisher", "/odd", "/chatter", "std_msgs/String", near_miss)
+    assert (await node.subscribe(proxy.master))[2] == [far, near_miss]
+    assert (await node.call(proxy.master, "lookupNode", "/far"))[2] == far
+    assert (await node.call(proxy.master, "lookupService", "/far/add"))[
+        2
+    ] == f"rosrpc://{OUTSIDE}:5"
+    assert await knock((HOST, proxy.settings.ports.listen.last), b"x") == "refused"
+    assert stranger.connections == 0
+    await stranger.stop()
+
+
+async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(
+    make_proxy, make_node, monkeypatch: pytest.MonkeyPatch
+):
+    networks = [ip_network("127.0.5.0/24")]
+    monkeypatch.setattr("rosproxy.ros1.context.interface_networks", lambda: tuple(networks))
+    proxy = await make_proxy(inside_network=())
+    talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
+    networks.append(ip_network("127.0.2.0/24"))
+    await talker.publish(proxy.master)
+    assert (await listener.subscribe(proxy.master))[2] == [talker.uri]

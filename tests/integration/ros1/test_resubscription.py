@@ -1,0 +1,169 @@
+"""Subscribers outside that have no connection after a restart are told again; no others are."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+
+import pytest
+
+from rosproxy import app
+from rosproxy.ros1.upkeep.resubscription import resubscriber
+from tests.integration.http_fake import End
+from tests.integration.http_fake import value as answer
+from tests.integration.master import Master
+from tests.integration.net import OTHER_NODE, OUTSIDE, THIRD_NODE, connect, refuses, rpc, until
+from tests.integration.node import Node, read_header, topic_header
+from tests.integration.proxy import Proxy
+
+LOOKS = (0.8, 1.6)
+"""Seconds after which the proxy of these tests looks; long enough to connect before."""
+AFTERWARDS = 2.2
+
+
+@pytest.fixture(autouse=True)
+def _early(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resubscriber, "LOOKS", LOOKS)
+    monkeypatch.setattr(app, "SILENT_TICK", 0.05)
+
+
+@pytest.fixture
+async def talker(make_node: Any, proxy: Proxy) -> Node:
+    node: Node = await make_node("/talker")
+    await node.publish(proxy.master)
+    return node
+
+
+async def make_ear(
+    make_node: Any, master: Master, name: str, address: str = OUTSIDE, topic: str = "/chatter"
+) -> Node:
+    """A node that the master has as a subscriber, outside unless told otherwise."""
+    node: Node = await make_node(name, address)
+    await rpc(master.uri, "registerSubscriber", name, topic, "std_msgs/String", node.uri)
+    return node
+
+
+@asynccontextmanager
+async def listening(proxy: Proxy, publisher: Node, name: str) -> AsyncIterator[None]:
+    """A subscriber's connection for /chatter, as roscpp makes it."""
+    async with connect(proxy.lease(publisher)) as wire:
+        await wire.send(topic_header(caller=name))
+        await read_header(wire)
+        yield
+
+
+async def served(proxy: Proxy, *nodes: Node) -> None:
+    """Wait until the nodes are served."""
+    for node in nodes:
+        await until(partial(known, proxy, node), f"{node.name} is recovered")
+
+
+def known(proxy: Proxy, node: Node) -> bool:
+    keys = [e.key for e in proxy.app.context.registry if e.trusted]
+    return (node.address, node.slave.address[1]) in keys
+
+
+async def told(node: Node, *uris: str) -> None:
+    """Wait until a node knows exactly these publishers of /chatter."""
+    await until(lambda: [{*some} for some in node.updates()[-1:]] == [{*uris}], f"{uris} are told")
+
+
+async def test_who_has_no_connection_is_told_at_each_look(proxy, talker, master, make_node):
+    lost = await make_ear(make_node, master, "/lost")
+    await proxy.restart()
+    await served(proxy, talker)
+    uri = proxy.uri(talker)
+    often = [[], [uri]] * (1 + len(LOOKS))
+    await until(lambda: lost.updates() == often, "it is told after the start and at each look")
+    await asyncio.sleep(1)
+    assert lost.updates() == often
+
+
+async def test_who_has_a_connection_is_left_alone(proxy, talker, master, make_node):
+    lost = await make_ear(make_node, master, "/lost")
+    kept = await make_ear(make_node, master, "/kept", "127.0.1.8")
+    await proxy.restart()
+    await served(proxy, talker)
+    uri = proxy.uri(talker)
+    await told(kept, uri)
+    async with listening(proxy, talker, "/kept"):
+        lost.calls.clear()
+        kept.calls.clear()
+        await until(lambda: lost.updates() == [[], [uri]] * len(LOOKS), "the other one is told")
+        assert set(map(tuple, kept.updates())) == {(uri,)}
+
+
+async def test_only_the_publisher_without_connection_is_withdrawn(proxy, talker, master, make_node):
+    other = await make_node("/other", OTHER_NODE)
+    await other.publish(proxy.master)
+    far = "http://127.0.1.7:4000/"
+    await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
+    ear = await make_ear(make_node, master, "/ear")
+    await proxy.restart()
+    await served(proxy, talker, other)
+    uris = {proxy.uri(talker), proxy.uri(other), far}
+    await told(ear, *uris)
+    async with listening(proxy, talker, "/ear"):
+        ear.calls.clear()
+        await until(lambda: len(ear.updates()) >= 2, "it is told at a look")
+        assert [set(uris) for uris in ear.updates()[:2]] == [{proxy.uri(talker), far}, uris]
+        assert all(proxy.uri(talker) in uris for uris in ear.updates())
+
+
+async def test_who_is_served_by_udpros_is_left_alone(proxy, talker, master, make_node):
+    ear = await make_ear(make_node, master, "/ear")
+    row = [0, "/ear", "o", "UDPROS", "/chatter", True, "UDPROS connection"]
+    talker.answers["getBusInfo"] = answer([1, "bus info", [row]])
+    await proxy.restart()
+    await served(proxy, talker)
+    await told(ear, proxy.uri(talker))
+    ear.calls.clear()
+    await asyncio.sleep(AFTERWARDS)
+    assert [] not in ear.updates()
+
+
+@pytest.mark.parametrize("hang", [True, False], ids=["hangs", "says nothing of use"])
+async def test_a_publisher_that_does_not_tell_its_connections_hinders_nobody(
+    proxy, talker, master, make_node, hang
+):
+    ear = await make_ear(make_node, master, "/ear")
+    talker.answers["getBusInfo"] = End.HANG if hang else answer([0, "not implemented", 0])
+    await proxy.restart()
+    await served(proxy, talker)
+    await told(ear, proxy.uri(talker))
+    ear.calls.clear()
+    await until(lambda: [] in ear.updates(), "it is told at a look")
+
+
+async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, make_node):
+    neighbour = await make_node("/neighbour", THIRD_NODE)
+    await neighbour.subscribe(proxy.master)
+    await proxy.restart()
+    await served(proxy, talker, neighbour)
+    await asyncio.sleep(AFTERWARDS)
+    assert [] not in neighbour.updates()
+
+
+async def test_a_subscriber_that_is_gone_hinders_nobody(proxy, talker, master, make_node):
+    gone = await make_ear(make_node, master, "/gone")
+    ear = await make_ear(make_node, master, "/ear", "127.0.1.8")
+    await gone.stop()
+    await proxy.restart()
+    await served(proxy, talker)
+    await told(ear, proxy.uri(talker))
+    ear.calls.clear()
+    await until(lambda: [] in ear.updates(), "it is told at a look")
+    await told(ear, proxy.uri(talker))
+
+
+async def test_who_lost_a_node_that_did_not_answer_for_a_time_is_told(
+    proxy, talker, master, make_node
+):
+    ear = await make_ear(make_node, master, "/ear")
+    lease = proxy.lease(talker)
+    await talker.slave.stop()
+    await until(lambda: refuses(lease), "its port refuses")
+    await talker.slave.start(talker.address, talker.slave.address[1])
+    await until(lambda: [] in ear.updates(), "it is told at a look")
+    await told(ear, proxy.uri(talker))

@@ -1,0 +1,131 @@
+"""What may be posted to the admin endpoint, and that each mistake names its field."""
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.admin.requests import (
+    Arrival,
+    BodyError,
+    ContainerNews,
+    read_master_address,
+    read_news,
+    read_nothing,
+)
+
+GOOD: list[tuple[Any, ContainerNews]] = [
+    ({}, ContainerNews()),
+    ({"gone": []}, ContainerNews()),
+    ({"gone": ["172.18.0.5", "fd00::5"]}, ContainerNews(gone=("172.18.0.5", "fd00::5"))),
+    ({"gone": ["::ffff:172.18.0.5"]}, ContainerNews(gone=("172.18.0.5",))),
+    ({"moved": {"172.18.0.5": "172.18.0.9"}}, ContainerNews(moved={"172.18.0.5": "172.18.0.9"})),
+    (
+        {"arrived": [{"address": "172.18.0.7", "names": ["Talker", "3f2a91c0b7de", "a.b-c_d"]}]},
+        ContainerNews(
+            arrived=(Arrival("172.18.0.7", frozenset({"talker", "3f2a91c0b7de", "a.b-c_d"})),)
+        ),
+    ),
+    ({"arrived": [{"address": "172.18.0.7"}]}, ContainerNews(arrived=(Arrival("172.18.0.7"),))),
+]
+
+
+@pytest.mark.parametrize(("body", "news"), GOOD)
+def test_news(body: Any, news: ContainerNews) -> None:
+    assert read_news(body) == news
+
+
+BAD: list[tuple[Any, str]] = [
+    (None, "the body: must be a JSON object, not null"),
+    ([], "the body: must be a JSON object, not a list"),
+    ("gone", "the body: must be a JSON object, not 'gone'"),
+    (1, "the body: must be a JSON object, not a number"),
+    (True, "the body: must be a JSON object, not true or false"),
+    ({"goen": []}, "the body: unknown field 'goen'; known: gone, moved, arrived"),
+    ({"gone": "172.18.0.5"}, "gone: must be a list, not '172.18.0.5'"),
+    ({"gone": {}}, "gone: must be a list, not an object"),
+    ({"gone": ["a", 1]}, "gone[0]: must be an IP address such as 172.18.0.5, not 'a'"),
+    ({"gone": ["10.0.0.1", 1]}, "gone[1]: must be an IP address such as 172.18.0.5, not a number"),
+    ({"gone": ["0.0.0.0"]}, "gone[0]: must be"),
+    ({"gone": ["224.0.0.1"]}, "gone[0]: must be"),
+    ({"gone": ["fe80::1%eth0"]}, "gone[0]: must be"),
+    ({"gone": ["10.0.0.0/24"]}, "gone[0]: must be"),
+    ({"moved": []}, "moved: must be a JSON object, not a list"),
+    ({"moved": {"c1": "10.0.0.1"}}, "moved: must be an IP address such as 172.18.0.5, not 'c1'"),
+    ({"moved": {"10.0.0.1": "c1"}}, "moved['10.0.0.1']: must be an IP address"),
+    ({"moved": {"10.0.0.1": None}}, "moved['10.0.0.1']: must be an IP address"),
+    ({"arrived": {}}, "arrived: must be a list, not an object"),
+    ({"arrived": ["10.0.0.1"]}, "arrived[0]: must be a JSON object, not '10.0.0.1'"),
+    ({"arrived": [{}]}, "arrived[0].address: must be an IP address such as 172.18.0.5, not null"),
+    (
+        {"arrived": [{"address": "10.0.0.1", "name": "x"}]},
+        "arrived[0]: unknown field 'name'; known: address, names",
+    ),
+    (
+        {"arrived": [{"address": "10.0.0.1", "names": "x"}]},
+        "arrived[0].names: must be a list, not 'x'",
+    ),
+    (
+        {"arrived": [{"address": "10.0.0.1", "names": ["x", "/y"]}]},
+        "arrived[0].names[1]: must be a host name, not '/y'",
+    ),
+    ({"arrived": [{"address": "10.0.0.1", "names": [""]}]}, "arrived[0].names[0]: must be"),
+    ({"arrived": [{"address": "10.0.0.1", "names": [7]}]}, "arrived[0].names[0]: must be"),
+]
+
+
+@pytest.mark.parametrize(("body", "complaint"), BAD)
+def test_a_mistake_names_its_field(body: Any, complaint: str) -> None:
+    with pytest.raises(BodyError) as caught:
+        read_news(body)
+    assert str(caught.value).startswith(complaint)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
+FIELDS = st.sampled_from(["gone", "moved", "arrived", "address", "names"])
+
+
+def complaint_of(read: Callable[[Any], object], body: Any) -> str:
+    try:
+        read(body)
+    except BodyError as error:
+        return str(error)
+    return ""
+
+
+@given(st.dictionaries(FIELDS, JSON) | JSON)
+def test_anything_else_is_a_mistake_in_one_short_line(body: Any) -> None:
+    for read in (read_news, read_master_address, read_nothing):
+        complaint = complaint_of(read, json.loads(json.dumps(body)))
+        assert "\n" not in complaint
+        assert len(complaint) < 200
+
+
+def test_a_master_address() -> None:
+    assert read_master_address({"address": "192.0.2.7"}) == "192.0.2.7"
+
+
+@pytest.mark.parametrize("body", [{}, {"address": "robot"}, {"address": None}, [], {"adress": "x"}])
+def test_a_bad_master_address(body: Any) -> None:
+    with pytest.raises(BodyError, match=r"address|the body"):
+        read_master_address(body)
+
+
+def test_no_body() -> None:
+    read_nothing({})
+    with pytest.raises(BodyError, match="unknown field 'x'; known: none"):
+        read_nothing({"x": 1})
+
+
+def test_what_a_container_is_called() -> None:
+    arrival = Arrival("172.18.0.7", frozenset({"talker"}))
+    assert arrival.is_called("172.18.0.7")
+    assert arrival.is_called("TALKER")
+    assert not arrival.is_called("172.18.0.8")
+    assert not arrival.is_called("talker.local")

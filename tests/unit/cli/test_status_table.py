@@ -1,0 +1,206 @@
+"""``rosproxy status`` as text."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.cli.status_table import render
+from rosproxy.telemetry.text import width
+from tests.unit.status_json import make_connection, make_node, make_status
+
+
+def lines_of(*nodes: dict[str, Any], columns: int = 120, **parts: Any) -> list[str]:
+    return render(make_status(*nodes, **parts), columns).split("\n")
+
+
+def test_head_of_a_proxy_without_nodes() -> None:
+    assert lines_of() == [
+        "rosproxy 0.1.0, pid 42, up 1 min",
+        "master   http://robot:11311 up for 1 min, round trip 1.2 ms (pid 7)",
+        "ports    robot-host:45000-45099: 0 used, 100 free",
+        "inside   ROS_MASTER_URI=http://<this host>:11311, networks 10.0.0.0/24",
+        "",
+        "No node has registered through the proxy yet.",
+    ]
+
+
+def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
+    lines = lines_of(
+        ports={"advertise": "46000-46099", "blocked": 2, "free": 98},
+        settings={"publish_master": 11411, "inside_networks": []},
+    )
+    assert lines[2] == (
+        "ports    robot-host:46000-46099, here 45000-45099: 0 used, 98 free, "
+        "2 held by other programs"
+    )
+    assert lines[3].endswith("networks none")
+    assert lines[4] == "outside  ROS_MASTER_URI=http://robot-host:11411"
+
+
+def test_head_names_mirrored_ports() -> None:
+    status = make_status()
+    status["mirrored"] = []
+    assert "mirrored" not in render(status, 120)
+    status["mirrored"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
+    assert (
+        "mirrored 7 ports of nodes on the master's host (14 connections): "
+        "40001, 40002, 40003, 40004, 40005 and 2 more"
+    ) in render(status, 120).split("\n")
+
+
+@pytest.mark.parametrize(
+    ("master", "line"),
+    [
+        (
+            {"up": False, "error": "master http://robot:11311: connection refused"},
+            "master   http://robot:11311 DOWN for 1 min: connection refused",
+        ),
+        ({"up": False, "error": ""}, "master   http://robot:11311 not asked yet"),
+        ({"round_trip": None}, "master   http://robot:11311 up for 1 min (pid 7)"),
+    ],
+)
+def test_master_line(master: dict[str, Any], line: str) -> None:
+    assert lines_of(master=master)[1] == line
+
+
+def test_a_node_with_everything() -> None:
+    node = make_node(
+        subscribes=["/clock"],
+        services=["/talker/get_loggers"],
+        parameters=["/rate"],
+        connections=[make_connection(), make_connection(caller_id="", sent=12, sent_rate=50.0)],
+    )
+    assert lines_of(node)[5:] == [
+        "NODE     INSIDE          OUTSIDE           STATE  PUB  SUB  SRV  CONN       OUT     IN",
+        "/talker  10.0.0.5:40001  robot-host:45000  ok       1    1    1     2  1.2 kB/s  0 B/s",
+        "    publishes  /chatter",
+        "    subscribes /clock",
+        "    services   /talker/get_loggers",
+        "    parameters /rate",
+        "    connected  topic /chatter with /listener at 192.168.0.9: 3.4 MB out, 120 B in",
+        "    connected  topic /chatter with ? at 192.168.0.9: 12 B out, 120 B in",
+    ]
+
+
+def test_nodes_that_share_an_address_and_one_without_a_name() -> None:
+    lines = lines_of(make_node(nodes=["/manager", "/nodelet"]), make_node(nodes=[], publishes=[]))
+    assert lines[6].startswith("/manager +1  ")
+    assert "    also       /nodelet" in lines
+    assert lines[-1].startswith("(unnamed)    10.0.0.5:40001")
+
+
+def test_long_lists_are_cut() -> None:
+    node = make_node(
+        publishes=[f"/topic_{number}" for number in range(100)],
+        connections=[make_connection() for _ in range(20)],
+    )
+    lines = lines_of(node, columns=80)
+    assert [line for line in lines if "/topic_" in line][-1].endswith(" …")
+    assert sum("/topic_" in line for line in lines) == 3
+    assert sum("connected " in line for line in lines) == 8
+    assert lines[-1] == "    … 12 connections more"
+
+
+def test_a_narrow_terminal_gives_addresses_a_line_of_their_own() -> None:
+    node = make_node("/a/very/long/node/name/of/some/driver_1795249066559")
+    lines = lines_of(node, columns=60)
+    heading = lines[lines.index("") + 1]
+    assert heading.split() == ["NODE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN"]
+    assert "    at         10.0.0.5:40001, outside robot-host:45000" in lines
+    assert max(map(width, lines)) <= 60
+
+
+@pytest.mark.parametrize("columns", [60, 80, 100, 120, 200])
+def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
+    node = make_node("/節點/" + "名" * 40, connections=[make_connection()], services=["/s"] * 50)
+    problem = {"age": 3.0, "subject": "/節點", "text": "does not answer " * 10}
+    lines = lines_of(node, make_node(), columns=columns, problems=[problem])
+    assert max(map(width, lines)) <= columns
+
+
+def test_problems_stand_at_the_end() -> None:
+    problem = {"age": 125.0, "subject": "/talker", "text": "does not answer"}
+    masters = {"age": 3.0, "subject": "master", "text": "told by the master's line"}
+    lines = lines_of(make_node(), problems=[problem, masters])
+    assert lines[-3:] == [
+        "",
+        "problems (rosproxy doctor looks into them):",
+        "  2 min ago  /talker: does not answer",
+    ]
+
+
+def test_names_cannot_reach_the_terminal() -> None:
+    evil = "\x1b]0;owned\x07\n\u202e"
+    node = make_node(
+        nodes=[evil, evil],
+        state=evil,
+        publishes=[evil],
+        subscribes=[evil],
+        services=[evil],
+        parameters=[evil],
+        advertised_uri=evil,
+        connections=[make_connection(caller_id=evil, name=evil, kind=evil, peer=evil)],
+        address=evil,
+    )
+    text = render(
+        make_status(
+            node,
+            problems=[{"age": 1.0, "subject": evil, "text": evil}],
+            master={"uri": evil, "error": evil, "up": False},
+        ),
+        120,
+    )
+    assert all(line.isprintable() for line in text.split("\n"))
+
+
+def test_a_short_screen_shows_problems_before_nodes() -> None:
+    problem = {"age": 1.0, "subject": "/talker", "text": "gone"}
+    nodes = [make_node(f"/node_{number}", 45000 + number) for number in range(20)]
+    text = render(make_status(*nodes, problems=[problem]), 120, lines=12)
+    lines = text.split("\n")
+    assert len(lines) == 12
+    assert "  1.0 s ago  /talker: gone" in lines
+    assert "publishes" not in text
+    assert lines[-1] == "… 18 lines more: rosproxy status"
+
+
+def test_a_screen_that_is_long_enough_shows_details() -> None:
+    status = make_status(make_node())
+    assert render(status, 120, lines=50) == render(status, 120)
+
+
+def a_plane(**changes: Any) -> dict[str, Any]:
+    return {
+        "plane": "kernel",
+        "port": 45050,
+        "reason": "",
+        "connections": 2,
+        "sent": 3_400_000,
+        "received": 120,
+        "sent_rate": 1200.0,
+        "received_rate": 10.0,
+        **changes,
+    }
+
+
+def planes(*nodes: dict[str, Any], **whole: str) -> str:
+    status = make_status(*nodes)
+    status["data_plane"] = {"mode": "auto", "plane": "kernel", "reason": ""} | whole
+    return render(status, 120)
+
+
+def test_the_kernels_connections_count_as_the_proxys_own() -> None:
+    text = planes(make_node(data_plane=a_plane(), connections=[make_connection()]))
+    assert "topics   forwarded by the kernel (--data-plane auto)" in text
+    row = next(line for line in text.split("\n") if line.startswith("/talker"))
+    assert row.split()[-5:] == ["3", "2.4", "kB/s", "10", "B/s"]
+    assert "kernel     2 connections through port 45050: 3.4 MB out, 120 B in as IP packets" in text
+
+
+def test_why_a_node_is_not_forwarded_is_told_where_others_are() -> None:
+    plane = a_plane(plane="splice", port=None, reason="port 45050 is in use", connections=0)
+    node = make_node(data_plane=plane)
+    assert "kernel     not used: port 45050 is in use" in planes(node)
+    text = planes(node, plane="splice", reason="nft is not installed")
+    assert "topics   relayed by the proxy (splice): nft is not installed" in text
+    assert "not used" not in text

@@ -1,0 +1,80 @@
+"""How findings are shown."""
+
+from rosproxy.doctor.findings import Finding, Severity, as_json, failed, render
+from rosproxy.doctor.rules import diagnose
+from tests.unit.doctor.cases import make_facts
+
+OK = Finding(Severity.OK, "ports", "ports", "100 free")
+NOTE = Finding(Severity.INFO, "node", "nodes", "3 registered")
+WARNING = Finding(Severity.WARNING, "time", "", "no clock", "rosparam set")
+ERROR = Finding(Severity.ERROR, "node", "/talker", "gone", "rosnode cleanup")
+
+
+def test_a_sound_system_gives_no_errors() -> None:
+    findings = diagnose(make_facts())
+    assert {f.severity for f in findings} == {Severity.OK}
+    assert render(findings, 100).endswith("\n\nNothing wrong was found.")
+    assert not failed(findings)
+
+
+def test_the_worst_stands_last_each_with_what_mends_it() -> None:
+    assert render([ERROR, WARNING, NOTE, OK, ERROR], 80).split("\n") == [
+        "ok       ports: 100 free",
+        "note     nodes: 3 registered",
+        "WARNING  no clock",
+        "         > rosparam set",
+        "ERROR    /talker: gone",
+        "ERROR    /talker: gone",
+        "         > rosnode cleanup",
+        "",
+        "2 errors, 1 warning.",
+    ]
+
+
+def test_only_errors_fail() -> None:
+    assert failed([OK, ERROR])
+    assert not failed([OK, NOTE, WARNING])
+
+
+def test_as_json() -> None:
+    assert as_json([OK, ERROR]) == {
+        "ok": False,
+        "findings": [
+            {
+                "severity": "ok",
+                "check": "ports",
+                "subject": "ports",
+                "text": "100 free",
+                "fix": "",
+            },
+            {
+                "severity": "error",
+                "check": "node",
+                "subject": "/talker",
+                "text": "gone",
+                "fix": "rosnode cleanup",
+            },
+        ],
+    }
+
+
+def test_many_of_a_kind_are_counted() -> None:
+    many = [Finding(Severity.ERROR, "stale", f"/node_{n}", "gone", "cleanup") for n in range(300)]
+    lines = render(many, 80).split("\n")
+    assert lines[9:12] == [
+        "ERROR    /node_9: gone",
+        "         ... and 290 more like this (stale): see --json",
+        "         > cleanup",
+    ]
+    assert lines[-1] == "300 errors, 0 warnings."
+
+
+def test_names_cannot_reach_the_terminal() -> None:
+    evil = Finding(Severity.ERROR, "node", "\x1b[2J", "\x1b]0;owned\x07\r", "\u202ehcum os")
+    assert all(line.isprintable() for line in render([evil], 80).split("\n"))
+
+
+def test_commands_are_not_torn_apart() -> None:
+    command = "docker run -p 45000-45099:45000-45099"
+    text = render([Finding(Severity.ERROR, "range", "range", "x " * 60, command)], 30)
+    assert "45000-45099:45000-45099" in text

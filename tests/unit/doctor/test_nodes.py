@@ -1,0 +1,233 @@
+"""What the doctor says of nodes."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.doctor.facts import Attempt, Facts, Graph, Node, Reach
+from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.rules import node as node_rules
+from tests.unit.doctor.cases import (
+    ANSWERED,
+    INSIDE_URI,
+    by_name,
+    listener,
+    make_facts,
+    make_master,
+    only,
+    talker,
+    without_proxy,
+)
+from tests.unit.status_json import make_node, make_status
+
+REFUSED = Attempt(Reach.REFUSED)
+
+
+def check(facts: Facts) -> list[Finding]:
+    return [*node_rules.check(facts)]
+
+
+def faults(facts: Facts) -> list[Finding]:
+    return [f for f in check(facts) if f.severity >= Severity.WARNING]
+
+
+def inside(**changes: Any) -> Finding:
+    """The finding on a node behind the proxy."""
+    return only(check(make_facts(status=make_status(make_node(**changes)))))
+
+
+def outside(**changes: Any) -> Finding:
+    """The finding on a node that the master knows."""
+    return only(check(make_facts(nodes=by_name(listener(**changes)))))
+
+
+def test_sound_nodes_are_counted() -> None:
+    assert [(f.severity, f.subject, f.text) for f in check(make_facts())] == [
+        (Severity.OK, "inside nodes", "1 of 1 answer"),
+        (Severity.OK, "nodes at the master", "2 registered, none with faults"),
+    ]
+
+
+def test_nobody_uses_the_proxy() -> None:
+    found = only(check(make_facts(status=make_status(), nodes={})))
+    assert (found.severity, found.text) == (
+        Severity.WARNING,
+        "none has registered through the proxy",
+    )
+    assert "ROS_MASTER_URI=http://PROXY:11311" in found.fix
+
+
+def test_a_node_that_listens_on_loopback_only() -> None:
+    found = inside(uri="http://127.0.0.1:40001/", state="refused")
+    assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
+    assert "listens on loopback only" in found.text
+    assert found.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
+
+
+def test_a_roscpp_node_on_loopback_answers_probes_and_is_a_fault_all_the_same() -> None:
+    """Its slave API listens everywhere, its TCPROS server on loopback only."""
+    found = inside(uri="http://localhost:40001/", state="ok")
+    assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
+    assert "listens on loopback only" in found.text
+
+
+def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
+    node = make_node(uri="http://localhost:40001/", address="127.0.0.1:40001")
+    node["advertised_uri"] = make_node()["advertised_uri"]
+    assert not faults(make_facts(status=make_status(node)))
+
+
+@pytest.mark.parametrize(
+    ("state", "severity", "text", "fix"),
+    [
+        ("refused", Severity.ERROR, "10.0.0.5:40001 refuses connections", "unregisters it 30 s"),
+        ("silent", Severity.ERROR, "does not answer at 10.0.0.5:40001", "nc -vz 10.0.0.5 40001"),
+        ("failing", Severity.WARNING, "did not answer the last probe", "look again"),
+        ("unverified", Severity.WARNING, "found at the master when the proxy started", "wait"),
+        ("cleaned", Severity.WARNING, "was unregistered", "restart it"),
+    ],
+)
+def test_a_node_behind_the_proxy_that_does_not_answer(
+    state: str, severity: Severity, text: str, fix: str
+) -> None:
+    found = inside(state=state)
+    assert (found.severity, found.subject) == (severity, "/talker")
+    assert text in found.text
+    assert fix in found.fix
+
+
+def test_a_dead_node_with_clean_up_switched_off() -> None:
+    status = make_status(make_node(state="refused"), settings={"cleanup_after": 0})
+    assert "rosnode cleanup" in only(check(make_facts(status=status))).fix
+
+
+def test_two_nodes_of_one_name() -> None:
+    nodes = by_name(talker(uri="http://192.168.0.9:4/", attempt=ANSWERED))
+    found = only(check(make_facts(nodes=nodes)))
+    assert "two nodes have this name" in found.text
+    assert "__name:=" in found.fix
+
+
+def test_a_registration_with_a_port_that_nobody_holds() -> None:
+    nodes = by_name(Node("/old", "http://robot-host:45007/10.0.0.9:4/"))
+    found = only(check(make_facts(nodes=nodes)))
+    assert (found.check, found.subject) == ("stale registration", "/old")
+    assert "a port that no node holds any more" in found.text
+    assert found.fix == "rosnode cleanup (answer y)"
+
+
+def test_a_registration_with_a_port_that_another_node_holds() -> None:
+    nodes = by_name(Node("/old", "http://robot-host:45000/10.0.0.9:4/"))
+    assert "a port that /talker holds by now" in only(check(make_facts(nodes=nodes))).text
+
+
+def test_nodes_that_share_a_lease_are_sound() -> None:
+    status = make_status(make_node(nodes=["/manager", "/talker"]))
+    nodes = by_name(talker(), Node("/manager", INSIDE_URI))
+    assert not faults(make_facts(status=status, nodes=nodes))
+
+
+def test_a_node_that_is_gone() -> None:
+    found = outside(attempt=REFUSED)
+    assert (found.check, found.text) == (
+        "stale registration",
+        "registered as http://192.168.0.9:35001/, but gone: connection refused",
+    )
+    assert found.fix == "rosnode cleanup (answer y)"
+
+
+def test_a_port_that_somebody_else_has_by_now() -> None:
+    found = outside(attempt=Attempt(Reach.STRANGER, "HTTP status 404"))
+    assert "but gone: something else answers (HTTP status 404)" in found.text
+
+
+def test_a_node_that_is_cut_off() -> None:
+    found = outside(attempt=Attempt(Reach.SILENT))
+    assert "no answer at http://192.168.0.9:35001/" in found.text
+    assert "nc -vz 192.168.0.9 35001" in found.fix
+
+
+def test_a_host_name_that_is_unknown_here() -> None:
+    found = outside(uri="http://laptop:4000/", attempt=Attempt(Reach.UNRESOLVABLE))
+    assert "the host name laptop can't be resolved here" in found.text
+    assert "ROS_IP=ADDRESS" in found.fix
+    assert "docker run --add-host laptop:ADDRESS" in found.fix
+
+
+def test_a_container_that_uses_the_real_master() -> None:
+    found = outside(uri="http://3f2a9c1b7d10:4000/", attempt=Attempt(Reach.UNRESOLVABLE))
+    assert "looks like a container that uses the real master, past the proxy" in found.text
+    assert "ROS_MASTER_URI=http://PROXY:11311" in found.fix
+
+
+def test_a_node_in_an_inside_network_that_has_registered_past_the_proxy() -> None:
+    found = outside(uri="http://10.0.0.7:4000/", addresses=("10.0.0.7",))
+    assert found.severity is Severity.WARNING
+    assert "registered past it" in found.text
+
+
+def test_no_such_suspicion_where_the_master_is_in_that_network_too() -> None:
+    nodes = by_name(listener(uri="http://10.0.0.7:4000/", addresses=("10.0.0.7",)))
+    facts = make_facts(nodes=nodes, master=make_master(addresses=("10.0.0.1",)))
+    assert not faults(facts)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
+def test_an_outside_node_that_calls_itself_loopback(host: str) -> None:
+    found = outside(uri=f"http://{host}:4000/")
+    assert "to every other machine that is the machine itself" in found.text
+    assert "ROS_IP=ADDRESS" in found.fix
+
+
+def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
+    nodes = by_name(listener(uri="http://localhost:4000/"))
+    assert not faults(make_facts(nodes=nodes, master=make_master(addresses=("127.0.0.1",))))
+
+
+def test_an_address_that_is_none() -> None:
+    assert "no usable address for it: ''" in outside(uri="").text
+
+
+def test_a_node_left_from_other_settings_of_the_proxy() -> None:
+    found = outside(uri="http://robot-host:47000/10.0.0.5:40001/", attempt=REFUSED)
+    assert "registered through a rosproxy" in found.text
+    assert "if this proxy had robot-host:47000 before" in found.fix
+
+
+def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
+    facts = without_proxy(nodes=by_name(talker(attempt=REFUSED)))
+    found = only(check(facts))
+    assert "on robot-host: rosproxy doctor" in found.fix
+    assert "cleanup" not in found.fix
+
+
+def test_a_service_with_a_port_that_nobody_holds() -> None:
+    graph = Graph({}, {}, {"/add": ["/listener"], "/other": ["/listener"]})
+    uris = {"/add": "rosrpc://robot-host:45009", "/other": "rosrpc://192.168.0.9:4"}
+    found = only(check(make_facts(graph=graph, service_uris=uris)))
+    assert (found.subject, found.check) == ("/listener", "stale registration")
+    assert "its service /add is registered as rosrpc://robot-host:45009" in found.text
+
+
+def test_simulated_time_without_a_clock() -> None:
+    assert "nobody publishes /clock" in only(check(make_facts(clock=True))).text
+    graph = Graph({"/clock": ["/talker"]}, {}, {})
+    assert not faults(make_facts(clock=True, graph=graph))
+
+
+def test_names_leave_out_what_is_said_of_others() -> None:
+    nodes = by_name(talker(), listener(), listener(name="/dead", attempt=REFUSED))
+    assert not check(make_facts(nodes=nodes, names=("/chatter",)))
+    graph = Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener", "/dead"]}, {})
+    facts = make_facts(nodes=nodes, names=("/chatter",), graph=graph)
+    assert [f.subject for f in check(facts)] == ["/dead"]
+
+
+def test_a_proxy_whose_advertised_name_is_unknown_here() -> None:
+    nodes = by_name(talker(attempt=Attempt(Reach.UNRESOLVABLE)))
+    assert "--advertise-host ADDRESS" in only(check(without_proxy(nodes=nodes))).fix
+
+
+def test_a_dead_node_on_the_proxys_own_machine() -> None:
+    found = inside(address="127.0.0.1:4", uri="http://localhost:4/", state="refused")
+    assert "has ended" in found.text

@@ -1,0 +1,240 @@
+"""What the doctor says of the names that it is asked about."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from rosproxy.doctor.facts import Attempt, Facts, Graph, Node, Reach, Words, scope
+from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.rules import pair as pair_rules
+from tests.unit.doctor.cases import (
+    INSIDE_URI,
+    OUTSIDE_URI,
+    by_name,
+    listener,
+    make_facts,
+    only,
+    talker,
+)
+from tests.unit.status_json import make_connection, make_node, make_status
+
+STRING = "std_msgs/String"
+GRAPH = Graph(
+    {"/chatter": ["/talker"], "/a": ["/listener"], "/b": ["/talker"], "/rosout": ["/talker"]},
+    {"/chatter": ["/listener", "/other"], "/c": ["/other"], "/rosout": ["/rosout"]},
+    {"/add": ["/adder"]},
+)
+
+
+def check(names: Sequence[str], **changes: Any) -> list[Finding]:
+    return [*pair_rules.check(make_facts(names=tuple(names), **changes))]
+
+
+def apart(giver: Node, taker: Node, **changes: Any) -> Finding:
+    """The finding on a publisher and a subscriber that are not connected."""
+    (found,) = check(["/chatter"], nodes=by_name(giver, taker), **changes)
+    assert found.severity is Severity.ERROR
+    assert found.subject == "/chatter from /talker to /listener"
+    assert found.text.startswith("not connected: ")
+    return found
+
+
+def silent_talker(**changes: Any) -> Node:
+    """A publisher that nobody is connected to."""
+    return talker(**{"words": Words({"/chatter": STRING}), **changes})
+
+
+@pytest.mark.parametrize(
+    ("names", "pairs", "lonely", "nodes"),
+    [
+        (
+            ["/chatter"],
+            [("/chatter", "/talker", "/listener"), ("/chatter", "/talker", "/other")],
+            [],
+            {"/talker", "/listener", "/other"},
+        ),
+        (["/listener"], [("/chatter", "/talker", "/listener")], ["/a"], {"/listener", "/talker"}),
+        (["/talker", "/other"], [("/chatter", "/talker", "/other")], ["/b", "/c"], None),
+        (["/chatter", "/other"], [("/chatter", "/talker", "/other")], [], None),
+        (["/a"], [], ["/a"], {"/listener"}),
+        (["/rosout"], [("/rosout", "/talker", "/rosout")], [], {"/talker", "/rosout"}),
+        (["/add"], [], [], {"/adder"}),
+        ([], [], [], set()),
+    ],
+)
+def test_what_names_lead_to(
+    names: list[str],
+    pairs: list[tuple[str, str, str]],
+    lonely: list[str],
+    nodes: set[str] | None,
+) -> None:
+    found = scope(GRAPH, names)
+    assert (found.pairs, found.lonely) == (pairs, lonely)
+    assert nodes is None or found.nodes == nodes
+
+
+def test_without_names_nothing_is_said() -> None:
+    assert not check([])
+
+
+def test_without_a_graph_that_is_said() -> None:
+    (found,) = check(["/chatter"], graph=None)
+    assert found.severity is Severity.INFO
+
+
+def test_a_name_that_nobody_knows() -> None:
+    found = only(check(["/chater"]))
+    assert found.text.endswith("; there is /chatter")
+    found = only(check(["/listener2", "/nothing"])[:1])
+    assert "/listener" in found.text
+
+
+def test_a_name_without_its_namespace() -> None:
+    graph = Graph({"/robot1/scan": ["/talker"]}, {}, {})
+    assert "there is /robot1/scan" in only(check(["/scan"], graph=graph)).text
+
+
+@pytest.mark.parametrize(
+    ("graph", "text"),
+    [
+        (
+            Graph({"/chatter": ["/talker"], "/ns/chatter": []}, {"/ns/chatter": ["/listener"]}),
+            "published by /talker; nobody subscribes to it",
+        ),
+        (
+            Graph({"/ns/chatter": ["/talker"]}, {"/chatter": ["/listener"]}),
+            "subscribed to by /listener; nobody publishes it",
+        ),
+    ],
+)
+def test_a_topic_with_one_side_only(graph: Graph, text: str) -> None:
+    found = only(check(["/chatter"], graph=graph))
+    assert found.text == text
+    assert found.fix.startswith("there is also /ns/chatter: a namespace or remapping?")
+
+
+def test_the_lonely_topics_of_a_node_are_no_error() -> None:
+    graph = Graph({"/chatter": ["/talker"]}, {}, {})
+    (found,) = check(["/talker"], graph=graph)
+    assert (found.subject, found.severity) == ("/chatter", Severity.INFO)
+
+
+def test_nodes_with_nothing_in_common() -> None:
+    graph = Graph({"/a": ["/talker"]}, {"/b": ["/listener"]}, {})
+    found = only(check(["/talker", "/listener"], graph=graph))
+    assert found.subject == "/talker and /listener"
+    assert found.fix.startswith("compare: rosnode info /talker /listener")
+
+
+def test_a_topic_that_a_node_has_nothing_to_do_with() -> None:
+    nodes = by_name(talker(), listener(), listener(name="/other"))
+    graph = Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener"], "/c": ["/other"]}, {})
+    assert only(check(["/chatter", "/other"], graph=graph, nodes=nodes)).check == "pair"
+
+
+def test_a_connected_pair_with_what_it_moves() -> None:
+    status = make_status(make_node(connections=[make_connection()]))
+    (found,) = check(["/chatter"], status=status)
+    assert (found.severity, found.text) == (
+        Severity.OK,
+        "connected, 3.4 MB so far, 1.2 kB/s just now",
+    )
+
+
+def test_the_subscribers_word_counts_where_the_publisher_cannot_be_asked() -> None:
+    peers = frozenset({("i", "/chatter", INSIDE_URI)})
+    nodes = by_name(talker(words=None), listener(words=Words({}, {"/chatter": STRING}, peers)))
+    (found,) = check(["/chatter"], nodes=nodes)
+    assert found.text == "connected"
+
+
+def test_the_publishers_word_counts_more() -> None:
+    peers = frozenset({("i", "/chatter", INSIDE_URI)})
+    taker = listener(words=Words({}, {"/chatter": STRING}, peers))
+    apart(silent_talker(), taker)
+
+
+def test_a_node_that_cannot_be_reached() -> None:
+    status = make_status(make_node(state="silent"))
+    assert "/talker can't be reached" in apart(silent_talker(), listener(), status=status).text
+    taker = listener(attempt=Attempt(Reach.SILENT), words=None)
+    assert "/listener can't be reached" in apart(silent_talker(), taker).text
+    gone = silent_talker(uri="http://robot-host:45050/10.0.0.9:1/")
+    assert "/talker can't be reached" in apart(gone, listener()).text
+
+
+def test_nodes_that_deny_what_the_master_says() -> None:
+    giver = talker(words=Words())
+    assert "/talker says that it does not publish it" in apart(giver, listener()).text
+    taker = listener(words=Words())
+    assert "/listener says that it is not subscribed" in apart(silent_talker(), taker).text
+
+
+def test_types_that_differ() -> None:
+    taker = listener(words=Words({}, {"/chatter": "std_msgs/Int32"}))
+    found = apart(silent_talker(), taker)
+    assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
+
+
+def test_any_type_fits_all() -> None:
+    taker = listener(words=Words({}, {"/chatter": "*"}))
+    assert "types differ" not in apart(silent_talker(), taker).text
+
+
+def test_a_subscriber_outside_that_does_not_come() -> None:
+    found = apart(silent_talker(), listener())
+    assert "/listener has not come to robot-host:45000" in found.text
+    assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
+
+
+def outside_pair(data_port: tuple[str, Attempt]) -> Finding:
+    """A publisher outside whose data port was tried."""
+    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
+    ports = {("/talker", "/chatter"): data_port}
+    return apart(giver, listener(), data_ports=ports)
+
+
+def test_a_data_port_that_cannot_be_reached() -> None:
+    found = outside_pair(("laptop:5000", Attempt(Reach.UNRESOLVABLE)))
+    assert "/talker gives laptop:5000 as its data port, host name unknown" in found.text
+    assert "ROS_IP=ADDRESS" in found.fix
+    found = outside_pair(("", Attempt(Reach.STRANGER, "no TCPROS address")))
+    assert "gives nothing as its data port" in found.text
+    assert "(no TCPROS address)" in found.text
+
+
+def test_a_data_port_on_loopback() -> None:
+    found = outside_pair(("127.0.0.1:5000", Attempt(Reach.ANSWERED)))
+    assert "which is loopback" in found.text
+
+
+def test_what_is_left_is_the_message_definition() -> None:
+    found = outside_pair(("192.168.0.9:5000", Attempt(Reach.ANSWERED)))
+    assert "md5sum" in found.text
+
+
+SERVICE_GRAPH = Graph({}, {}, {"/add": ["/talker"]})
+
+
+def service(attempt: Attempt) -> Finding:
+    """The finding on a service."""
+    (found,) = check(
+        ["/add"],
+        graph=SERVICE_GRAPH,
+        service_uris={"/add": "rosrpc://robot-host:45000"},
+        services={"/add": attempt},
+    )
+    return found
+
+
+def test_services() -> None:
+    assert service(Attempt(Reach.ANSWERED)).severity is Severity.OK
+    dead = service(Attempt(Reach.REFUSED))
+    assert dead.text == "/talker provides it at rosrpc://robot-host:45000: connection refused"
+    assert "rosnode cleanup" in dead.fix
+    assert "ROS_IP" in service(Attempt(Reach.UNRESOLVABLE)).fix
+
+
+def test_no_facts_at_all() -> None:
+    assert not [*pair_rules.check(Facts())]

@@ -1,0 +1,225 @@
+"""What the doctor says of the proxy, its master and its ports."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.doctor.facts import Attempt, Facts, Reach
+from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.rules import proxy as proxy_rules
+from tests.unit.doctor.cases import (
+    make_facts,
+    make_master,
+    only,
+    probes,
+    without_proxy,
+)
+from tests.unit.status_json import make_node, make_status
+
+
+def check(facts: Facts) -> list[Finding]:
+    return [*proxy_rules.check(facts)]
+
+
+def of(check_name: str, facts: Facts) -> list[Finding]:
+    return [f for f in check(facts) if f.check == check_name]
+
+
+def test_a_sound_proxy() -> None:
+    assert [(f.severity, f.check) for f in check(make_facts())] == [
+        (Severity.OK, "admin"),
+        (Severity.OK, "master"),
+        (Severity.OK, "published range"),
+        (Severity.OK, "ports"),
+    ]
+
+
+def test_no_proxy_answers() -> None:
+    found = only(check(without_proxy()))
+    assert (found.severity, found.check) == (Severity.ERROR, "admin")
+    assert "no rosproxy answers" in found.text
+    assert "docker exec CONTAINER rosproxy doctor" in found.fix
+
+
+def test_a_look_from_outside_does_not_ask_for_a_proxy() -> None:
+    findings = check(without_proxy(admin_error="", advertise_host=""))
+    assert [f.check for f in findings] == ["master"]
+
+
+def test_without_proxy_and_settings_the_checks_say_what_they_need() -> None:
+    facts = without_proxy(master=None, advertise_host="", advertised_addresses=())
+    notes = [f for f in check(facts) if f.severity is Severity.INFO]
+    assert [f.fix.split(" ")[1] for f in notes] == ["--master-uri", "--advertise-host"]
+
+
+@pytest.mark.parametrize(
+    ("master", "text", "fix"),
+    [
+        (make_master(Reach.REFUSED), "no roscore runs there", "on robot: roscore -p 11311"),
+        (make_master(Reach.SILENT), "does not answer", "nc -vz robot 11311"),
+        (
+            make_master(Reach.UNRESOLVABLE, addresses=()),
+            "the host name robot can't be resolved here",
+            "docker run --add-host robot:ADDRESS",
+        ),
+        (
+            make_master(
+                Reach.STRANGER, "HTTP status 404", uri="http://robot:11311/x", at_root=True
+            ),
+            "not at the path /x (it knows only / and /RPC2)",
+            "--master-uri http://robot:11311/",
+        ),
+        (
+            make_master(Reach.STRANGER, "HTTP status 404"),
+            "is no ROS master (HTTP status 404)",
+            "--master-uri http://HOST:11311",
+        ),
+        (
+            make_master(Reach.STRANGER, looped=True),
+            "leads back to this proxy itself",
+            "--master-uri http://HOST:11311",
+        ),
+        (
+            make_master(Reach.REFUSED, uri="http://localhost:11311", addresses=("127.0.0.1",)),
+            "In a container localhost is the container itself",
+            "--master-uri http://ADDRESS:11311",
+        ),
+    ],
+)
+def test_the_master_is_not_there(master: Any, text: str, fix: str) -> None:
+    found = only(check(make_facts(master=master, graph=None)))
+    assert (found.severity, found.check) == (Severity.ERROR, "master")
+    assert text in found.text
+    assert fix in found.fix
+
+
+def test_the_master_answers_the_doctor_but_not_the_proxy() -> None:
+    status = make_status(make_node(), master={"up": False, "error": "no answer in time"})
+    found = only(check(make_facts(status=status)))
+    assert found.severity is Severity.WARNING
+    assert "answers here, but the proxy says: no answer in time" in found.text
+
+
+def test_a_proxy_that_has_not_asked_its_master_yet_is_sound() -> None:
+    status = make_status(make_node(), master={"up": False, "error": ""})
+    assert not [f for f in check(make_facts(status=status)) if f.severity > Severity.INFO]
+
+
+def test_a_master_that_keeps_its_state_to_itself() -> None:
+    assert "does not tell its state" in only(check(make_facts(graph=None))).text
+
+
+def test_a_loopback_address_is_advertised() -> None:
+    found = only(of("advertised host", make_facts(advertise_host="127.0.0.1")))
+    assert found.severity is Severity.ERROR
+    assert "--advertise-host ADDRESS" in found.fix
+
+
+@pytest.mark.parametrize(
+    "master",
+    [
+        make_master(uri="http://localhost:11311"),
+        make_master(addresses=("127.0.1.1",)),
+    ],
+)
+def test_loopback_is_fine_where_all_is_on_one_machine(master: Any) -> None:
+    assert not of("advertised host", make_facts(advertise_host="127.0.0.1", master=master))
+
+
+def test_an_advertised_name_that_is_unknown_here() -> None:
+    found = only(of("advertised host", without_proxy(advertised_addresses=())))
+    assert "robot-host can't be resolved here" in found.text
+
+
+@pytest.mark.parametrize(
+    ("outcome", "severity", "text", "fix"),
+    [
+        (("ok", "ok"), Severity.OK, "the master reaches robot-host, port 45001 and 45099", ""),
+        (("ok", "unknown"), Severity.OK, "the master could not be asked", ""),
+        (("refused", "ok"), Severity.OK, "(the proxy itself does not, refused: no harm)", ""),
+        (
+            ("ok", "missed"),
+            Severity.ERROR,
+            "reached from here, but not from the master's machine",
+            "nc -vz robot-host 45099",
+        ),
+        (
+            ("refused", "missed"),
+            Severity.ERROR,
+            "The master does not get through either",
+            "docker run -p 46000-46099:45000-45099, and let it through the firewall",
+        ),
+        (("silent", "missed"), Severity.ERROR, "a firewall drops it", "docker run -p"),
+        (("refused", "unknown"), Severity.WARNING, "only the way back is missing", "docker run -p"),
+        (("closed", "unknown"), Severity.ERROR, "takes the connection and drops it", "docker run"),
+        (("stranger", "missed"), Severity.ERROR, "something else answers there", "docker run -p"),
+        (
+            ("unresolvable", "missed"),
+            Severity.ERROR,
+            "the host name is unknown here",
+            "--advertise-host ADDRESS instead of a name",
+        ),
+    ],
+)
+def test_tries_at_the_published_range(
+    outcome: tuple[str, str], severity: Severity, text: str, fix: str
+) -> None:
+    status = make_status(make_node(), ports={"advertise": "46000-46099"})
+    (found,) = of("published range", make_facts(status=status, probe=probes(outcome, outcome)))
+    assert found.severity is severity
+    assert text in found.text
+    assert fix in found.fix
+
+
+def test_a_range_that_is_published_in_part() -> None:
+    facts = make_facts(probe=probes(("ok", "ok"), ("refused", "missed")))
+    found = only(of("published range", facts))
+    assert found.text.startswith("robot-host, port 45099: nothing listens there")
+    assert found.fix == "publish the whole range: docker run -p 45000-45099:45000-45099"
+
+
+def test_a_range_that_could_not_be_tried() -> None:
+    found = only(of("published range", make_facts(probe=None, probe_error="HTTP 500")))
+    assert (found.severity, found.text) == (Severity.WARNING, "not tried: HTTP 500")
+
+
+def test_no_port_is_left_to_try() -> None:
+    assert not of("published range", make_facts(probe={"probes": []}))
+
+
+@pytest.mark.parametrize(
+    ("ports", "severity", "text"),
+    [
+        ({"used": 100, "free": 0}, Severity.ERROR, "none is free, 100 used"),
+        ({"used": 95, "free": 5}, Severity.WARNING, "only 5 left, 95 used"),
+        ({"used": 90, "free": 10}, Severity.OK, "90 used, 10 free"),
+    ],
+)
+def test_how_many_ports_are_left(ports: dict[str, int], severity: Severity, text: str) -> None:
+    (found,) = of("ports", make_facts(status=make_status(ports=ports)))
+    assert found.severity is severity
+    assert text in found.text
+
+
+def test_ports_that_other_programs_hold() -> None:
+    found = only(of("ports", make_facts(status=make_status(ports={"blocked": 1, "free": 99}))))
+    assert found.text == "1 port of the range 45000-45099 held by other programs"
+    assert "ss -ltnp 'sport >= :45000 and sport <= :45099'" in found.fix
+
+
+@pytest.mark.parametrize(
+    ("attempt", "outcome", "severity"),
+    [
+        (Attempt(Reach.ANSWERED), ("ok", "ok"), Severity.OK),
+        (Attempt(Reach.REFUSED), ("ok", "ok"), Severity.ERROR),
+        (Attempt(Reach.REFUSED), ("refused", "ok"), Severity.WARNING),
+    ],
+)
+def test_the_published_master(
+    attempt: Attempt, outcome: tuple[str, str], severity: Severity
+) -> None:
+    status = make_status(make_node(), settings={"publish_master": 11411})
+    facts = make_facts(status=status, published_master=attempt, probe=probes(outcome, outcome))
+    (found,) = of("published master", facts)
+    assert found.severity is severity
+    assert "http://robot-host:11411" in found.text

@@ -1,0 +1,51 @@
+"""Replies to the doctor, sound and broken."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.doctor.facts import Graph, Words
+from rosproxy.doctor.replies import data_port, graph, words
+from rosproxy.net.addresses import HostPort
+
+
+def test_graph() -> None:
+    state = [[["/t", ["/a", "/b"]]], [["/t", ["/c"]]], [["/s", ["/a"]]]]
+    assert graph(state) == Graph({"/t": ["/a", "/b"]}, {"/t": ["/c"]}, {"/s": ["/a"]})
+
+
+@pytest.mark.parametrize("state", [None, "x", 7, [], [1, 2, 3], [[["/t"]], [[1, []]], {}]])
+def test_a_broken_graph_is_an_empty_one(state: Any) -> None:
+    found = graph(state)
+    assert not found.topics
+    assert not found.names()
+
+
+def test_words() -> None:
+    bus = [
+        [1, "/c", "o", "TCPROS", "/t", True, "more"],
+        [2, "http://a:1/", "i", "TCPROS", "/u", True],
+        [3, "http://b:1/", "i", "TCPROS", "/u", False],
+        [4, "short"],
+        "broken",
+    ]
+    assert words([["/t", "T"], ["/x"], 3], [["/u", "U"]], bus) == Words(
+        {"/t": "T"}, {"/u": "U"}, frozenset({("o", "/t", "/c"), ("i", "/u", "http://a:1/")})
+    )
+    assert words(None, "x", 3) == Words()
+
+
+@pytest.mark.parametrize(
+    ("answer", "where"),
+    [
+        (["TCPROS", "a", 5], HostPort("a", 5)),
+        (["TCPROS", "a", 0], None),
+        (["TCPROS", "a", 70000], None),
+        (["TCPROS", 1, 5], None),
+        (["UDPROS", "a", 5], None),
+        ([], None),
+        (0, None),
+    ],
+)
+def test_data_port(answer: Any, where: HostPort | None) -> None:
+    assert data_port(answer) == where

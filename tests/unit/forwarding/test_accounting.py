@@ -1,0 +1,116 @@
+"""Whose connections the kernel forwards, and how many bytes went through them."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.forwarding.kernel.accounting import Account, KernelBook, Ledger, Silence
+from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.leases import fast_ports
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.registry import Registry
+
+
+def holder(registry: Registry, number: int) -> Endpoint:
+    node = HostPort(f"10.0.0.{number}", 40000)
+    endpoint = registry.admit(f"http://{node}/", node, Place(node.host, True), node.host)
+    registry.register(endpoint, Registration(Kind.PUBLISHER, "/t", f"/node{number}"))
+    assert fast_ports.claim(registry, endpoint)
+    return endpoint
+
+
+def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
+    return Flow("ESTABLISHED", HostPort(peer, 1), port, HostPort(endpoint.place.address, 50000))
+
+
+@given(st.lists(st.tuples(st.integers(0, 1000), st.integers(0, 1000))))
+def test_no_byte_is_lost_or_counted_twice(steps: list[tuple[int, int]]) -> None:
+    ledger, counter, counted = Ledger(), (0, 0), (0, 0)
+    for sent, received in steps:
+        counter = counter[0] + sent, counter[1] + received
+        more = ledger.take({45050: counter}).get(45050, (0, 0))
+        counted = counted[0] + more[0], counted[1] + more[1]
+    assert counted == counter
+
+
+def test_counters_that_begin_anew_are_added() -> None:
+    ledger = Ledger()
+    assert ledger.take({1: (100, 10)}) == {1: (100, 10)}
+    assert ledger.take({1: (100, 10)}) == {}
+    assert ledger.take({1: (30, 3)}) == {1: (30, 3)}
+    assert ledger.take({1: (31, 3), 2: (5, 0)}) == {1: (1, 0), 2: (5, 0)}
+
+
+def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
+    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    endpoint = holder(registry, 1)
+    book.note_owners(registry)
+    assert book.count({1002: (400, 40), 1003: (5, 6)}, 10.0) == [
+        ("/node1", 400, 40),
+        ("unnamed", 5, 6),
+    ]
+    assert book.count({1002: (600, 40), 1003: (5, 6)}, 12.0) == [("/node1", 200, 0)]
+    assert book.account(endpoint) == Account(600, 40, (100.0, 0.0))
+    book.count({1002: (600, 40)}, 14.0)
+    assert book.account(endpoint).rates == (0.0, 0.0)
+
+
+def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> None:
+    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    first = holder(registry, 1)
+    book.note_owners(registry)
+    fast_ports.give_back(registry, first)
+    book.note_owners(registry)
+    assert book.ports_of(first) == [1002]
+    book.note_peers([open_flow(first, 1002)])
+    assert first.fast_peers == {"192.0.2.1": 1}
+    registry.remove(first)
+    book.note_owners(registry)
+    assert book.owners == {}
+    assert book.account(first) == Account()
+
+
+def test_peers_are_those_of_the_nodes_own_address() -> None:
+    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    first, second = holder(registry, 1), holder(registry, 2)
+    book.note_owners(registry)
+    flows = [open_flow(first, 1002), open_flow(first, 1003), open_flow(second, 1003, "192.0.2.2")]
+    book.note_peers(flows)
+    assert first.fast_peers == {"192.0.2.1": 1}
+    assert second.fast_peers == {"192.0.2.2": 1}
+    second.health.end(1.0)
+    book.note_peers(flows)
+    assert second.fast_peers == {}
+    assert first.fast_peers == {"192.0.2.1": 1}
+    book.note_peers([])
+    assert first.fast_peers == second.fast_peers == {}
+
+
+def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
+    silence = Silence()
+    assert silence.look({1: (0, 60), 2: (0, 60), 3: (5, 60)}, 10.0) == []
+    assert silence.look({1: (0, 60), 2: (40, 60), 3: (0, 60)}, 13.0) == [1]
+    assert silence.look({3: (0, 60), 1: (0, 0)}, 16.0) == [3]
+    assert silence.look({}, 19.0) == []
+    assert silence.look({3: (0, 60)}, 22.0) == []
+
+
+def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
+    silence = Silence()
+    assert silence.look({1: (0, 60), 2: (0, 60)}, 10.0) == []
+    assert silence.look({1: (0, 60), 2: (0, 60)}, 10.1) == []
+    assert silence.look({1: (40, 0)}, 11.9) == []
+    assert silence.look({}, 12.0) == [2]
+
+
+def test_silent_ports_are_noted_with_the_bytes() -> None:
+    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    holder(registry, 1)
+    book.note_owners(registry)
+    for size in (60, 120):
+        book.count({1002: (0, size)}, float(size))
+    assert book.silent == [1002]
+    book.count({1002: (40, 180)}, 200.0)
+    assert book.silent == []

@@ -1,0 +1,129 @@
+"""What the kernel forwards, and why it doesn't: plain decisions."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.forwarding.kernel.policy import (
+    LONGEST_PAUSE,
+    Pauses,
+    World,
+    changes,
+    destination,
+    kept,
+    unchanged,
+)
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.health import ProbeResult
+
+NODE = "10.0.0.5"
+THERE = HostPort(NODE, 50000)
+
+
+def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
+    node = HostPort(address, 40001)
+    made = Endpoint(f"http://{node}/", node, Place(address, True), 45000)
+    made.tcpros_port = 50000
+    for name, value in changed.items():
+        setattr(made, name, value)
+    return made
+
+
+def test_a_node_that_named_its_port_is_forwarded_to() -> None:
+    assert destination(an_endpoint(), World()) == THERE
+    assert destination(an_endpoint(topic_ports={"/a": 50000}), World()) == THERE
+    assert destination(an_endpoint(tcpros_port=None, topic_ports={"/a": 50000}), World()) == THERE
+    assert destination(an_endpoint("fd00::5"), World()) == HostPort("fd00::5", 50000)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "world", "why"),
+    [
+        (an_endpoint(trusted=False), World(), "does not answer"),
+        (an_endpoint(tcpros_port=None), World(), "nobody outside has asked"),
+        (an_endpoint(topic_ports={"/a": 50001}), World(), "several TCPROS ports"),
+        (an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None), World(), "several"),
+        (an_endpoint("127.0.0.1"), World(), "namespace of the proxy itself"),
+        (an_endpoint(), World(own={NODE}), "namespace of the proxy itself"),
+        (an_endpoint(), World(ipv4=False), "net.ipv4.ip_forward"),
+        (an_endpoint("fd00::5"), World(ipv6=False), "net.ipv6.conf.all.forwarding"),
+    ],
+)
+def test_what_keeps_a_node_in_user_space(endpoint: Endpoint, world: World, why: str) -> None:
+    said = destination(endpoint, world)
+    assert isinstance(said, str)
+    assert why in said
+
+
+def test_a_node_that_is_down_stays_in_user_space() -> None:
+    endpoint = an_endpoint()
+    for _ in range(2):
+        assert destination(endpoint, World()) == THERE
+        endpoint.health.note(ProbeResult.REFUSED, 1.0)
+    assert destination(endpoint, World()) == "the node does not answer"
+
+
+PORTS = st.integers(1, 9)
+FORWARDS = st.dictionaries(PORTS, st.builds(HostPort, st.sampled_from(["10.0.0.1", "::5"]), PORTS))
+
+
+@given(FORWARDS, FORWARDS)
+def test_changes_lead_from_what_there_is_to_what_is_wanted(
+    now: dict[int, HostPort], wanted: dict[int, HostPort]
+) -> None:
+    change = changes(now, wanted)
+    after = {port: where for port, where in now.items() if port not in change.removed}
+    assert not set(after) & set(change.added)
+    assert {**after, **change.added} == wanted
+    assert all(now[port] == where for port, where in change.removed.items())
+    assert bool(change) == (now != wanted)
+
+
+@given(FORWARDS)
+def test_everything_is_kept_until_the_registry_is_rebuilt(now: dict[int, HostPort]) -> None:
+    assert kept(now, [], recovered=False) == now
+    assert kept(now, [], recovered=True) == {}
+
+
+def test_what_leads_to_a_node_that_was_not_heard_yet_is_kept() -> None:
+    waiting = an_endpoint(fast_port=45050, trusted=False)
+    now = {45050: THERE, 45051: THERE}
+    assert kept(now, [waiting], recovered=True) == {45050: THERE}
+    elsewhere = {45050: HostPort("10.0.0.6", 50000)}
+    assert kept(elsewhere, [waiting], recovered=True) == {}
+    waiting.trusted = True
+    assert kept(now, [waiting], recovered=True) == {}
+
+
+def test_what_did_not_change_stays() -> None:
+    holders = [an_endpoint(fast_port=45050 + number) for number in range(3)]
+    now = dict.fromkeys(range(45050, 45055), THERE)
+    owners = {endpoint.fast_port or 0: endpoint for endpoint in holders} | {45053: holders[0]}
+    assert unchanged(now, owners, []) == dict.fromkeys(range(45050, 45053), THERE)
+    assert unchanged(now, owners, {holders[1]}) == {45050: THERE, 45052: THERE}
+
+
+def test_a_forward_without_answer_is_not_made_for_longer_each_time() -> None:
+    pauses, now, lasted = Pauses(), 0.0, []
+    assert pauses.why(45050, THERE, now) is None
+    for _ in range(12):
+        pauses.note(45050, THERE, "no answer", now)
+        start = now
+        while pauses.why(45050, THERE, now):
+            now += 2.5
+        lasted.append(now - start)
+    assert lasted[:3] == [5.0, 10.0, 20.0]
+    assert lasted[-2:] == [LONGEST_PAUSE] * 2
+    assert pauses.why(45050, HostPort(NODE, 50001), now) is None
+
+
+def test_pauses_of_ports_that_nobody_has_are_forgotten() -> None:
+    pauses = Pauses()
+    for port in (45050, 45051):
+        pauses.note(port, THERE, "no answer", 0.0)
+    pauses.keep({45051})
+    assert pauses.why(45050, THERE, 1.0) is None
+    assert pauses.why(45051, THERE, 1.0) == "no answer"

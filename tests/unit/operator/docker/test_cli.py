@@ -1,0 +1,102 @@
+"""The command line of the controller: every mistake is one line that names the option."""
+
+import pytest
+from click.testing import CliRunner, Result
+
+from rosproxy_operator.cli import main
+from rosproxy_operator.settings import DEFAULT_ADMIN, parse_docker_settings
+
+GIVEN = {
+    "master_uri": None,
+    "advertise_host": None,
+    "ports": 32,
+    "port_window": "11400-65535",
+    "publish_address": (),
+    "proxy_image": "rosproxy:latest",
+    "expose_by_default": False,
+    "grace": 60.0,
+    "resync": 30.0,
+    "uplink": "0-rosproxy",
+    "admin_bind": "127.0.0.1:11313",
+}
+
+
+def run(*words: str, **variables: str) -> Result:
+    return CliRunner().invoke(main, words, env={"DOCKER_HOST": "unix:///nowhere", **variables})
+
+
+def test_the_defaults() -> None:
+    settings = parse_docker_settings(GIVEN)
+    assert settings.admin == DEFAULT_ADMIN
+    assert settings.resync == 30.0
+    assert settings.plan.publish == ("0.0.0.0",)
+    assert settings.plan.uplink == "0-rosproxy"
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "told"),
+    [
+        ("--ports", "0", "0 is not between 1 and 1000"),
+        ("--ports", "1001", "1001 is not between 1 and 1000"),
+        ("--port-window", "5-1", "'5-1' must rise"),
+        ("--port-window", "11400-11410", "11400-11410 has 11 ports, --ports is 32"),
+        ("--publish-address", "here", "'here' is not an IP address"),
+        ("--master-uri", "robot", "'robot' is not of the form http://host:11311"),
+        ("--master-uri", "http://localhost:11311", "means another machine to each container"),
+        ("--advertise-host", "a b", "'a b' is neither a host name nor an address"),
+        ("--proxy-image", "", "'' is not the name of an image"),
+        ("--uplink", "-x", "'-x' is not a network's name"),
+        ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
+        ("--grace", "-1", "-1 s is not between 0 and 86400 s"),
+        ("--resync", "0", "0 s is not between 1 and 86400 s"),
+    ],
+)
+def test_a_bad_value_names_its_option(option: str, value: str, told: str) -> None:
+    result = run("docker", f"{option}={value}")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"rosproxy-operator: {option}: ")
+    assert told in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_every_option_has_a_variable() -> None:
+    result = run("docker", "plan", ROSPROXY_PORTS="0")
+    assert result.stderr == "rosproxy-operator: --ports: 0 is not between 1 and 1000\n"
+    result = run("docker", "plan", ROS_MASTER_URI="robot")
+    assert result.stderr.startswith("rosproxy-operator: --master-uri: 'robot'")
+
+
+@pytest.mark.parametrize("words", [["docker", "--nope"], ["nope"], ["docker", "status", "x"]])
+def test_a_wrong_word_is_one_line(words: list[str]) -> None:
+    result = run(*words)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("rosproxy-operator: ")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["status"], ["plan"], ["--once"]])
+def test_no_engine_is_one_line_that_says_what_to_do(words: list[str]) -> None:
+    result = run("docker", *words)
+    assert result.exit_code == 1
+    assert "there is no Docker engine's socket /nowhere: start the engine" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_once_is_for_the_controller_itself() -> None:
+    result = run("docker", "--once", "status")
+    assert result.exit_code == 2
+    assert "--once has no meaning for status" in result.stderr
+
+
+def test_health_of_a_controller_that_is_not_there() -> None:
+    result = run("health", ROSPROXY_ADMIN_BIND="127.0.0.1:1")
+    assert result.exit_code == 1
+    assert result.stderr == "rosproxy-operator: no controller answers at http://127.0.0.1:1\n"
+
+
+def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    done = CliRunner().invoke(main, ["docker", "--once"])
+    assert done.exit_code == 1
+    assert "pip install 'rosproxy[docker]'" in done.stderr
+    assert "Traceback" not in done.output

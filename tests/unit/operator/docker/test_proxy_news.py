@@ -1,0 +1,194 @@
+"""What a proxy is told of the containers on its networks."""
+
+from dataclasses import replace
+from ipaddress import IPv4Network
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.docker.planner.model import (
+    Attachment,
+    Container,
+    Host,
+    Key,
+    Network,
+    Observed,
+    Proxy,
+    Sandbox,
+    Wish,
+)
+from rosproxy_operator.docker.proxy_news import Facts, Places, facts, gone, node_addresses
+from rosproxy_operator.docker.snapshot import Look
+
+KEY = Key("http://robot:11311", "192.0.2.10")
+PORTS = PortRange(11400, 11431)
+SUBNET = IPv4Network("172.18.0.0/16")
+
+
+def at(address: str, network: str = "app", *names: str) -> Attachment:
+    return Attachment(network, address, frozenset(names))
+
+
+def talker(address: str = "172.18.0.5", state: str = "running") -> Container:
+    return Container("t" * 20, "talker", state, attachments=(at(address),), hostname="bhost")
+
+
+def look(*containers: Container) -> Look:
+    home = Container(
+        "box", "box", "running", attachments=(at("172.30.0.2", "up"), at("172.18.0.2"))
+    )
+    process = Container("p", "p", "running", network_mode="container:box")
+    networks = (
+        Network("1", "app", gateway="172.18.0.1"),
+        Network("2", "up", gateway="172.30.0.1"),
+        Network("3", "other", gateway="172.19.0.1"),
+    )
+    return Look(
+        Observed(
+            containers,
+            networks,
+            (Proxy(KEY, process, PORTS, ""),),
+            Host(PORTS),
+            sandboxes=(Sandbox(KEY, home, PORTS, ""),),
+        ),
+        endpoints={("t" * 20, "app"): "e1"},
+        subnets={"app": (SUBNET,), "other": (IPv4Network("172.19.0.0/16"),)},
+        addresses=frozenset({"172.18.0.5", "172.18.0.2", "172.30.0.2"}),
+    )
+
+
+def told(seen: Look, *wishes: Wish, master: str = "198.51.100.7") -> Facts:
+    return facts(seen, seen.observed.proxies[0], wishes, master)
+
+
+def wish(container: Container) -> Wish:
+    return Wish(container.name, container.id, KEY)
+
+
+def test_a_running_container_has_arrived_under_all_its_names() -> None:
+    seen = look(replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),)))
+    (arrival,) = told(seen, wish(talker())).arrivals
+    assert (arrival.address, arrival.network, arrival.endpoint) == ("172.18.0.5", "app", "e1")
+    assert arrival.names == {"talker", "t" * 12, "web", "bhost"}
+
+
+def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
+    other = Wish("talker", "t" * 20, Key("http://other:11311", "192.0.2.10"))
+    assert not told(look(talker()), other).arrivals
+    assert not told(look(talker(state="exited")), wish(talker())).arrivals
+    assert not told(look(talker())).arrivals
+
+
+def test_networks_that_the_proxy_is_not_on_do_not_count() -> None:
+    away = replace(talker(), attachments=(at("172.19.0.5", "other"),))
+    known = told(look(away), wish(away))
+    assert not known.arrivals
+    assert not known.addresses
+    assert known.subnets == (SUBNET,)
+
+
+def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
+    guest = Container("g" * 20, "guest", "running", network_mode=f"container:{'t' * 20}")
+    (arrival,) = told(look(talker(), guest), wish(guest)).arrivals
+    assert (arrival.container, arrival.address, arrival.endpoint) == ("g" * 20, "172.18.0.5", "e1")
+    assert {"guest", "bhost"} <= arrival.names
+
+
+def test_the_masters_address_is_only_told_for_a_name() -> None:
+    assert told(look()).master_address == "198.51.100.7"
+    seen = look()
+    key = Key("http://198.51.100.8:11311", "192.0.2.10")
+    process = replace(seen.observed.proxies[0], key=key)
+    assert facts(seen, process, (), "198.51.100.8").master_address == ""
+
+
+def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
+    known = told(look(talker()))
+    nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
+    assert gone(nodes, known.taken, known.subnets) == ["172.18.0.6"]
+    assert gone(nodes, known.taken, ()) == []
+
+
+def test_the_addresses_of_nodes() -> None:
+    ended = {"address": "172.18.0.7:4001", "state": "cleaned"}
+    status = {"nodes": [{"address": "172.18.0.6:4001"}, {"address": "[fd00::1]:1"}, {}, ended]}
+    assert node_addresses(status) == {"172.18.0.6", "fd00::1"}
+    assert node_addresses({}) == frozenset()
+
+
+OLD, NEW = "172.18.0.5", "172.18.0.9"
+HERE, AWAY, THERE, NOBODY = (
+    told(look(*containers))
+    for containers in (
+        [talker()],
+        [replace(talker(), attachments=())],
+        [talker(NEW)],
+        [],
+    )
+)
+
+
+def places(*looks: tuple[float, Facts]) -> Places:
+    found = Places()
+    for when, known in looks:
+        found.look(known, when)
+    return found
+
+
+def test_a_container_with_another_address_has_moved_until_its_proxy_knows() -> None:
+    found = places((0.0, HERE), (1.0, THERE))
+    assert found.moved({OLD}) == {OLD: NEW}
+    assert found.moved({NEW}) == {}
+    assert found.held == {OLD}
+    assert found.until == 6.0
+
+
+def test_a_move_is_given_up_in_the_end() -> None:
+    found = places((0.0, HERE), (1.0, THERE), (6.0, THERE))
+    assert not found.moved({OLD})
+    assert not found.held
+    assert found.until is None
+
+
+def test_a_container_off_the_network_for_a_moment_may_come_back_elsewhere() -> None:
+    found = places((0.0, HERE), (1.0, AWAY))
+    assert not found.moved({OLD})
+    assert found.held == {OLD}
+    assert found.until == 3.0
+    found.look(THERE, 2.0)
+    assert found.moved({OLD}) == {OLD: NEW}
+
+
+def test_a_container_that_stays_away_is_gone() -> None:
+    assert places((0.0, HERE), (1.0, AWAY), (3.0, AWAY)).held == frozenset()
+
+
+def test_a_container_that_does_not_run_is_gone_at_once() -> None:
+    found = places((0.0, HERE), (1.0, NOBODY))
+    assert not found.held
+    assert found.until is None
+
+
+def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> None:
+    other = Container("o", "other", "running", attachments=(at(OLD),))
+    found = places((0.0, HERE), (1.0, told(look(talker(NEW), other))))
+    assert found.moved({OLD}) == {}
+
+
+def test_container_that_changes_networks_takes_its_nodes_along() -> None:
+    before = Facts(addresses={("t", "app"): "172.18.0.5"}, running=frozenset("t"))
+    between = Facts(running=frozenset("t"))
+    after = Facts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
+
+    found = places((0.0, before), (0.1, between), (1.0, after))
+
+    assert found.moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+    assert found.held == {"172.18.0.5"}
+    found.look(replace(after, addresses={("t", "other"): "172.19.0.3"}), 1.5)
+    assert found.moved({"172.19.0.9"}) == {"172.19.0.9": "172.19.0.3"}
+
+
+def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> None:
+    app, other = ("t", "app"), ("t", "other")
+    both = Facts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
+    one = replace(both, addresses={other: "172.19.0.9"})
+
+    assert places((0.0, both), (0.1, one)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}

@@ -1,0 +1,124 @@
+"""From the engine's JSON to what the core plans with."""
+
+from dataclasses import replace
+from ipaddress import ip_network
+from typing import Any
+
+import pytest
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.docker.details import Details, bound_ports, read_details, signature
+from rosproxy_operator.docker.planner.model import Container, Host, Key, Network, Observed, Sandbox
+from rosproxy_operator.docker.snapshot import Look, read_container, read_network, read_subnets
+from tests.unit.operator.docker import captured
+
+APP = Network(captured.APP_ID, "app")
+
+
+def test_a_running_container() -> None:
+    found = read_container(captured.running(), read_details(captured.inspected()), [APP])
+    assert (found.id, found.name, found.state) == (captured.ID, "talker", "running")
+    assert found.labels == {"rosproxy.enable": "true"}
+    assert (found.network_mode, found.hostname) == ("app", "bhost")
+    assert found.master_uri == "http://robot:11311"
+    assert found.host_ports == {18080, 18000, 18001, 18002}
+    (place,) = found.attachments
+    assert (place.network, place.address, place.network_id) == ("app", "172.29.0.2", APP.id)
+    assert place.names == {"talker", "45afed2aea6c", "web", "bhost"}
+
+
+def test_a_created_container_on_the_default_network() -> None:
+    found = read_container(captured.created(), Details())
+    assert (found.name, found.state, found.network_mode) == ("listener", "created", "bridge")
+    assert found.networks == {"bridge"}
+    assert found.attachments[0].address == found.attachments[0].network_id == ""
+    assert found.started_at == ""
+
+
+def test_a_network_mode_given_by_id_becomes_the_name() -> None:
+    row = captured.running() | {"HostConfig": {"NetworkMode": captured.APP_ID}}
+    assert read_container(row, Details(), [APP]).network_mode == "app"
+
+
+def test_a_name_of_a_link_is_not_the_containers_name() -> None:
+    row = captured.running() | {"Names": ["/other/talker", "/talker"]}
+    assert read_container(row, Details()).name == "talker"
+
+
+def test_a_container_without_names_goes_by_its_id() -> None:
+    assert read_container(captured.running() | {"Names": None}, Details()).name == "45afed2aea6c"
+
+
+def test_details() -> None:
+    details = read_details(captured.inspected())
+    assert details.token == "a=b"
+    assert details.aliases == {"app": {"web", "45afed2aea6c", "bhost"}}
+    assert details.started_at == "2026-11-21T10:27:24.131326951Z"
+
+
+def test_newer_engines_keep_the_containers_own_names_apart() -> None:
+    inspected = captured.inspected()
+    ends = {"app": {"Aliases": ["web"], "DNSNames": ["talker", "web", "45afed2aea6c"]}}
+    inspected["NetworkSettings"]["Networks"] = ends
+    assert read_details(inspected).aliases == {"app": {"talker", "web", "45afed2aea6c"}}
+
+
+def test_a_container_that_was_never_started() -> None:
+    inspected = captured.inspected() | {"State": {"StartedAt": "0001-01-01T00:00:00Z"}}
+    assert read_details(inspected).started_at == ""
+
+
+def test_an_inspection_with_nothing_in_it() -> None:
+    assert read_details({}) == Details()
+
+
+@pytest.mark.parametrize(
+    ("text", "ports"),
+    [
+        ("80", {80}),
+        ("8000-8002", {8000, 8001, 8002}),
+        ("", set()),
+        ("0", set()),
+        ("x", set()),
+        ("80-", {80}),
+    ],
+)
+def test_host_ports(text: str, ports: set[int]) -> None:
+    assert bound_ports({"1/tcp": [{"HostIp": "", "HostPort": text}]}) == ports
+
+
+def test_no_bindings() -> None:
+    assert bound_ports(None) == bound_ports({"80/tcp": []}) == frozenset()
+
+
+def test_a_network_and_its_subnets() -> None:
+    assert read_network(captured.network()) == Network(
+        captured.APP_ID, "app", "bridge", False, "172.29.0.1"
+    )
+    assert read_subnets(captured.network()) == (ip_network("172.29.0.0/16"),)
+
+
+def test_a_network_without_addresses() -> None:
+    host = {"Name": "host", "Id": "1", "Driver": "host", "IPAM": {"Config": None}}
+    assert read_network(host).gateway == ""
+    assert read_subnets(host) == ()
+
+
+def test_the_signature_changes_with_each_connection() -> None:
+    row: dict[str, Any] = captured.running()
+    before = signature(row)
+    row["State"], row["Status"] = "paused", "Up 3 seconds (Paused)"
+    assert signature(row) == before
+    row["NetworkSettings"]["Networks"]["app"] = captured.end("another", "172.29.0.2")
+    assert signature(row) != before
+
+
+def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
+    key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
+    box = Sandbox(key, Container("1", "box", "created"), ports, "")
+    observed = Observed((), (), (), Host(ports), sandboxes=(box,))
+    look = Look(observed, unsure=frozenset({"box"}), at_host=True)
+    listening = frozenset({22, 11400, 11401})
+    assert look.strangers(listening) == {22}
+    assert replace(look, unsure=frozenset()).strangers(listening) == listening
+    assert replace(look, at_host=False).strangers(listening) == frozenset()

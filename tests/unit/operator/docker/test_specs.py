@@ -1,0 +1,181 @@
+"""What containers are made of, when they must be made anew, and what their labels tell."""
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.settings import parse_settings
+from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.docker.planner.specs import (
+    Own,
+    admin_port,
+    container_config,
+    fingerprint,
+    is_proxy_name,
+    own_labels,
+    proxy_name,
+    read_own,
+    reserved_ports,
+    sandbox_config,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
+
+SANDBOX = SandboxSpec("s", KEY, PortRange(11400, 11401), "f1", "0-rosproxy")
+PROXY = ProxySpec("p", KEY, PortRange(11400, 11401), "f2", "s")
+
+
+def test_a_sandbox_holds_ports_and_network_and_does_nothing() -> None:
+    body = sandbox_config(SANDBOX, SETTINGS)
+    assert (body["Entrypoint"], body["Cmd"]) == (["sleep"], ["infinity"])
+    assert body["Healthcheck"] == {"Test": ["NONE"]}
+    assert body["ExposedPorts"] == {"11400/tcp": {}, "11401/tcp": {}}
+    assert body["NetworkingConfig"] == {"EndpointsConfig": {"0-rosproxy": {}}}
+    host = body["HostConfig"]
+    assert host["NetworkMode"] == "0-rosproxy"
+    assert host["PortBindings"] == {
+        "11400/tcp": [{"HostIp": "0.0.0.0", "HostPort": "11400"}],
+        "11401/tcp": [{"HostIp": "0.0.0.0", "HostPort": "11401"}],
+    }
+    assert host["Init"] is True
+    assert host["Sysctls"] == {"net.ipv4.ip_local_port_range": "1024 11000"}
+
+
+def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
+    body = container_config(PROXY, SETTINGS, "t0ken", "192.0.2.7")
+    assert body["HostConfig"]["NetworkMode"] == "container:s"
+    assert not {"ExposedPorts", "NetworkingConfig"} & body.keys()
+    assert not {"PortBindings", "Sysctls"} & body["HostConfig"].keys()
+    assert body["Env"] == [
+        "ROS_MASTER_URI=http://robot:11311",
+        "ROSPROXY_ADVERTISE_HOST=192.0.2.10",
+        "ROSPROXY_PORT_RANGE=11400-11401",
+        "ROSPROXY_MASTER_PORT=11311",
+        "ROSPROXY_ADMIN_BIND=0.0.0.0:11312",
+        "ROSPROXY_ADMIN_TOKEN=t0ken",
+        "ROSPROXY_MASTER_ADDRESS=192.0.2.7",
+    ]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        sandbox_config(SANDBOX, SETTINGS),
+        container_config(PROXY, SETTINGS, "t", "192.0.2.7"),
+    ],
+)
+def test_both_are_hardened(body: dict) -> None:
+    host = body["HostConfig"]
+    assert body["User"] == "10001:10001"
+    assert body["Image"] == "rosproxy:latest"
+    assert host["ReadonlyRootfs"] is True
+    assert host["CapDrop"] == ["ALL"]
+    assert host["SecurityOpt"] == ["no-new-privileges:true"]
+    assert host["RestartPolicy"] == {"Name": "unless-stopped"}
+    assert not {"Privileged", "CapAdd", "Binds", "Devices"} & host.keys()
+
+
+def test_an_unknown_address_is_not_given() -> None:
+    names = [pair.split("=")[0] for pair in container_config(PROXY, SETTINGS, "t", "")["Env"]]
+    assert "ROSPROXY_MASTER_ADDRESS" not in names
+
+
+def test_ports_are_published_on_each_address_asked_for() -> None:
+    settings = replace(SETTINGS, publish=("192.0.2.10", "::"))
+    bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
+    assert [each["HostIp"] for each in bindings["11400/tcp"]] == ["192.0.2.10", "::"]
+
+
+@pytest.mark.parametrize("port", [11311, 11312, 11500])
+def test_the_proxy_accepts_its_environment(port: int) -> None:
+    """A second roscore is often at 11312, where the admin endpoint usually is."""
+    key = Key(f"http://robot:{port}", HERE)
+    body = container_config(replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
+    env = dict(pair.split("=", 1) for pair in body["Env"])
+    options = {
+        "master_uri": env["ROS_MASTER_URI"],
+        "advertise_host": env["ROSPROXY_ADVERTISE_HOST"],
+        "port_range": env["ROSPROXY_PORT_RANGE"],
+        "master_port": int(env["ROSPROXY_MASTER_PORT"]),
+        "admin_bind": env["ROSPROXY_ADMIN_BIND"],
+        "admin_token": env["ROSPROXY_ADMIN_TOKEN"],
+        "master_address": env["ROSPROXY_MASTER_ADDRESS"],
+        "bind": "0.0.0.0",
+        "slave_control": "any",
+        "probe_interval": 5.0,
+        "probe_timeout": 3.0,
+        "cleanup_after": 30.0,
+        "linger": 30.0,
+        "master_interval": 2.0,
+    }
+    settings = parse_settings(options)
+    assert settings.admin.port == admin_port(key)
+    assert reserved_ports(key) == {port, settings.admin.port}
+
+
+def test_what_makes_a_sandbox_anew() -> None:
+    now = sandbox_fingerprint(KEY, RANGE, SETTINGS)
+    assert now == sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, image="other", grace=1.0))
+    assert now != sandbox_fingerprint(KEY, PortRange(11400, 11430), SETTINGS)
+    assert now != sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, publish=("::",)))
+    assert now != sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, uplink="0-other"))
+
+
+def test_what_makes_a_proxy_anew() -> None:
+    now = fingerprint(KEY, RANGE, SETTINGS, IMAGE)
+    assert now == fingerprint(KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE)
+    assert now != fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
+    assert now != fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
+    assert now != fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
+
+
+def test_labels_are_read_back() -> None:
+    assert read_own(own_labels(SANDBOX)) == Own("ports", KEY, PortRange(11400, 11401), "f1")
+    assert read_own(own_labels(PROXY)) == Own("proxy", KEY, PortRange(11400, 11401), "f2")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"io.rosproxy.managed": "yes"},
+        {"io.rosproxy.role": "robot"},
+        {"io.rosproxy.master-uri": "robot"},
+        {"io.rosproxy.advertise-host": ""},
+        {"io.rosproxy.range": "11401-11400"},
+        {"io.rosproxy.range": "many"},
+    ],
+)
+def test_other_containers_are_not_taken_for_own_ones(wrong: dict[str, str]) -> None:
+    assert read_own({**own_labels(SANDBOX), **wrong}) is None
+
+
+@given(st.dictionaries(st.sampled_from(sorted(own_labels(SANDBOX))), st.text(max_size=20)))
+def test_labels_of_whatever_kind_are_read_or_refused(labels: dict[str, str]) -> None:
+    own = read_own({**own_labels(SANDBOX), **labels})
+    assert own is None or own.role in ("ports", "proxy")
+
+
+@pytest.mark.parametrize(
+    ("uri", "start"),
+    [
+        ("http://robot:11311", "rosproxy-robot-"),
+        ("http://robot.Lab.example:11311", "rosproxy-robot-lab-example-"),
+        ("http://192.0.2.7:11311", "rosproxy-192-0-2-7-"),
+        ("http://[2001:db8::1]:11311", "rosproxy-2001-db8-1-"),
+        (f"http://{'r' * 200}:11311", f"rosproxy-{'r' * 30}-"),
+        ("http://___:11311", "rosproxy-master-"),
+    ],
+)
+def test_names(uri: str, start: str) -> None:
+    name = proxy_name(Key(uri, HERE))
+    assert name.startswith(start)
+    assert len(name) == len(start) + 6
+    assert is_proxy_name(name)
+    assert is_proxy_name(sandbox_name(Key(uri, HERE)))
+    assert name != proxy_name(Key(uri, "192.0.2.11"))
+    assert not is_proxy_name(start)

@@ -1,0 +1,183 @@
+"""The API server is asked by the real client, over HTTP; errors say what to do."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.errors import ApiError, Kind, missing_rule, refusal
+from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.planner.names import own_labels
+from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
+
+FORBIDDEN = (
+    'pods is forbidden: User "system:serviceaccount:rosproxy:rosproxy" cannot list resource '
+    '"pods" in API group "" at the cluster scope'
+)
+
+
+def pod(name: str, **labels: str) -> dict[str, object]:
+    return {"metadata": {"name": name, "labels": labels}, "spec": {"nodeName": "node1"}}
+
+
+async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
+    server.put("pods", pod("a", app="x"))
+    server.put("pods", pod("b", app="y"))
+    server.put("pods", pod("other", app="x"), "elsewhere")
+    server.put("pods", {"metadata": {"name": "mine", "labels": own_labels("arm")}})
+
+    def names(found: list[dict[str, dict[str, str]]]) -> set[str]:
+        return {each["metadata"]["name"] for each in found}
+
+    assert names(await in_thread(api.pods, "ns", "app in (x,z)")) == {"a"}
+    assert names(await in_thread(api.pods_on, "node1")) == {"a", "b", "other"}
+    assert names(await in_thread(api.own, "pods")) == {"mine"}
+
+
+async def test_a_list_from_memory_is_never_older_than_the_one_before(
+    server: ApiServer, api: Api
+) -> None:
+    """With several API servers one may lag behind another."""
+    await in_thread(api.nodes)
+    server.put("nodes", {"metadata": {"name": "node1"}})
+    await in_thread(api.nodes)
+    first, second = server.asked("GET", "nodes")
+    assert first == {"resourceVersion": "0"}
+    assert int(second["resourceVersion"]) > 0
+    assert second["resourceVersionMatch"] == "NotOlderThan"
+
+
+async def test_a_store_that_was_set_back_is_asked_itself(server: ApiServer, api: Api) -> None:
+    await in_thread(api.nodes)
+    server.refuse("GET", "nodes", 504, "Timeout: Too large resource version: 9, current: 3")
+    with pytest.raises(ApiError):
+        await in_thread(api.nodes)
+    server.refusals.clear()
+    await in_thread(api.nodes)
+    assert [("resourceVersion" in query) for query in server.asked("GET", "nodes")] == [
+        True,
+        True,
+        False,
+        True,
+    ]
+
+
+async def test_rosproxies_are_listed_from_the_store(server: ApiServer, api: Api) -> None:
+    await in_thread(api.rosproxies)
+    assert server.asked("GET", "rosproxies") == [{}]
+
+
+async def test_only_the_given_namespaces_are_listed(server: ApiServer) -> None:
+    api = Api(["one", "two"])
+    server.put("rosproxies", {"metadata": {"name": "arm"}}, "two")
+    server.put("rosproxies", {"metadata": {"name": "leg"}}, "three")
+    found = await in_thread(api.rosproxies)
+    assert [each["metadata"]["name"] for each in found] == ["arm"]
+    api.close()
+
+
+async def test_deletes_only_what_has_the_uid(server: ApiServer, api: Api) -> None:
+    server.put("pods", pod("a"))
+    with pytest.raises(ApiError) as caught:
+        await in_thread(api.delete, "pods", Name("ns", "a"), "another")
+    assert caught.value.kind is Kind.CONFLICT
+    uid = server.get("pods", "a")["metadata"]["uid"]
+    await in_thread(api.delete, "pods", Name("ns", "a"), uid)
+    assert not server.all("pods")
+
+
+async def test_fields_that_the_client_does_not_know_get_through(
+    server: ApiServer, api: Api
+) -> None:
+    body = {"metadata": {"namespace": "ns", "name": "a"}, "spec": {"newerThanUs": {"x": [1]}}}
+    await in_thread(api.create, "pods", body)
+    assert server.get("pods", "a")["spec"] == {"newerThanUs": {"x": [1]}}
+
+
+async def test_a_patch_with_a_failed_test_is_a_conflict(server: ApiServer, api: Api) -> None:
+    server.put("pods", pod("a"))
+    operations = [{"op": "test", "path": "/metadata/uid", "value": "another"}]
+    with pytest.raises(ApiError) as caught:
+        await in_thread(api.patch, "pods", Name("ns", "a"), operations)
+    assert caught.value.kind is Kind.CONFLICT
+
+
+async def test_the_token_is_sent(server: ApiServer, api: Api) -> None:
+    assert api.server == server.url
+    configuration = api._client.configuration
+    assert configuration.get_api_key_with_prefix("BearerToken") == "Bearer secret"
+
+
+async def test_an_api_server_that_is_away_and_back(
+    tmp_path: Path, server: ApiServer, api: Api
+) -> None:
+    other = ApiServer()
+    async with listening(other):
+        port = int(other.url.rpartition(":")[2])
+    write_kubeconfig(tmp_path / "config", other.url)
+    late = Api()
+    with pytest.raises(ApiError, match=f"API server at {other.url} can't be reached") as caught:
+        await in_thread(late.nodes)
+    assert caught.value.kind is Kind.AWAY
+    async with listening(other, port):
+        assert await in_thread(late.nodes) == []
+        late.close()
+
+
+async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> None:
+    server.refuse("GET", "nodes", 200, "hello")
+    with pytest.raises(ApiError, match="is no API server") as caught:
+        await in_thread(api.nodes)
+    assert caught.value.kind is Kind.AWAY
+
+
+def test_no_cluster_is_one_line_that_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    monkeypatch.setattr(
+        "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(tmp_path / "none")
+    )
+    with pytest.raises(ApiError, match=r"no cluster is known here .* name a kubeconfig"):
+        Api()
+
+
+@pytest.mark.parametrize(
+    ("status", "message", "kind", "told"),
+    [
+        (403, FORBIDDEN, Kind.DENIED, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
+        (403, 'pods "p" is forbidden: violates PodSecurity "baseline"', Kind.INVALID, "violates"),
+        (
+            403,
+            "unable to create new content in namespace x because it is being terminated",
+            Kind.GONE,
+            "terminated",
+        ),
+        (401, "Unauthorized", Kind.AWAY, "does not know the controller's token"),
+        (404, 'pods "p" not found', Kind.GONE, 'pods "p" not found'),
+        (409, "exists", Kind.CONFLICT, "exists"),
+        (422, "spec.clusterIP: Invalid value", Kind.INVALID, "spec.clusterIP"),
+        (429, "storage is (re)initializing", Kind.AWAY, "HTTP 429"),
+        (503, "etcd", Kind.AWAY, "HTTP 503: etcd"),
+        (418, "tea", Kind.OTHER, "tea"),
+    ],
+)
+def test_refusals(status: int, message: str, kind: Kind, told: str) -> None:
+    body = json.dumps({"kind": "Status", "message": message})
+    error = refusal(status, "reason", body.encode())
+    assert error.kind is kind
+    assert told in str(error)
+    assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("body", [b"", b"<html>\xff", b"[]", b'{"message": 3}'])
+def test_a_refusal_by_anything_else(body: bytes) -> None:
+    assert str(refusal(500, "Internal Server Error", body))
+
+
+def test_the_missing_rule_names_its_namespace() -> None:
+    text = 'User "x" cannot get resource "secrets" in API group "" in the namespace "rosproxy"'
+    assert missing_rule(text).startswith("the controller's role lacks a rule in the namespace ros")
+    assert missing_rule("violates PodSecurity") == ""

@@ -1,0 +1,290 @@
+"""What is done to the cluster, through the real client, against an API server on loopback."""
+
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+from aiohttp import web
+
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.proxy_client import ProxyClient
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.apply import Applier
+from rosproxy_operator.kubernetes.planner.actions import (
+    Action,
+    CreateProxy,
+    CreateService,
+    DeleteProxy,
+    DeleteService,
+    Emit,
+    PatchStatus,
+    SetImage,
+)
+from rosproxy_operator.kubernetes.planner.model import Name, Observed, RosProxy
+from rosproxy_operator.kubernetes.planner.names import own_labels
+from rosproxy_operator.kubernetes.planner.spec import rosproxy
+from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.builders_api import NAMESPACE, proxy_obj, rosproxy_obj
+
+OF = Name(NAMESPACE, "arm")
+OWNER = {"apiVersion": "rosproxy.io/v1alpha1", "kind": "RosProxy", "name": "arm", "uid": "uid-arm"}
+ABOUT = {"kind": "RosProxy", "namespace": NAMESPACE, "name": "arm", "uid": "uid-arm"}
+
+
+class Carried:
+    """An applier, and what it has counted."""
+
+    def __init__(self, api: Api) -> None:
+        self.counted: list[tuple[str, str]] = []
+        self.tasks, self.proxies = Tasks(), ProxyClient()
+        self.applier = Applier(api, self.proxies, self.tasks, self.count)
+
+    def count(self, action: Action, outcome: str) -> None:
+        self.counted.append((type(action).__name__, outcome))
+
+    async def out(self, *actions: Action, **observed: Any) -> None:
+        observed.setdefault("rosproxies", (seen(),))
+        await self.applier.carry_out(actions, Observed(**observed))
+
+
+@pytest.fixture
+async def carry(api: Api) -> AsyncIterator[Carried]:
+    carried = Carried(api)
+    yield carried
+    await carried.tasks.cancel()
+    await carried.proxies.close()
+
+
+def seen(status: dict[str, Any] | None = None) -> RosProxy:
+    return rosproxy(rosproxy_obj(status=status))
+
+
+def body(kind: str, name: str, **spec: Any) -> dict[str, Any]:
+    return {
+        "apiVersion": "v1",
+        "kind": kind,
+        "metadata": {
+            "name": name,
+            "namespace": NAMESPACE,
+            "labels": own_labels("arm"),
+            "ownerReferences": [OWNER],
+        },
+        "spec": spec,
+    }
+
+
+def create_pod(name: str = "proxy") -> CreateProxy:
+    env = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": ""}]
+    return CreateProxy(OF, "node1", body("Pod", name, containers=[{"name": "proxy", "env": env}]))
+
+
+async def test_a_proxy_gets_a_secret_token(server: ApiServer, carry: Carried) -> None:
+    await carry.out(create_pod("one"), create_pod("two"))
+    tokens = {pod["spec"]["containers"][0]["env"][0]["value"] for pod in server.all("pods")}
+    assert len(tokens) == 2
+    assert all(len(token) == 32 for token in tokens)
+    assert carry.applier.failures == {OF: ()}
+    assert carry.counted == [("CreateProxy", "ok")] * 2
+
+
+async def test_one_that_is_there_already_is_no_failure(server: ApiServer, carry: Carried) -> None:
+    """The list that was planned from lacked what had just been created."""
+    server.put("pods", body("Pod", "proxy"), NAMESPACE)
+    await carry.out(create_pod())
+    assert carry.applier.failures == {OF: ()}
+
+
+async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carried) -> None:
+    server.put("pods", {"metadata": {"name": "proxy"}}, NAMESPACE)
+    await carry.out(create_pod())
+    (failure,) = carry.applier.failures[OF]
+    assert failure.subject == f"{NAMESPACE}/proxy"
+    assert "not the controller's is there: rename it" in failure.text
+    assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
+
+
+async def test_a_lost_service_gets_its_address_or_another(
+    server: ApiServer, carry: Carried
+) -> None:
+    service = body("Service", "rosproxy-arm", clusterIP="10.96.0.5")
+    taken = body("Service", "rosproxy-leg", clusterIP="10.96.9.9")
+    await carry.out(CreateService(OF, service), CreateService(OF, taken))
+    assert server.get("services", "rosproxy-arm", NAMESPACE)["spec"]["clusterIP"] == "10.96.0.5"
+    assert server.get("services", "rosproxy-leg", NAMESPACE)["spec"]["clusterIP"] == "10.96.0.7"
+    assert carry.applier.failures == {OF: ()}
+
+
+async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Carried) -> None:
+    uid = server.put("pods", body("Pod", "old"), NAMESPACE)["metadata"]["uid"]
+    server.put("pods", body("Pod", "new"), NAMESPACE)
+    server.put("services", body("Service", "new"), NAMESPACE)
+    await carry.out(
+        DeleteProxy(OF, Name(NAMESPACE, "old"), uid, "why"),
+        DeleteProxy(OF, Name(NAMESPACE, "new"), "another", "why"),
+        DeleteProxy(OF, Name(NAMESPACE, "never was"), "x", "why"),
+        DeleteService(OF, Name(NAMESPACE, "new"), "another", "why"),
+    )
+    assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["new"]
+    assert server.all("services")
+    assert carry.applier.failures == {OF: ()}
+
+
+async def test_another_image(server: ApiServer, carry: Carried) -> None:
+    pod = body("Pod", "proxy", containers=[{"name": "proxy", "image": "a"}])
+    uid = server.put("pods", pod, NAMESPACE)["metadata"]["uid"]
+    id = Name(NAMESPACE, "proxy")
+    await carry.out(SetImage(OF, id, uid, "b"), SetImage(OF, id, "another", "c"))
+    assert server.get("pods", "proxy", NAMESPACE)["spec"]["containers"][0]["image"] == "b"
+    assert carry.applier.failures == {OF: ()}
+
+
+async def test_a_status_is_replaced_whole(server: ApiServer, carry: Carried) -> None:
+    old = {"message": "old", "perNode": [{"name": "a"}, {"name": "b"}]}
+    server.put("rosproxies", rosproxy_obj(status=old), NAMESPACE)
+    await carry.out(PatchStatus(OF, {"perNode": []}), rosproxies=(seen(old),))
+    held = server.get("rosproxies", "arm", NAMESPACE)
+    assert held["status"] == {"perNode": []}
+    assert held["spec"] == rosproxy_obj()["spec"]
+    assert server.requests[-1][1].endswith("/rosproxies/arm/status")
+
+
+async def test_a_status_that_is_the_same_is_not_written(server: ApiServer, carry: Carried) -> None:
+    await carry.out(PatchStatus(OF, {"nodes": 1}), rosproxies=(seen({"nodes": 1}),))
+    assert not server.requests
+
+
+async def test_the_status_of_a_new_rosproxy_of_that_name_is_left_alone(
+    server: ApiServer, carry: Carried
+) -> None:
+    again = rosproxy_obj()
+    again["metadata"]["uid"] = "another"
+    server.put("rosproxies", again, NAMESPACE)
+    await carry.out(PatchStatus(OF, {"nodes": 1}))
+    assert server.get("rosproxies", "arm", NAMESPACE)["status"] == {}
+    assert not carry.applier.problems
+
+
+async def test_a_status_that_cannot_be_written_is_a_problem_until_it_can(
+    server: ApiServer, carry: Carried
+) -> None:
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    server.refuse("PATCH", "rosproxies", 422, "status.nodes: Invalid value")
+    await carry.out(PatchStatus(OF, {"nodes": "?"}))
+    (problem,) = carry.applier.problems.values()
+    assert problem.subject == f"rosproxy {OF}"
+    assert problem.text == "its status can't be written: status.nodes: Invalid value"
+    server.refusals.clear()
+    await carry.out(PatchStatus(OF, {"nodes": 2}))
+    assert not carry.applier.problems
+
+
+async def test_a_failure_stops_no_other_action_but_what_tells_of_success(
+    server: ApiServer, carry: Carried
+) -> None:
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    server.refuse("POST", "pods", 403, 'violates PodSecurity "baseline:latest": hostPort')
+    service = CreateService(OF, body("Service", "rosproxy-arm"))
+    await carry.out(
+        create_pod(),
+        service,
+        Emit(OF, ABOUT, "Normal", "ProxyCreated", "created"),
+        Emit(OF, ABOUT, "Warning", "Invalid", "warned"),
+        PatchStatus(OF, {"nodes": 1}),
+    )
+    assert [failure.text for failure in carry.applier.failures[OF]] == [
+        'violates PodSecurity "baseline:latest": hostPort'
+    ]
+    assert server.all("services")
+    assert [event["reason"] for event in server.all("events")] == ["Invalid"]
+    assert server.get("rosproxies", "arm", NAMESPACE)["status"] == {"nodes": 1}
+    server.refusals.clear()
+    await carry.out(create_pod())
+    assert carry.applier.failures == {OF: ()}
+
+
+async def test_a_namespace_that_is_being_deleted_is_no_failure(
+    server: ApiServer, carry: Carried
+) -> None:
+    text = "unable to create new content in namespace robots because it is being terminated"
+    for kind in ("pods", "services", "events"):
+        server.refuse("POST", kind, 403, text)
+    service = CreateService(OF, body("Service", "rosproxy-arm", clusterIP="10.96.0.5"))
+    await carry.out(create_pod(), service, Emit(OF, ABOUT, "Warning", "Invalid", "warned"))
+    assert carry.applier.failures == {OF: ()}
+    assert len(server.asked("POST", "services")) == 1
+
+
+async def test_failures_of_a_deleted_rosproxy_are_forgotten(
+    server: ApiServer, carry: Carried
+) -> None:
+    server.refuse("POST", "pods", 422, "no")
+    await carry.out(create_pod())
+    assert carry.applier.failures
+    await carry.out(rosproxies=())
+    assert not carry.applier.failures
+
+
+async def test_a_mistake_of_ours_is_a_failure_like_any(server: ApiServer, carry: Carried) -> None:
+    await carry.out(CreateProxy(OF, "node1", body("Pod", "broken")), create_pod())
+    assert "the controller failed: KeyError('containers')" in carry.applier.failures[OF][0].text
+    assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["proxy"]
+
+
+async def test_an_event_is_made_once_and_counted_now_and_then(
+    server: ApiServer, carry: Carried
+) -> None:
+    event = Emit(OF, ABOUT, "Warning", "PortConflict", "port 11400 is taken")
+    for _ in range(3):
+        await carry.out(event)
+    (made,) = server.all("events")
+    assert (made["count"], made["involvedObject"]) == (1, ABOUT)
+    assert made["metadata"]["namespace"] == NAMESPACE
+    made["lastTimestamp"] = "2026-01-01T00:00:00Z"
+    await carry.out(event)
+    (made,) = server.all("events")
+    assert made["count"] == 2
+    assert made["lastTimestamp"] > "2026-01-02"
+    await carry.out(Emit(OF, ABOUT, "Warning", "PortConflict", "port 11401 is taken"))
+    assert len(server.all("events")) == 2
+
+
+async def test_a_retired_proxy_unregisters_first(server: ApiServer, carry: Carried) -> None:
+    told: list[str] = []
+
+    async def retire(request: web.Request) -> web.Response:
+        told.append(request.headers["Authorization"])
+        assert server.all("pods")
+        return web.json_response({"unregistered": 2})
+
+    application = web.Application()
+    application.router.add_post("/retire", retire)
+    runner = web.AppRunner(application)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.77", 11312).start()
+    await _retire(server, carry, "127.0.0.77")
+    assert told == ["Bearer secret"]
+    assert not server.all("pods")
+    await runner.cleanup()
+
+
+async def test_a_retired_proxy_that_is_dead_is_deleted_all_the_same(
+    server: ApiServer, carry: Carried
+) -> None:
+    await _retire(server, carry, "127.0.0.78")
+    assert not server.all("pods")
+
+
+async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
+    from rosproxy_operator.kubernetes.planner.objects import proxy_pod
+
+    obj = proxy_obj(status={"phase": "Running", "podIP": ip})
+    obj["spec"]["containers"][0]["env"] = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}]
+    server.put("pods", obj, NAMESPACE)
+    proxy = proxy_pod(obj)
+    assert proxy is not None
+    action = DeleteProxy(OF, proxy.pod.id, proxy.pod.uid, "RosProxy deleted", retire=True)
+    await carry.out(action, action, proxies=(proxy,))
+    for task in [*carry.tasks._tasks]:
+        await task
+    await carry.out(action, proxies=(proxy,))  # a pod that ends slowly is told once
+    assert not carry.tasks._tasks

@@ -1,0 +1,345 @@
+"""The webhook's certificate: made, kept, renewed, trusted and served without a gap."""
+
+import asyncio
+import base64
+import contextlib
+import socket
+import ssl
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.errors import ApiError
+from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.webhook import certificates, rotation
+from rosproxy_operator.kubernetes.webhook.certificates import Pair, Unfit
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, Directory, SelfSigned
+from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from tests.unit.operator.kubernetes.api_server import ApiServer
+
+NAMES = certificates.service_names("ns", "wh")
+HOST = "wh.ns.svc"
+SECRET = Name("ns", "wh")
+NOW = datetime.now(UTC).replace(microsecond=0)
+
+
+class Clock:
+    """A time of day that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.time = NOW
+
+    def __call__(self) -> datetime:
+        return self.time
+
+    def forward(self, **by: float) -> None:
+        self.time += timedelta(**by)
+
+
+def put(server: ApiServer, data: dict[str, str] | None = None) -> None:
+    server.put("secrets", {"metadata": {"name": "wh"}, **({"data": data} if data else {})})
+    hooks = [{"name": f"{n}.rosproxy.io", "clientConfig": {"service": {}}} for n in ("wire", "b")]
+    server.put("mutatingwebhookconfigurations", {"metadata": {"name": "wh"}, "webhooks": hooks})
+
+
+def bundle(server: ApiServer) -> bytes:
+    hooks = server.get("mutatingwebhookconfigurations", "wh", "")["webhooks"]
+    found = {hook["clientConfig"].get("caBundle", "") for hook in hooks}
+    assert len(found) == 1
+    return base64.b64decode(found.pop())
+
+
+def source(api: Api, clock: Clock) -> SelfSigned:
+    return SelfSigned(api, NAMES, SECRET, "wh", clock)
+
+
+@contextlib.asynccontextmanager
+async def served(pair: Pair) -> AsyncIterator[tuple[int, ssl.SSLContext]]:
+    """A TLS server on loopback; its port and context."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    certificates.load(context, pair)
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"hello")
+        writer.close()
+
+    listening = await asyncio.start_server(answer, "127.0.0.1", 0, ssl=context)
+    try:
+        yield listening.sockets[0].getsockname()[1], context
+    finally:
+        listening.close()
+        await listening.wait_closed()
+
+
+def call(port: int, authorities: bytes, host: str = HOST) -> bytes:
+    """What a client that trusts these CAs alone gets, as an API server does."""
+    context = ssl.create_default_context(cadata=authorities.decode())
+    with (
+        socket.create_connection(("127.0.0.1", port), 5) as plain,
+        context.wrap_socket(plain, server_hostname=host) as secure,
+    ):
+        return secure.recv(10)
+
+
+@pytest.mark.parametrize("host", NAMES)
+async def test_a_real_handshake(host: str) -> None:
+    pair = certificates.make(NAMES, NOW)
+    async with served(pair) as (port, _):
+        assert await in_thread(call, port, pair.ca, host) == b"hello"
+
+
+async def test_another_ca_or_name_is_refused() -> None:
+    pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
+    async with served(pair) as (port, _):
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await in_thread(call, port, other.ca)
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await in_thread(call, port, pair.ca, "example.org")
+
+
+async def test_renewal_while_serving() -> None:
+    """Whoever trusts both CAs is served without a gap."""
+    old = certificates.make(NAMES, NOW)
+    new = certificates.make(NAMES, NOW, before=old.ca)
+    async with served(old) as (port, context):
+        assert await in_thread(call, port, new.ca) == b"hello"
+        certificates.load(context, new)
+        assert await in_thread(call, port, new.ca) == b"hello"
+        with pytest.raises(ssl.SSLCertVerificationError):
+            await in_thread(call, port, old.ca)
+
+
+def test_due_after_two_thirds_of_its_life() -> None:
+    pair = certificates.make(NAMES, NOW)
+    assert pair.expires == NOW + timedelta(days=90)
+    assert not pair.due(NOW + timedelta(days=59))
+    assert pair.due(NOW + timedelta(days=61))
+
+
+def test_old_cas_are_dropped_when_they_expire() -> None:
+    first = certificates.make(NAMES, NOW)
+    second = certificates.make(NAMES, NOW + timedelta(days=60), before=first.ca)
+    third = certificates.make(NAMES, NOW + timedelta(days=120), before=second.ca)
+    assert [pair.ca.count(b"BEGIN") for pair in (first, second, third)] == [1, 2, 2]
+
+
+def test_a_secret_holds_it() -> None:
+    pair = certificates.make(NAMES, NOW)
+    assert certificates.read(pair.secret()) == pair
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tls.key": base64.b64encode(certificates.make(NAMES, NOW).key).decode()},
+        {"tls.crt": "bm9uc2Vuc2U="},
+        {"tls.crt": "?"},
+        {"ca.crt": "bm9uc2Vuc2U="},
+    ],
+)
+def test_what_is_no_pair_is_unfit(change: dict[str, str]) -> None:
+    with pytest.raises(Unfit):
+        certificates.read({**certificates.make(NAMES, NOW).secret(), **change})
+    with pytest.raises(Unfit, match=r"it has no tls.crt"):
+        certificates.read({})
+
+
+async def test_made_kept_and_trusted(server: ApiServer, api: Api) -> None:
+    put(server)
+    pair = await in_thread(source(api, Clock()).refresh)
+    assert certificates.read(server.get("secrets", "wh")["data"]) == pair
+    assert bundle(server) == pair.ca
+
+
+async def test_a_restart_finds_the_same(server: ApiServer, api: Api) -> None:
+    put(server)
+    first = await in_thread(source(api, Clock()).refresh)
+    before = len(server.asked("PATCH", "secrets"))
+    assert await in_thread(source(api, Clock()).refresh) == first
+    assert len(server.asked("PATCH", "secrets")) == before
+    assert len(server.asked("PATCH", "mutatingwebhookconfigurations")) == 1
+
+
+async def test_renewed_and_trusted_before_it_is_served(server: ApiServer, api: Api) -> None:
+    put(server)
+    clock = Clock()
+    one = source(api, clock)
+    first = await in_thread(one.refresh)
+    clock.forward(days=61)
+    assert await in_thread(one.refresh) == first
+    second = certificates.read(server.get("secrets", "wh")["data"])
+    assert second != first
+    assert bundle(server) == second.ca
+    assert second.ca.endswith(first.ca)
+    clock.forward(seconds=5)
+    assert await in_thread(one.refresh) == first
+    clock.forward(seconds=6)
+    assert await in_thread(one.refresh) == second
+
+
+async def test_not_served_while_it_cannot_be_trusted(server: ApiServer, api: Api) -> None:
+    put(server)
+    clock = Clock()
+    one = source(api, clock)
+    first = await in_thread(one.refresh)
+    clock.forward(days=61)
+    server.refuse("PATCH", "mutatingwebhookconfigurations", 422, "no")
+    for _ in range(3):
+        clock.forward(minutes=1)
+        assert await in_thread(one.refresh) == first
+    (problem,) = one.problems
+    assert problem.text == "MutatingWebhookConfiguration wh: no"
+    server.refusals.clear()
+    await in_thread(one.refresh)
+    clock.forward(seconds=11)
+    assert await in_thread(one.refresh) != first
+
+
+async def test_a_ca_that_somebody_overwrites_is_written_again(server: ApiServer, api: Api) -> None:
+    put(server)
+    one = source(api, Clock())
+    pair = await in_thread(one.refresh)
+    hooks = server.get("mutatingwebhookconfigurations", "wh", "")["webhooks"]
+    del hooks[0]["clientConfig"]["caBundle"]
+    assert await in_thread(one.refresh) == pair
+    assert bundle(server) == pair.ca
+
+
+@pytest.mark.parametrize("status", [403, 404])
+async def test_without_the_secret_it_is_kept_in_memory(
+    server: ApiServer, api: Api, status: int
+) -> None:
+    put(server)
+    server.refuse("GET", "secrets", status, "no")
+    one = source(api, Clock())
+    pair = await in_thread(one.refresh)
+    assert await in_thread(one.refresh) == pair
+    assert bundle(server) == pair.ca
+    assert "the certificate is kept in memory meanwhile" in one.problems[0].text
+
+
+async def test_without_the_api_server_nothing_is_made(server: ApiServer, api: Api) -> None:
+    put(server)
+    server.refuse("GET", "secrets", 503, "starting")
+    one = source(api, Clock())
+    with pytest.raises(ApiError):
+        await in_thread(one.refresh)
+    server.refusals.clear()
+    pair = await in_thread(one.refresh)
+    server.refuse("GET", "secrets", 503, "starting")
+    assert await in_thread(one.refresh) == pair
+
+
+@pytest.mark.parametrize("data", [{"tls.key": "?"}, {"tls.crt": "", "tls.key": "eA=="}])
+async def test_nonsense_in_the_secret_is_replaced(
+    server: ApiServer, api: Api, data: dict[str, str]
+) -> None:
+    put(server, {**data, "other": "a2VwdA=="})
+    pair = await in_thread(source(api, Clock()).refresh)
+    held = server.get("secrets", "wh")["data"]
+    assert certificates.read(held) == pair
+    assert held["other"] == "a2VwdA=="
+
+
+async def test_one_for_other_names_is_replaced(server: ApiServer, api: Api) -> None:
+    put(server, certificates.make(["old.ns.svc"], NOW).secret())
+    pair = await in_thread(source(api, Clock()).refresh)
+    assert pair.names() == set(NAMES)
+
+
+async def test_who_writes_the_secret_first_has_the_right_one(server: ApiServer, api: Api) -> None:
+    put(server)
+    server.refuse("PATCH", "secrets", 409, "the object has been modified")
+    one = source(api, Clock())
+    with pytest.raises(ApiError, match="somebody else writes ns/wh"):
+        await in_thread(one.refresh)
+    theirs = certificates.make(NAMES, NOW)
+    put(server, theirs.secret())
+    assert await in_thread(one.refresh) == theirs
+
+
+def write(directory: Path, pair: Pair) -> None:
+    (directory / "tls.crt").write_bytes(pair.certificate)
+    (directory / "tls.key").write_bytes(pair.key)
+
+
+async def test_a_directory_is_read_again(tmp_path: Path) -> None:
+    one = Directory(str(tmp_path))
+    with pytest.raises(Unfit, match=r"--webhook-cert-dir: .*tls.crt: No such file"):
+        one.refresh()
+    pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
+    write(tmp_path, pair)
+    assert one.refresh().certificate == pair.certificate
+    write(tmp_path, other)
+    assert one.refresh().certificate == other.certificate
+
+
+async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> None:
+    write(tmp_path, certificates.make(NAMES, NOW))
+    one = CertificateRotation(Directory(str(tmp_path)), ClusterMetrics())
+    await one.refresh()
+    first = one.pair
+    (tmp_path / "tls.crt").write_bytes(certificates.make(NAMES, NOW).certificate)
+    await one.refresh()
+    assert one.pair is first is not None
+
+
+async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken:
+        every = 1.0
+
+        def refresh(self) -> Pair:
+            raise RuntimeError("oops")
+
+    one = CertificateRotation(Broken(), ClusterMetrics())
+    await one.refresh()
+    assert one.pair is None
+    assert "the controller failed: RuntimeError('oops')" in caplog.text
+
+
+async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.server.CHECK", 0.01)
+    old = certificates.make(NAMES, NOW)
+    new = certificates.make(NAMES, NOW, before=old.ca)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    held = CertificateRotation(rotation.Directory(""), ClusterMetrics())
+
+    async def answer(review: Any, **_: Any) -> Any:
+        return {}
+
+    server = WebhookServer(HostPort("127.0.0.1", port), held)
+    serving = server(answer)  # type: ignore[arg-type]
+    started = asyncio.ensure_future(anext(serving))
+    await asyncio.sleep(0.05)
+    assert not started.done()  # there is no certificate yet
+    held.pair = old
+    await started
+    keeping = asyncio.ensure_future(anext(serving))
+    assert b"HTTP" in await in_thread(ask, port, old.ca)
+    held.pair = new
+    await asyncio.sleep(0.1)
+    assert b"HTTP" in await in_thread(ask, port, new.ca)
+    with pytest.raises(ssl.SSLCertVerificationError):
+        await in_thread(ask, port, old.ca)
+    keeping.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await keeping
+
+
+def ask(port: int, authorities: bytes) -> bytes:
+    context = ssl.create_default_context(cadata=authorities.decode())
+    with (
+        socket.create_connection(("127.0.0.1", port), 5) as plain,
+        context.wrap_socket(plain, server_hostname=HOST) as secure,
+    ):
+        secure.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        return secure.recv(100)

@@ -1,0 +1,128 @@
+"""The command line of the Kubernetes controller."""
+
+import pytest
+from click.testing import CliRunner, Result
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator import cli
+from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.settings import KubernetesSettings
+
+HOOK = ["--webhook-bind=0.0.0.0:9443"]
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> list[KubernetesSettings]:
+    """The settings with which the controller would have been run."""
+    found: list[KubernetesSettings] = []
+    monkeypatch.setattr(cli, "_run_kubernetes", lambda settings, *_: found.append(settings))
+    return found
+
+
+def run(*words: str, **variables: str) -> Result:
+    return CliRunner().invoke(cli.main, ["kubernetes", *words], env=variables)
+
+
+def test_the_defaults(given: list[KubernetesSettings]) -> None:
+    assert run().exit_code == 0
+    assert given == [KubernetesSettings()]
+
+
+def test_all_options(given: list[KubernetesSettings]) -> None:
+    run(
+        "--namespace=one",
+        "--namespace=two",
+        "--proxy-image=rosproxy:1",
+        "--proxy-image-pull-policy=Never",
+        "--node-port-range=31000-31999",
+        "--ephemeral-range=40000-50000",
+        "--resync=5",
+        *HOOK,
+        "--webhook-service=ns/wh",
+        "--webhook-secret=ns/secret",
+        "--webhook-configuration=wh",
+        "--admin-bind=127.0.0.1:1",
+        "--liveness-bind=127.0.0.1:2",
+    )
+    (settings,) = given
+    assert settings.namespaces == ("one", "two")
+    assert settings.plan.image == "rosproxy:1"
+    assert settings.plan.image_pull_policy == "Never"
+    assert settings.plan.node_ports == PortRange(31000, 31999)
+    assert settings.plan.ephemeral == PortRange(40000, 50000)
+    assert settings.resync == 5.0
+    assert settings.admin == HostPort("127.0.0.1", 1)
+    assert settings.liveness == HostPort("127.0.0.1", 2)
+    assert settings.webhook is not None
+    assert settings.webhook.service == Name("ns", "wh")
+    assert settings.webhook.secret == Name("ns", "secret")
+
+
+def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
+    run(
+        ROSPROXY_NAMESPACE="one two",
+        ROSPROXY_PROXY_IMAGE="x:1",
+        ROSPROXY_WEBHOOK_BIND="0.0.0.0:1",
+        ROSPROXY_WEBHOOK_CERT_DIR="/certs",
+    )
+    (settings,) = given
+    assert settings.namespaces == ("one", "two")
+    assert settings.plan.image == "x:1"
+    assert settings.webhook is not None
+    assert settings.webhook.directory == "/certs"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--namespace=A b"], "--namespace: 'A b' is not a namespace's name"),
+        (["--proxy-image="], "--proxy-image: '' is not the name of an image"),
+        (["--node-port-range=5"], "--node-port-range: '5' is not a range"),
+        (["--ephemeral-range=9-1"], "--ephemeral-range: '9-1' must rise"),
+        (["--resync=0"], "--resync: 0 s is not between 1 and 86400 s"),
+        (["--admin-bind=x"], "--admin-bind: 'x' is not of the form 0.0.0.0:11313"),
+        (["--liveness-bind=x"], "--liveness-bind: 'x' is not of the form 0.0.0.0:8080"),
+        (["--webhook-bind=x"], "--webhook-bind: 'x' is not of the form 0.0.0.0:9443"),
+        (HOOK, "--webhook-service: NAMESPACE/NAME is needed"),
+        ([*HOOK, "--webhook-service=wh"], "--webhook-service: 'wh' is not of the form NAMESPACE/"),
+        (
+            [*HOOK, "--webhook-service=ns/wh", "--webhook-configuration=A/b"],
+            "--webhook-configuration: 'A/b' is not an object's name",
+        ),
+        (
+            [*HOOK, "--webhook-cert-dir=/x", "--webhook-secret=ns/wh"],
+            "--webhook-cert-dir: the certificate comes from there",
+        ),
+    ],
+)
+def test_a_bad_value_names_its_option(words: list[str], told: str) -> None:
+    result = run(*words)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"rosproxy-operator: {told}")
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_wrong_word_is_one_line() -> None:
+    result = run("--nope")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("rosproxy-operator: ")
+    assert result.stderr.count("\n") == 1
+
+
+def test_no_cluster_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
+    where = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
+    monkeypatch.setattr(where, f"{tmp_path}/none")
+    monkeypatch.setattr("rosproxy.telemetry.logs.set_up", lambda *_: None)
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    result = run()
+    assert result.exit_code == 1
+    assert result.stderr.startswith("rosproxy-operator: no cluster is known here")
+    assert result.stderr.count("\n") == 1
+
+
+def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    result = run()
+    assert result.exit_code == 1
+    assert "pip install 'rosproxy[kubernetes]'" in result.stderr

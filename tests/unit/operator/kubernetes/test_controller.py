@@ -1,0 +1,232 @@
+"""The reconcile loop against an API server on loopback that comes and goes."""
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+from aiohttp import web
+
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.kubernetes import controller as module
+from rosproxy_operator.kubernetes import proxy_sync
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.controller import KubernetesController
+from rosproxy_operator.kubernetes.planner.model import Observed
+from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.settings import KubernetesSettings
+from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
+
+INJECT = {"rosproxy.io/inject": "true"}
+NODE = {
+    "metadata": {"name": "node1"},
+    "spec": {"podCIDRs": ["127.0.0.0/24"]},
+    "status": {
+        "addresses": [{"type": "InternalIP", "address": "192.0.2.11"}],
+        "conditions": [{"type": "Ready", "status": "True"}],
+    },
+}
+
+
+class Running:
+    """A controller at work."""
+
+    def __init__(self, api: Api) -> None:
+        self.metrics = ClusterMetrics()
+        self.controller = KubernetesController(KubernetesSettings(resync=60.0), api, self.metrics)
+        self.task = asyncio.create_task(self.controller.run())
+
+    def looks(self, outcome: str = "ok") -> float:
+        return float(self.metrics.looks.labels(outcome)._value.get())
+
+
+@pytest.fixture
+async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Running]:
+    monkeypatch.setattr(module, "DEBOUNCE", 0.01)
+    monkeypatch.setattr(module, "SETTLED", 0.05)
+    monkeypatch.setattr(module, "PAUSES", (0.02,))
+    monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
+    monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.02)
+    one = Running(api)
+    yield one
+    one.task.cancel()
+    await asyncio.gather(one.task, return_exceptions=True)
+
+
+async def until(true: Callable[[], bool], seconds: float = 10.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.01)
+
+
+def put_all(server: ApiServer) -> None:
+    server.put("nodes", dict(NODE))
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
+
+
+def proxies(server: ApiServer) -> list[dict[str, Any]]:
+    pods = server.all("pods")
+    return [pod for pod in pods if "rosproxy.io/proxy-of" in pod["metadata"].get("labels", {})]
+
+
+async def test_a_labelled_pod_gets_a_proxy(server: ApiServer, running: Running) -> None:
+    put_all(server)
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)))
+    (proxy,) = proxies(server)
+    assert proxy["metadata"]["ownerReferences"][0]["uid"] == "uid-arm"
+
+    def told() -> Any:
+        return server.get("rosproxies", "arm", NAMESPACE)["status"].get("masterURI")
+
+    await until(lambda: told() == "http://10.96.0.7:11311")
+
+
+async def test_it_settles(server: ApiServer, running: Running) -> None:
+    """Nothing is written when nothing happens."""
+    put_all(server)
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)))
+    await asyncio.sleep(0.3)
+    before = len([1 for method, _, _ in server.requests if method != "GET"])
+    for _ in range(3):
+        looks = running.looks()
+        running.controller.wake()
+        await until(lambda looks=looks: running.looks() > looks)  # type: ignore[misc]
+    assert len([1 for method, _, _ in server.requests if method != "GET"]) == before
+
+
+async def test_an_api_server_that_is_away(
+    server: ApiServer, running: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    await until(lambda: running.looks() > 0)
+    server.refuse("GET", "rosproxies", 503, "starting")
+    running.controller.wake()
+    await until(lambda: running.looks("unavailable") > 3)
+    assert running.controller.unready() == "the API server answers HTTP 503: starting"
+    assert running.controller.dead() is None
+    assert caplog.text.count("HTTP 503") == 1
+    server.refusals.clear()
+    await until(lambda: running.controller.unready() is None)
+    assert "looking works again" in caplog.text
+
+
+async def test_a_crd_that_comes_late(server: ApiServer, running: Running) -> None:
+    appeared: list[bool] = []
+    running.controller.appeared = lambda: appeared.append(True)
+    server.refuse("GET", "rosproxies", 404, "not found")
+    running.controller.wake()
+    await until(lambda: "CustomResourceDefinition" in (running.controller.unready() or ""))
+    assert not appeared
+    server.refusals.clear()
+    await until(lambda: bool(appeared))
+
+
+async def test_a_mistake_of_ours_does_not_end_it(
+    server: ApiServer, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await until(lambda: running.looks() > 0)
+
+    def broken(*_: Any) -> Plan:
+        raise RuntimeError("oops")
+
+    real = plan
+    monkeypatch.setattr(module, "plan", broken)
+    running.controller.wake()
+    await until(lambda: running.looks("failed") > 2)
+    assert running.controller.unready() == "the controller failed: RuntimeError('oops')"
+    monkeypatch.setattr(module, "plan", real)
+    await until(lambda: running.controller.unready() is None)
+
+
+async def test_a_failure_is_in_the_status(server: ApiServer, running: Running) -> None:
+    put_all(server)
+    server.refuse("POST", "pods", 403, 'violates PodSecurity "baseline:latest": hostPort')
+    running.controller.wake()
+    await until(lambda: "PodSecurity" in str(server.get("rosproxies", "arm", NAMESPACE)["status"]))
+
+
+async def test_what_is_malformed_stops_nobody(server: ApiServer, running: Running) -> None:
+    server.put("rosproxies", {"metadata": {"name": "bad"}, "spec": {"master": []}}, "other")
+    server.put("pods", {"metadata": {"name": "x"}, "spec": {"nodeName": "node1"}}, "other")
+    server.put("nodes", {"metadata": {"name": "node2"}})
+    put_all(server)
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)))
+    await until(lambda: running.controller.unready() is None)
+    assert server.get("rosproxies", "bad", "other")["status"]["conditions"]
+
+
+async def test_a_proxy_is_asked_and_told(
+    server: ApiServer, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it answers is in the status; what is gone it is told until it has heard."""
+    told: list[Any] = []
+
+    async def status(_: web.Request) -> web.Response:
+        return web.json_response({"master": {"up": True}, "nodes": []})
+
+    async def containers(request: web.Request) -> web.Response:
+        told.append((request.headers["Authorization"], await request.json()))
+        return web.json_response({}, status=503 if len(told) == 1 else 200)
+
+    application = web.Application()
+    application.router.add_get("/status", status)
+    application.router.add_post("/containers", containers)
+    runner = web.AppRunner(application)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.79", 11312).start()
+    real = plan
+    gone: dict[str, tuple[str, ...]] = {}
+
+    def planned(observed: Observed, *rest: Any) -> Plan:
+        found = real(observed, *rest)
+        return Plan(found.actions, found.problems, found.memory, {**gone}, found.again_in)
+
+    monkeypatch.setattr(module, "plan", planned)
+    put_all(server)
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)))
+    (proxy,) = proxies(server)
+    ready = [{"type": "Ready", "status": "True"}]
+    proxy["status"] = {"phase": "Running", "podIP": "127.0.0.79", "conditions": ready}
+    running.controller.wake()
+    await until(
+        lambda: server.get("rosproxies", "arm", NAMESPACE)["status"].get("proxies") == "1/1"
+    )
+    gone[proxy["metadata"]["uid"]] = ("10.244.1.9",)
+    running.controller.wake()
+    await until(lambda: len(told) == 2)
+    gone.clear()
+    env = proxy["spec"]["containers"][0]["env"]
+    token = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN")
+    assert told == [(f"Bearer {token}", {"gone": ["10.244.1.9"]})] * 2
+    await runner.cleanup()
+
+
+async def test_a_loop_that_hangs_is_dead(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    await until(lambda: running.looks() > 0)
+    monkeypatch.setattr(module, "LONGEST_BEAT", 0.05)
+    time.sleep(0.2)
+    assert "the event loop has not run for" in (running.controller.dead() or "")
+
+
+async def test_a_look_that_hangs_is_dead(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    await until(lambda: running.looks() > 0)
+    monkeypatch.setattr(module, "LONGEST_LOOK", 0.05)
+    release = asyncio.Event()
+
+    async def hang() -> Any:
+        await release.wait()
+
+    monkeypatch.setattr(running.controller, "look", hang)
+    running.controller._looking_since = time.monotonic() - 1
+    assert "looking at the cluster for 1 s" in (running.controller.dead() or "")
+    running.controller.wake()
+    await until(lambda: running.looks("unavailable") > 0)

@@ -1,0 +1,285 @@
+"""Pods that are wired at admission, and pods that are not."""
+
+import copy
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy_operator.kubernetes.planner import objects
+from rosproxy_operator.kubernetes.planner.injection import MIRROR, Wiring, unwired, wire
+from rosproxy_operator.kubernetes.planner.model import ELSEWHERE
+from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, NAMESPACE, URI, pod, rosproxy
+
+MASTER = {"name": "ROS_MASTER_URI", "value": URI}
+IP = {
+    "name": "ROS_IP",
+    "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}},
+}
+ANNOTATION = "rosproxy.io/master-uri"
+INJECT = "rosproxy.io/inject"
+
+
+def admitted(*containers: Any, **spec: Any) -> dict[str, Any]:
+    """A pod as it comes to the webhook."""
+    return {
+        "metadata": {"generateName": "talker-", "labels": {INJECT: "true"}},
+        "spec": {"containers": list(containers), **spec},
+    }
+
+
+def container(*env: Any, name: str = "ros", **more: Any) -> dict[str, Any]:
+    return {"name": name, **({"env": list(env)} if env else {}), **more}
+
+
+def applied(obj: dict[str, Any], wiring: Wiring) -> dict[str, Any]:
+    """The pod as the API server stores it."""
+    notes = {**obj["metadata"].get("annotations", {}), **wiring.annotations}
+    meta = {**obj["metadata"], "annotations": notes}
+    return {**obj, "metadata": meta, "spec": wiring.spec or obj["spec"]}
+
+
+def env_of(wiring: Wiring, kind: str = "containers", place: int = 0) -> Any:
+    assert wiring.spec is not None
+    return wiring.spec[kind][place]["env"]
+
+
+def test_a_pod_is_wired():
+    found = wire(admitted(container()), URI)
+
+    assert env_of(found) == [MASTER, IP]
+    assert (found.annotations, found.warnings) == ({ANNOTATION: URI}, ())
+
+
+def test_every_container_is_wired_and_nothing_else_changes():
+    obj = admitted(
+        container(name="a", image="ros"),
+        container(name="b"),
+        initContainers=[container(name="setup"), container(name="side", restartPolicy="Always")],
+        volumes=[{"name": "data"}],
+    )
+    before = copy.deepcopy(obj)
+
+    found = wire(obj, URI)
+
+    assert obj == before
+    assert found.spec is not None
+    for kind in ("containers", "initContainers"):
+        assert [one.pop("env") for one in found.spec[kind]] == [[MASTER, IP]] * 2
+    assert found.spec == before["spec"]
+
+
+def test_variables_of_the_template_can_use_those_that_are_set():
+    url = {"name": "URL", "value": "$(ROS_MASTER_URI)/x"}
+
+    assert env_of(wire(admitted(container(url)), URI)) == [MASTER, IP, url]
+
+
+@pytest.mark.parametrize(
+    ("own", "set_too"),
+    [
+        ({"name": "ROS_MASTER_URI", "value": "http://robot:11311"}, [IP]),
+        ({"name": "ROS_MASTER_URI", "value": ""}, [IP]),
+        ({"name": "ROS_MASTER_URI", "valueFrom": {"configMapKeyRef": {"key": "x"}}}, [IP]),
+        ({"name": "ROS_IP", "value": "10.0.0.1"}, [MASTER]),
+        ({"name": "ROS_HOSTNAME", "value": "talker"}, [MASTER]),
+    ],
+)
+def test_a_container_keeps_what_it_sets_itself(own, set_too):
+    assert env_of(wire(admitted(container(own)), URI)) == [*set_too, own]
+
+
+def test_a_pod_that_sets_all_itself_stays_as_it_is():
+    own = [{"name": "ROS_MASTER_URI", "value": "http://robot:11311"}, {"name": "ROS_IP"}]
+
+    assert wire(admitted(container(*own)), URI) == Wiring()
+
+
+def test_a_pod_of_which_one_container_sets_it_is_still_wired():
+    own = {"name": "ROS_MASTER_URI", "value": "http://robot:11311"}
+
+    found = wire(admitted(container(own), container(name="b")), URI)
+
+    assert env_of(found, place=1) == [MASTER, IP]
+    assert found.annotations == {ANNOTATION: URI}
+
+
+def test_host_aliases_are_added_to_those_of_the_pod():
+    own = {"ip": "192.0.2.7", "hostnames": ["mine", "robot"]}
+    other = {"ip": "192.0.2.9", "hostnames": ["other"]}
+
+    found = wire(
+        admitted(container(), hostAliases=[own]),
+        URI,
+        [{"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]}, other],
+    )
+
+    assert found.spec is not None
+    assert found.spec["hostAliases"] == [
+        {"ip": "192.0.2.7", "hostnames": ["mine", "robot", "robot.example"]},
+        other,
+    ]
+
+
+def test_without_host_aliases_none_are_made():
+    spec = wire(admitted(container()), URI).spec
+
+    assert spec is not None
+    assert "hostAliases" not in spec
+    assert "initContainers" not in spec
+
+
+def test_a_copy_of_a_wired_pod_is_wired_anew():
+    obj = admitted(container())
+    copied = applied(obj, wire(obj, "http://10.96.0.1:11311"))
+
+    found = wire(copied, URI)
+
+    assert env_of(found) == [MASTER, IP]
+    assert found.annotations == {ANNOTATION: URI}
+
+
+def test_a_static_pods_picture_is_not_changed():
+    obj = admitted(container())
+    obj["metadata"]["annotations"] = {MIRROR: "hash"}
+
+    found = wire(obj, URI)
+
+    assert (found.spec, found.annotations) == (None, {})
+    assert "static pod" in found.warnings[0]
+
+
+_variable = st.builds(
+    lambda name, value: {"name": name, "value": value},
+    st.sampled_from(["ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME", "PATH"]),
+    st.sampled_from(["", URI, "http://robot:11311", "$(PATH)"]),
+)
+_containers = st.lists(
+    st.lists(_variable, max_size=4).map(lambda env: container(*env)), min_size=1, max_size=3
+)
+_aliases = st.lists(
+    st.builds(
+        lambda ip, names: {"ip": ip, "hostnames": names},
+        st.sampled_from(["192.0.2.7", "192.0.2.8"]),
+        st.lists(st.sampled_from(["a", "b", "c"]), max_size=3),
+    ),
+    max_size=3,
+)
+_pods = st.builds(
+    lambda containers, init, aliases: admitted(
+        *containers, initContainers=init, hostAliases=aliases
+    ),
+    _containers,
+    _containers,
+    _aliases,
+)
+
+
+@given(_pods, _aliases)
+def test_wiring_twice_changes_nothing_more(obj, aliases):
+    first = wire(obj, URI, aliases)
+    second = wire(applied(obj, first), URI, aliases)
+
+    assert second.spec is None
+    assert second.annotations == first.annotations
+
+
+@given(_pods)
+def test_what_a_template_sets_comes_through_unharmed_and_last(obj):
+    found = wire(obj, URI)
+    spec = found.spec or obj["spec"]
+
+    for kind in ("containers", "initContainers"):
+        for before, after in zip(obj["spec"][kind], spec[kind], strict=True):
+            own = before.get("env", [])
+            added = after["env"][: len(after["env"]) - len(own)]
+            assert after["env"] == [*added, *own]
+            assert not {one["name"] for one in added} & {one["name"] for one in own}
+
+
+@given(_pods)
+def test_every_container_has_a_master_and_an_address_in_the_end(obj):
+    spec = wire(obj, URI).spec or obj["spec"]
+
+    for one in (*spec["containers"], *spec["initContainers"]):
+        there = {variable["name"] for variable in one["env"]}
+        assert "ROS_MASTER_URI" in there
+        assert there & {"ROS_IP", "ROS_HOSTNAME"}
+
+
+def test_a_wired_pod_is_wired():
+    obj = admitted(container())
+
+    stored = objects.pod(applied(obj, wire(obj, URI)), NAMESPACE)
+
+    assert stored.wired == URI
+    assert unwired(stored, rosproxy(), CLUSTER_IP) is None
+
+
+@pytest.mark.parametrize(
+    "master",
+    [
+        URI,
+        f"{URI}/",
+        "http://rosproxy-arm:11311",
+        "http://rosproxy-arm.robots:11311",
+        "http://rosproxy-arm.robots.svc:11311/",
+        "http://rosproxy-arm.robots.svc.cluster.local:11311",
+        "http://rosproxy-arm.robots.svc.cluster.local.:11311",
+        ELSEWHERE,
+    ],
+)
+def test_a_pod_that_sets_its_proxy_itself_is_wired(master):
+    assert unwired(pod(own_masters=(master,)), rosproxy(), CLUSTER_IP) is None
+
+
+@pytest.mark.parametrize(
+    "master",
+    [
+        "http://robot:11311",
+        "http://rosproxy-leg:11311",
+        "http://rosproxy-arm.other:11311",
+        "http://rosproxy-arm:11312",
+        "http://10.96.7.8:11311",
+        "",
+        "rosproxy-arm:11311",
+    ],
+)
+def test_a_pod_that_goes_around_its_proxy_is_told(master):
+    found = unwired(pod(own_masters=(URI, master), wired=URI), rosproxy(), CLUSTER_IP)
+
+    assert found is not None
+    assert (found.reason, found.fatal) == ("NotWired", False)
+    assert f"ROS_MASTER_URI={master}" in found.text
+    assert found.about is not None
+    assert found.about.id == pod().id
+
+
+def test_a_pod_that_was_there_before_the_webhook_is_told():
+    found = unwired(pod(), rosproxy(), CLUSTER_IP)
+
+    assert found is not None
+    assert "create the pod anew" in found.text
+
+
+def test_a_pod_that_is_selected_but_not_labelled_is_told_the_label():
+    found = unwired(pod(labels={"app": "x"}), rosproxy(), CLUSTER_IP)
+
+    assert found is not None
+    assert "rosproxy.io/inject=arm" in found.text
+
+
+def test_a_pod_that_is_wired_to_an_address_of_the_past_is_told():
+    found = unwired(pod(wired="http://10.96.0.1:11311"), rosproxy(), CLUSTER_IP)
+
+    assert found is not None
+    assert f"its proxy is at {URI} now" in found.text
+
+
+@pytest.mark.parametrize(
+    ("more", "address"),
+    [({}, ""), ({"phase": "Succeeded"}, CLUSTER_IP), ({"deleting": True}, CLUSTER_IP)],
+)
+def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(more, address):
+    assert unwired(pod(**more), rosproxy(), address) is None

@@ -1,0 +1,289 @@
+"""Nodes, pods, Services and answers as they are read."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy_operator.kubernetes.planner.model import ELSEWHERE, Name
+from rosproxy_operator.kubernetes.planner.objects import node, pod, proxy_pod, service
+from rosproxy_operator.kubernetes.planner.proxy_status import RECENT, answer, no_answer
+from rosproxy_operator.kubernetes.planner.values import host_problem
+from tests.unit.operator.kubernetes.builders_api import (
+    CLUSTER_IP,
+    NAMESPACE,
+    RANGE,
+    pod_obj,
+    proxy_obj,
+    service_obj,
+)
+
+NODE = {
+    "metadata": {
+        "name": "node1",
+        "labels": {"kubernetes.io/hostname": "node1"},
+        "annotations": {"rosproxy.io/advertise-host": " arm.example "},
+    },
+    "spec": {"podCIDR": "10.244.1.0/24", "podCIDRs": ["10.244.1.0/24", "fd00:1::/64"]},
+    "status": {
+        "addresses": [
+            {"type": "InternalIP", "address": "10.88.0.11"},
+            {"type": "InternalIP", "address": "fd00::11"},
+            {"type": "Hostname", "address": "node1"},
+        ],
+        "conditions": [
+            {"type": "MemoryPressure", "status": "False"},
+            {"type": "Ready", "status": "True"},
+        ],
+    },
+}
+
+
+def test_a_node():
+    found = node(NODE)
+
+    assert found.name == "node1"
+    assert found.addresses == {"InternalIP": "10.88.0.11", "Hostname": "node1"}
+    assert found.advertise_host == "arm.example"
+    assert found.pod_networks == ("10.244.1.0/24", "fd00:1::/64")
+    assert (found.ready, found.cordoned, found.deleting) == (True, False, False)
+
+
+@pytest.mark.parametrize("status", ["False", "Unknown"])
+def test_a_node_whose_kubelet_is_gone_is_not_ready(status):
+    conditions = [{"type": "Ready", "status": status}]
+
+    assert not node({**NODE, "status": {"conditions": conditions}}).ready
+
+
+def test_a_node_that_was_just_made_is_not_ready_and_has_nothing():
+    found = node({"metadata": {"name": "node3"}, "spec": {"unschedulable": True}})
+
+    assert (found.ready, found.cordoned, found.pod_networks) == (False, True, ())
+
+
+def test_a_pod():
+    found = pod(pod_obj(labels={"app": "talker"}))
+
+    assert found.id == Name(NAMESPACE, "talker")
+    assert (found.node, found.phase, found.ip) == ("node1", "Running", "10.244.1.5")
+    assert found.labels == {"app": "talker"}
+    assert (found.own_masters, found.wired, found.host_network) == ((), "", False)
+
+
+def test_a_pod_at_admission_has_neither_name_nor_node():
+    obj = {"metadata": {"generateName": "talker-"}, "spec": {"containers": [{"name": "ros"}]}}
+
+    found = pod(obj, "robots")
+
+    assert found.id == Name("robots", "")
+    assert (found.uid, found.node, found.ip, found.phase) == ("", "", "", "Pending")
+
+
+def test_host_ports_are_those_that_the_scheduler_counts():
+    def container(name: str, port: int, **more: Any) -> dict[str, Any]:
+        return {"name": name, "ports": [{"containerPort": 80, "hostPort": port, **more}]}
+
+    found = pod(
+        pod_obj(
+            containers=[container("a", 8080), container("b", 8081, protocol="UDP"), {"name": "c"}],
+            initContainers=[
+                {**container("sidecar", 8082), "restartPolicy": "Always"},
+                container("setup", 8083),
+            ],
+        )
+    )
+
+    assert found.host_ports == {8080, 8082}
+
+
+def test_masters_that_a_template_sets_itself():
+    def container(**variable: Any) -> dict[str, Any]:
+        return {"name": "x", "env": [{"name": "ROS_MASTER_URI", **variable}]}
+
+    found = pod(
+        pod_obj(
+            containers=[
+                container(value="http://robot:11311"),
+                container(valueFrom={"configMapKeyRef": {"name": "ros", "key": "master"}}),
+                container(value="http://$(HOST_IP):11311"),
+                {"name": "none"},
+            ],
+            initContainers=[container(value="")],
+        )
+    )
+
+    assert found.own_masters == ("", "http://robot:11311", ELSEWHERE, ELSEWHERE)
+
+
+def test_what_the_webhook_has_set_is_not_the_templates_own():
+    obj = pod_obj(
+        containers=[{"name": "x", "env": [{"name": "ROS_MASTER_URI", "value": "http://a:11311"}]}]
+    )
+    obj["metadata"]["annotations"] = {"rosproxy.io/master-uri": "http://a:11311"}
+
+    found = pod(obj)
+
+    assert (found.own_masters, found.wired) == ((), "http://a:11311")
+
+
+@pytest.mark.parametrize(
+    ("phase", "ended"), [("Succeeded", True), ("Failed", True), ("Running", False), ("", False)]
+)
+def test_pods_that_have_ended(phase, ended):
+    obj = pod_obj()
+    obj["status"]["phase"] = phase
+
+    assert pod(obj).ended is ended
+
+
+def test_a_proxy_is_read_back_from_its_pod():
+    found = proxy_pod(
+        proxy_obj(
+            status={
+                "phase": "Running",
+                "podIP": "10.244.1.9",
+                "conditions": [{"type": "Ready", "status": "True"}],
+                "containerStatuses": [
+                    {"name": "proxy", "restartCount": 2, "state": {"running": {}}}
+                ],
+            }
+        )
+    )
+
+    assert found is not None
+    assert (found.of, found.owner, found.on) == (Name(NAMESPACE, "arm"), "uid-arm", "node1")
+    assert (found.range, found.fingerprint, found.image) == (
+        RANGE,
+        "0123456789abcdef",
+        "rosproxy:1",
+    )
+    assert (found.token, found.ready, found.stuck, found.restarts) == ("secret", True, None, 2)
+    assert found.pod.host_ports == set(RANGE.ports())
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        ("metadata", "labels", "rosproxy.io/proxy-of"),
+        ("metadata", "labels", "app.kubernetes.io/managed-by"),
+        ("metadata", "annotations", "rosproxy.io/node"),
+        ("metadata", "annotations", "rosproxy.io/port-range"),
+        ("metadata", "ownerReferences"),
+        ("spec", "containers"),
+    ],
+)
+def test_a_pod_that_lacks_something_is_no_proxy(path):
+    obj = proxy_obj()
+    inner = obj
+    for key in path[:-1]:
+        inner = inner[key]
+    del inner[path[-1]]
+
+    assert proxy_pod(obj) is None
+
+
+def test_somebody_elses_pod_with_the_same_labels_is_no_proxy():
+    obj = proxy_obj()
+    obj["metadata"]["ownerReferences"][0].update(apiVersion="apps/v1", kind="ReplicaSet")
+
+    assert proxy_pod(obj) is None
+    assert proxy_pod(pod_obj()) is None
+
+
+def test_a_service():
+    found = service(service_obj())
+
+    assert found is not None
+    assert (found.of, found.owner) == (Name(NAMESPACE, "arm"), "uid-arm")
+    assert (found.cluster_ip, found.fingerprint, found.deleting) == (CLUSTER_IP, "f", False)
+
+
+def test_a_service_without_an_address():
+    assert service({**service_obj(), "spec": {"clusterIP": "None"}}).cluster_ip == ""  # type: ignore[union-attr]
+    assert service(service_obj(deletionTimestamp="2026-11-21T14:00:00Z")).deleting  # type: ignore[union-attr]
+
+
+def test_other_services_are_not_ours():
+    assert service(service_obj(labels={})) is None
+    assert service(service_obj(ownerReferences=[])) is None
+    assert service(service_obj(name="roscore")) is None
+
+
+STATUS = {
+    "master": {"up": True, "error": ""},
+    "ports": {"used": 2},
+    "nodes": [
+        {
+            "nodes": ["/talker"],
+            "address": "10.244.1.5:40001",
+            "publishes": ["/chatter", "/rosout"],
+            "subscribes": [],
+        },
+        {"nodes": ["/b", "/a"], "address": "10.244.1.5:40002", "subscribes": ["/chatter"]},
+        {"nodes": ["/v6"], "address": "[fd00::5]:40001", "state": "silent"},
+        {"nodes": ["/dead"], "address": "10.244.1.6:40001", "state": "cleaned"},
+    ],
+    "problems": [
+        {"age": 3.0, "subject": "/talker", "text": "does not answer"},
+        {"age": RECENT + 1, "subject": "/old", "text": "long ago"},
+    ],
+}
+
+
+def test_what_a_proxy_answers():
+    found = answer(STATUS)
+
+    assert (found.answered, found.master_up, found.error, found.used) == (True, True, "", 2)
+    assert found.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
+    assert found.topics == {"/chatter", "/rosout"}
+    assert found.problems == ("/talker: does not answer",)
+
+
+def test_a_proxy_without_its_master():
+    assert answer({"master": {"up": False, "error": "refused"}}).error == "refused"
+    assert answer({"master": {"up": False, "error": ""}}).error == "not asked yet"
+
+
+def test_a_proxy_that_does_not_answer():
+    found = no_answer("timed\x1bout")
+
+    assert (found.answered, found.master_up, found.error) == (False, False, "timed\\x1bout")
+
+
+_json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["master", "up", "nodes", "address", "ports", "used", "problems"])
+            | st.text(max_size=3),
+            inner,
+            max_size=4,
+        )
+    ),
+)
+
+
+@given(_json)
+def test_no_answer_of_a_proxy_is_too_strange(status):
+    assert answer(status).answered
+
+
+@given(st.dictionaries(st.sampled_from(["metadata", "spec", "status"]), _json))
+def test_no_object_is_too_strange(obj):
+    pod(obj)
+    node(obj)
+    assert proxy_pod(obj) is None
+    assert service(obj) is None
+
+
+@pytest.mark.parametrize("host", ["node1", "arm.example", "192.0.2.7", "fd00::1", "[fd00::1]"])
+def test_hosts_that_outside_can_be_told(host):
+    assert host_problem(host) == ""
+
+
+@pytest.mark.parametrize("host", ["", "a b", "http://a", "localhost", "127.0.0.1", "[::1]"])
+def test_hosts_that_outside_can_not_be_told(host):
+    assert host_problem(host)

@@ -1,0 +1,170 @@
+"""What is known of proxies that start, answer, fall silent and go."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.kubernetes import proxy_sync
+from rosproxy_operator.kubernetes.planner.model import ProxyPod
+from rosproxy_operator.kubernetes.planner.objects import proxy_pod
+from rosproxy_operator.kubernetes.proxy_sync import ProxySync
+from tests.unit.operator.kubernetes.builders_api import proxy_obj
+
+UP = {"master": {"up": True}, "nodes": []}
+DOWN = {"master": {"up": False, "error": "refused"}, "nodes": []}
+
+
+class Told(ProxyClient):
+    """Proxies whose answers are given by the test."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.says: dict[str, Any] | None = None
+        self.hears = True
+        self.asked = self.failing = 0
+        self.told: list[Any] = []
+
+    async def status(self, where: HostPort) -> dict[str, Any]:
+        self.asked += 1
+        self.failing -= 1
+        if self.says is None or self.failing >= 0:
+            raise ProxyError(f"{where} refuses connections")
+        return self.says
+
+    async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
+        self.told.append(body)
+        if not self.hears:
+            raise ProxyError("its master is away", later=True)
+        return {}
+
+
+class Talk:
+    def __init__(self) -> None:
+        self.proxies, self.tasks, self.changes = Told(), Tasks(), 0
+        self.all = ProxySync(self.tasks, self.proxies, self.changed)
+
+    def changed(self) -> None:
+        self.changes += 1
+
+    async def asked(self, times: int = 3) -> None:
+        target = self.proxies.asked + times
+        await until(lambda: self.proxies.asked >= target)
+
+
+@pytest.fixture
+async def talk(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Talk]:
+    monkeypatch.setattr(proxy_sync, "EVERY", 0.01)
+    monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.01)
+    one = Talk()
+    yield one
+    await one.tasks.cancel()
+
+
+async def until(true: Callable[[], bool]) -> None:
+    end = time.monotonic() + 5
+    while not true():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.005)
+
+
+def proxy(ip: str = "10.244.1.7") -> ProxyPod:
+    found = proxy_pod(proxy_obj(status={"phase": "Running", "podIP": ip}))
+    assert found is not None
+    return found
+
+
+UID = proxy().pod.uid
+
+
+async def test_an_answer(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.hold([proxy()])
+    await talk.asked()
+    assert talk.all.answers[UID].master_up
+    assert talk.changes == 1  # the same answer is no news
+
+
+async def test_one_that_is_just_starting_is_no_news(talk: Talk) -> None:
+    talk.all.hold([proxy()])
+    await talk.asked()
+    talk.proxies.says = DOWN  # it has not asked its master yet
+    await talk.asked()
+    assert talk.all.answers == {}
+    assert talk.changes == 0
+    talk.proxies.says = UP
+    await talk.asked()
+    assert talk.all.answers[UID].answered
+
+
+@pytest.mark.parametrize("says", [None, DOWN])
+async def test_one_that_never_gets_well_is_told_of(
+    talk: Talk, says: dict[str, Any] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proxy_sync, "STARTING", 0.05)
+    talk.proxies.says = says
+    talk.all.hold([proxy()])
+    await until(lambda: UID in talk.all.answers)
+    assert not talk.all.answers[UID].master_up
+    assert "refuse" in talk.all.answers[UID].error
+
+
+async def test_one_unanswered_question_is_no_silence(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.hold([proxy()])
+    await talk.asked()
+    talk.proxies.failing = 1
+    await talk.asked()
+    assert talk.changes == 1
+    talk.proxies.says = None
+    await talk.asked()
+    assert not talk.all.answers[UID].answered
+    assert talk.changes == 2
+
+
+async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
+    talk.proxies.says, talk.proxies.hears = UP, False
+    talk.all.hold([proxy()])
+    talk.all.tell({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
+    await until(lambda: len(talk.proxies.told) > 2)
+    talk.all.tell({UID: ["10.0.0.1"]})
+    talk.proxies.hears = True
+    await until(lambda: talk.proxies.told[-1] == {"gone": ["10.0.0.1", "10.0.0.2"]})
+    count, changes = len(talk.proxies.told), talk.changes
+    await talk.asked()
+    assert len(talk.proxies.told) == count
+    assert talk.changes == changes + 1  # one more look whether the nodes are still there
+
+
+async def test_who_is_not_there_any_more_is_forgotten(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.hold([proxy()])
+    await talk.asked()
+    talk.all.hold([])
+    assert talk.all.answers == {}
+    await asyncio.sleep(0.03)
+    asked = talk.proxies.asked
+    await asyncio.sleep(0.05)
+    assert talk.proxies.asked == asked
+
+
+async def test_another_address_is_another_conversation(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.hold([proxy()])
+    await talk.asked()
+    talk.all.hold([proxy("10.244.1.8")])
+    assert talk.all.answers == {}
+
+
+async def test_no_address_no_conversation(talk: Talk) -> None:
+    one = proxy()
+    ended = replace(one, pod=replace(one.pod, phase="Failed"))
+    talk.all.hold([proxy(""), ended])
+    await asyncio.sleep(0.05)
+    assert talk.proxies.asked == 0

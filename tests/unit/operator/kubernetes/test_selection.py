@@ -1,0 +1,203 @@
+"""Which pods a RosProxy takes."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy_operator.kubernetes.planner.model import Name, Node, Selector
+from rosproxy_operator.kubernetes.planner.names import own_labels
+from rosproxy_operator.kubernetes.planner.selection import (
+    chosen,
+    label_selector,
+    matches,
+    nobody,
+    on_node,
+)
+from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
+
+INJECT = "rosproxy.io/inject"
+ALL = Selector()
+
+
+def expression(key: str, operator: str, *values: str) -> Selector:
+    return Selector(expressions=((key, operator, frozenset(values)),))
+
+
+@pytest.mark.parametrize(
+    ("selector", "labels", "fits"),
+    [
+        (ALL, {}, True),
+        (Selector({"a": "1"}), {"a": "1", "b": "2"}, True),
+        (Selector({"a": "1"}), {"a": "2"}, False),
+        (Selector({"a": ""}), {}, False),
+        (expression("a", "In", "1", "2"), {"a": "2"}, True),
+        (expression("a", "In", "1"), {}, False),
+        (expression("a", "NotIn", "1"), {"a": "1"}, False),
+        (expression("a", "NotIn", "1"), {}, True),
+        (expression("a", "Exists"), {"a": ""}, True),
+        (expression("a", "Exists"), {}, False),
+        (expression("a", "DoesNotExist"), {}, True),
+        (expression("a", "DoesNotExist"), {"a": ""}, False),
+        (expression("a", "Gt", "1"), {"a": "2"}, False),
+    ],
+)
+def test_label_selectors(selector, labels, fits):
+    assert matches(selector, labels) is fits
+
+
+def test_by_default_pods_are_asked_for_by_their_label():
+    assert label_selector(rosproxy().spec, "arm") == "rosproxy.io/inject in (arm,true)"
+
+
+def test_a_selector_as_the_api_server_takes_it():
+    selector = Selector(
+        {"b": "2", "a": ""},
+        (
+            ("tier", "NotIn", frozenset({"x", "y"})),
+            ("on", "Exists", frozenset()),
+            ("off", "DoesNotExist", frozenset()),
+        ),
+    )
+
+    assert label_selector(rosproxy(selector=selector).spec, "arm") == (
+        "a=,b=2,tier notin (x,y),on,!off,rosproxy.io/inject notin (,false)"
+    )
+
+
+def server_side(selector: str, labels: Mapping[str, str]) -> bool:
+    """What the API server makes of a selector: written anew from its grammar."""
+    return all(
+        requirement(one, labels) for one in re.split(r",(?![^(]*\))", selector) if one.strip()
+    )
+
+
+def requirement(text: str, labels: Mapping[str, str]) -> bool:
+    listed = re.fullmatch(r"(\S+) (in|notin) \((.*)\)", text)
+    if listed:
+        among = labels.get(listed[1]) in listed[3].split(",")
+        return among if listed[2] == "in" else not among
+    if "=" in text:
+        key, _, value = text.partition("=")
+        return labels.get(key) == value
+    return text[1:] not in labels if text.startswith("!") else text in labels
+
+
+_keys = st.sampled_from(["app", "example.org/tier", INJECT])
+_values = st.sampled_from(["", "a", "true", "false", "arm", "leg"])
+_labels = st.dictionaries(_keys, _values)
+
+
+def _expressions() -> st.SearchStrategy[tuple[str, str, frozenset[str]]]:
+    some = st.frozensets(_values, min_size=1, max_size=3)
+    return st.tuples(_keys, st.sampled_from(["In", "NotIn"]), some) | st.tuples(
+        _keys, st.sampled_from(["Exists", "DoesNotExist"]), st.just(frozenset())
+    )
+
+
+_selectors = st.builds(Selector, _labels, st.lists(_expressions(), max_size=3).map(tuple))
+
+
+@given(_selectors | st.none(), _labels)
+def test_the_api_server_gives_exactly_the_pods_that_are_taken(selector, labels):
+    one = rosproxy(selector=selector)
+
+    asked = server_side(label_selector(one.spec, one.id.name), labels)
+
+    assert asked is (chosen(pod(labels=labels), [one]).rosproxy is one)
+
+
+@pytest.mark.parametrize(("label", "taken"), [("true", True), ("arm", True), ("leg", False)])
+def test_a_pod_is_taken_by_its_label(label, taken):
+    one = rosproxy()
+
+    assert chosen(pod(labels={INJECT: label}), [one]).rosproxy is (one if taken else None)
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        {INJECT: "false"},
+        {INJECT: ""},
+        own_labels("arm"),
+        {"app.kubernetes.io/name": "rosproxy", "app.kubernetes.io/component": "controller"},
+        {"app.kubernetes.io/part-of": "rosproxy", "app.kubernetes.io/component": "controller"},
+    ],
+)
+def test_pods_that_no_selector_takes(labels):
+    assert chosen(pod(labels=labels), [rosproxy(selector=ALL)]) == chosen(pod(), [])
+
+
+def test_a_pod_of_another_namespace_is_not_taken():
+    assert chosen(pod(namespace="other"), [rosproxy()]).rosproxy is None
+
+
+def test_a_rosproxy_that_is_being_deleted_takes_no_pod():
+    gone, new = rosproxy("gone", deleting=True), rosproxy("new")
+
+    assert chosen(pod(), [gone, new]).rosproxy is new
+
+
+def test_of_two_the_label_decides():
+    arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
+
+    assert chosen(pod(labels={INJECT: "leg"}), [arm, leg]).rosproxy is leg
+
+
+@pytest.mark.parametrize("labels", [{INJECT: "true"}, {}, {INJECT: "third"}])
+def test_a_pod_that_two_select_has_none(labels):
+    arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
+
+    found = chosen(pod(labels=labels), [leg, arm])
+
+    assert found.rosproxy is None
+    assert found.finding is not None
+    assert (found.finding.reason, found.finding.of) == ("Ambiguous", arm.id)
+    assert found.finding.subject == "pod robots/talker"
+    assert found.finding.about is not None
+    assert (found.finding.about.kind, found.finding.about.uid) == ("Pod", "uid-talker")
+    assert "arm and leg" in found.finding.text
+    assert f"{INJECT}=arm" in found.finding.text
+
+
+def test_a_pod_in_its_nodes_own_network_is_left_out():
+    found = chosen(pod(host_network=True), [rosproxy()])
+
+    assert found.rosproxy is None
+    assert found.finding is not None
+    assert (found.finding.reason, found.finding.of) == ("HostNetwork", Name("robots", "arm"))
+
+
+def test_a_pod_that_is_not_labelled_needs_no_warning():
+    assert nobody(pod(labels={}), []) == ""
+    assert nobody(pod(labels={INJECT: "false"}), []) == ""
+
+
+@pytest.mark.parametrize(
+    ("label", "there", "said"),
+    [
+        ("true", [], "no RosProxy in namespace robots"),
+        ("true", [rosproxy("arm", namespace="other")], "no RosProxy in namespace robots"),
+        ("leg", [rosproxy("arm"), rosproxy("hand")], "set it to arm or hand"),
+        ("true", [rosproxy("arm", Selector({"app": "x"}))], "spec.podSelector of RosProxy arm"),
+        ("arm", [rosproxy("arm", Selector({"app": "x"}))], "spec.podSelector of RosProxy arm"),
+    ],
+)
+def test_why_no_rosproxy_takes_a_labelled_pod(label, there, said):
+    text = nobody(pod(labels={INJECT: label}), there)
+
+    assert said in text
+    assert "create" in text
+
+
+@pytest.mark.parametrize(
+    ("wanted", "fits"), [({}, True), ({"disk": "ssd"}, True), ({"disk": "hdd"}, False)]
+)
+def test_nodes_that_may_have_a_proxy(wanted, fits):
+    one = rosproxy()
+    picky = replace(one, spec=replace(one.spec, node_selector=wanted))
+
+    assert on_node(picky, Node("node1", {"disk": "ssd"})) is fits

@@ -1,0 +1,259 @@
+"""RosProxies as they are read."""
+
+import re
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner.model import Advertise, Master, Name, Selector
+from rosproxy_operator.kubernetes.planner.spec import RESOURCES, Unusable, invalid, rosproxy
+from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
+
+
+def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
+    found = rosproxy(rosproxy_obj())
+
+    assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
+    spec = found.spec
+    assert spec.master == Master(uri="http://robot:11311")
+    assert (spec.ports, spec.window) == (32, PortRange(11400, 29999))
+    assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
+    assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
+    assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
+    assert (spec.image, spec.image_pull_policy, spec.resources) == ("", "", RESOURCES)
+    assert (found.former, found.cluster_ip, found.deleting) == ({}, "", False)
+
+
+def test_all_fields():
+    found = rosproxy(
+        rosproxy_obj(
+            {
+                "master": {"service": {"name": "roscore"}, "publish": 31100},
+                "ports": 8,
+                "portWindow": {"first": 12000},
+                "podSelector": {
+                    "matchLabels": {"app": "ros"},
+                    "matchExpressions": [
+                        {"key": "example.org/tier", "operator": "In", "values": ["a", ""]},
+                        {"key": "off", "operator": "DoesNotExist"},
+                    ],
+                },
+                "nodeSelector": {"disk": "ssd"},
+                "tolerations": [{"operator": "Exists"}],
+                "advertise": "Hostname",
+                "cleanupAfterSeconds": 0,
+                "graceSeconds": 5,
+                "policy": {"slaveControl": "Master"},
+                "dataPlane": "Kernel",
+                "image": "rosproxy:2",
+                "imagePullPolicy": "Never",
+                "imagePullSecrets": [{"name": "pull"}],
+                "resources": {"requests": {"cpu": 1}},
+                "hostAliases": [{"ip": "192.0.2.7", "hostnames": ["Robot", "robot.example"]}],
+            }
+        )
+    ).spec
+
+    assert found.master == Master(service=Name(NAMESPACE, "roscore"), publish=31100)
+    assert (found.ports, found.window) == (8, PortRange(12000, 29999))
+    assert found.pod_selector == Selector(
+        {"app": "ros"},
+        (
+            ("example.org/tier", "In", frozenset({"a", ""})),
+            ("off", "DoesNotExist", frozenset()),
+        ),
+    )
+    assert found.node_selector == {"disk": "ssd"}
+    assert found.tolerations == ({"operator": "Exists"},)
+    assert (found.advertise, found.slave_control) == (Advertise.HOSTNAME, "master")
+    assert (found.cleanup_after, found.grace, found.data_plane) == (0.0, 5.0, "kernel")
+    assert (found.image, found.image_pull_policy) == ("rosproxy:2", "Never")
+    assert found.image_pull_secrets == ({"name": "pull"},)
+    assert found.resources == {"requests": {"cpu": 1}}
+    assert found.host_aliases == ({"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]},)
+
+
+@pytest.mark.parametrize(
+    ("uri", "read"),
+    [
+        ("http://Robot:11311/", "http://robot:11311"),
+        ("http://robot", "http://robot:11311"),
+        ("http://robot/", "http://robot:11311"),
+        ("http://robot:80/master/", "http://robot:80/master"),
+        ("http://192.0.2.7:11311", "http://192.0.2.7:11311"),
+        ("http://[fd00::1]", "http://[fd00::1]:11311"),
+        (" http://robot:11311 ", "http://robot:11311"),
+    ],
+)
+def test_masters(uri, read):
+    assert rosproxy(rosproxy_obj({"master": {"uri": uri}})).spec.master.uri == read
+
+
+def test_a_masters_address():
+    master = {"uri": "http://robot:11311", "address": "192.0.2.7"}
+
+    assert rosproxy(rosproxy_obj({"master": master})).spec.master.address == "192.0.2.7"
+
+
+def test_what_the_status_holds():
+    lines = [
+        {"name": "node1", "ports": "11400-11431"},
+        {"name": "node2"},
+        {"name": "node3", "ports": "11431-11400"},
+        "strange",
+    ]
+
+    found = rosproxy(rosproxy_obj(status={"masterURI": "http://10.96.7.7:11311", "perNode": lines}))
+
+    assert found.former == {"node1": PortRange(11400, 11431)}
+    assert found.cluster_ip == "10.96.7.7"
+    assert found.status["perNode"] == lines
+
+
+def test_one_that_is_being_deleted():
+    obj = rosproxy_obj()
+    obj["metadata"]["deletionTimestamp"] = "2026-11-21T14:00:00Z"
+
+    assert rosproxy(obj).deleting
+
+
+def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> dict[str, Any]:
+    one: dict[str, Any] = {"key": key, "operator": operator}
+    return {"podSelector": {"matchExpressions": [{**one, "values": list(values)}]}}
+
+
+@pytest.mark.parametrize(
+    ("spec", "field"),
+    [
+        ({"master": None}, "spec.master"),
+        ({"master": "http://robot:11311"}, "spec.master"),
+        ({"master": {"uri": "http://r:1", "service": {"name": "r"}}}, "spec.master"),
+        ({"master": {"uri": 7}}, "spec.master.uri"),
+        ({"master": {"uri": "robot:11311"}}, "spec.master.uri"),
+        ({"master": {"uri": "https://robot:11311"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://robot:"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://robot:99999"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://[::"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://localhost:11311"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://127.0.0.2"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://rosproxy-arm:11311"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://rosproxy-arm.robots:11311"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://rosproxy-arm.robots.svc.cluster.local"}}, "spec.master.uri"),
+        ({"master": {"uri": "http://r:1", "address": "robot"}}, "spec.master.address"),
+        ({"master": {"uri": "http://r:1", "address": "::1"}}, "spec.master.address"),
+        ({"master": {"service": {"name": "r"}, "address": "192.0.2.7"}}, "spec.master.address"),
+        ({"master": {"service": {"name": "r"}, "publish": 80}}, "spec.master.publish"),
+        ({"master": {"service": {}}}, "spec.master.service.name"),
+        ({"master": {"service": {"name": "rosproxy-arm"}}}, "spec.master.service.name"),
+        ({"master": {"service": {"name": "r", "namespace": "a.b"}}}, "spec.master.service.namesp"),
+        ({"master": {"service": {"name": "r", "port": 0}}}, "spec.master.service.port"),
+        ({"ports": 0}, "spec.ports"),
+        ({"ports": 501}, "spec.ports"),
+        ({"ports": True}, "spec.ports"),
+        ({"ports": "32"}, "spec.ports"),
+        ({"portWindow": {"first": 80}}, "spec.portWindow.first"),
+        ({"portWindow": {"first": 12000, "last": 12010}}, "spec.portWindow"),
+        ({"portWindow": {"first": 12000, "last": 11999}, "ports": 1}, "spec.portWindow"),
+        ({"portWindow": [1, 2]}, "spec.portWindow"),
+        ({"podSelector": {"matchLabels": {"a b": "x"}}}, "spec.podSelector.matchLabels"),
+        ({"podSelector": {"matchLabels": {"a": "x,y"}}}, "spec.podSelector.matchLabels.a"),
+        ({"podSelector": {"matchLabels": {"a": 1}}}, "spec.podSelector.matchLabels.a"),
+        (_selector(operator="Gt"), "spec.podSelector.matchExpressions[0].operator"),
+        (_selector(key="/x"), "spec.podSelector.matchExpressions[0].key"),
+        (_selector(key="A.b/x/y"), "spec.podSelector.matchExpressions[0].key"),
+        (_selector(values=["a)"]), "spec.podSelector.matchExpressions[0].values[0]"),
+        (_selector(values=[]), "spec.podSelector.matchExpressions[0].values"),
+        (_selector(operator="Exists"), "spec.podSelector.matchExpressions[0].values"),
+        ({"nodeSelector": {"a": 1}}, "spec.nodeSelector.a"),
+        ({"tolerations": ["x"]}, "spec.tolerations[0]"),
+        ({"advertise": "Internal"}, "spec.advertise"),
+        ({"cleanupAfterSeconds": -1}, "spec.cleanupAfterSeconds"),
+        ({"graceSeconds": "1m"}, "spec.graceSeconds"),
+        ({"policy": {"slaveControl": "any"}}, "spec.policy.slaveControl"),
+        ({"dataPlane": "kernel"}, "spec.dataPlane"),
+        ({"imagePullPolicy": "Maybe"}, "spec.imagePullPolicy"),
+        ({"hostAliases": {"robot": "192.0.2.7"}}, "spec.hostAliases"),
+        ({"hostAliases": [{"ip": "robot", "hostnames": []}]}, "spec.hostAliases[0].ip"),
+        ({"hostAliases": [{"ip": "010.0.0.1"}]}, "spec.hostAliases[0].ip"),
+        ({"hostAliases": [{"ip": "fe80::1%eth0"}]}, "spec.hostAliases[0].ip"),
+        (
+            {"hostAliases": [{"ip": "192.0.2.7", "hostnames": ["my_robot"]}]},
+            "spec.hostAliases[0].hostnames[0]",
+        ),
+    ],
+)
+def test_what_can_not_be_used_is_told_by_its_field(spec, field):
+    with pytest.raises(Unusable, match=re.escape(field)) as error:
+        rosproxy(rosproxy_obj(spec))
+
+    assert ": " in str(error.value)
+    assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize("name", ["a" * 47, "Arm", "arm.1", "", "-a"])
+def test_names_that_are_no_part_of_a_host_name(name):
+    with pytest.raises(Unusable, match=re.escape("metadata.name")):
+        rosproxy(rosproxy_obj(name=name))
+
+
+def test_the_longest_name():
+    assert rosproxy(rosproxy_obj(name="a" * 46)).id.name == "a" * 46
+
+
+def test_what_is_left_of_one_that_can_not_be_used():
+    obj = rosproxy_obj({"ports": 0}, status={"masterURI": "http://10.96.7.7:11311"})
+
+    found = invalid(obj, Unusable("spec.ports: 0"))
+
+    assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
+    assert found.text == "spec.ports: 0"
+    assert found.status == {"masterURI": "http://10.96.7.7:11311"}
+
+
+_FIELDS = [
+    *("master", "uri", "address", "service", "publish", "ports", "portWindow", "first", "last"),
+    *("podSelector", "matchLabels", "matchExpressions", "key", "operator", "values", "advertise"),
+    *("nodeSelector", "tolerations", "policy", "slaveControl", "cleanupAfterSeconds", "image"),
+    "dataPlane",
+    *("imagePullSecrets", "resources", "hostAliases", "ip", "hostnames"),
+]
+_json = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from(["http://robot:11311", "http://[::1", "In", "app"]),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(_FIELDS) | st.text(max_size=3), inner, max_size=5)
+    ),
+    max_leaves=15,
+)
+
+
+def _refusal(obj: Any) -> str:
+    """Why it is refused, empty if it is not."""
+    try:
+        rosproxy(obj)
+    except Unusable as error:
+        return invalid(obj, error).text
+    return ""
+
+
+@given(_json)
+def test_no_spec_is_too_strange_to_be_read_or_refused(spec):
+    text = _refusal({**rosproxy_obj(), "spec": spec})
+
+    assert not text or text.startswith("spec")
+
+
+@given(st.dictionaries(st.sampled_from(_FIELDS), _json, min_size=1, max_size=3))
+def test_a_bad_field_beside_good_ones(spec):
+    text = _refusal(rosproxy_obj(spec))
+
+    assert not text or text.startswith("spec.")

@@ -1,0 +1,317 @@
+"""kopf itself, in its thread, against an API server on loopback: it may end, nothing else does."""
+
+import asyncio
+import base64
+import json
+import socket
+import ssl
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import AsyncIterator, Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import jsonpatch
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes import kopf_log, watch
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.event_filter import EventFilter
+from rosproxy_operator.kubernetes.watch import Watch
+from rosproxy_operator.kubernetes.webhook import certificates
+from rosproxy_operator.kubernetes.webhook.injector import Injector
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, Directory
+from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+from rosproxy_operator.settings import KubernetesSettings
+from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
+
+PAIR = certificates.make(["localhost"], certificates.now())
+INJECT = {"rosproxy.io/inject": "true"}
+
+
+class Woken:
+    """A controller that only counts."""
+
+    def __init__(self) -> None:
+        self.concern = EventFilter()
+        self.times = 0
+        self.reason: str | None = None
+
+    def wake(self) -> None:
+        self.times += 1
+
+    def dead(self) -> str | None:
+        return self.reason
+
+
+class Running:
+    """A watch with its surroundings."""
+
+    def __init__(self, server: ApiServer, api: Api) -> None:
+        self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
+        self.liveness, self.webhook = free_port(), free_port()
+        keeper = CertificateRotation(Directory(""), self.metrics)
+        keeper.pair = PAIR
+        settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
+        serving = WebhookServer(HostPort("127.0.0.1", self.webhook), keeper)
+        self.wirer = Injector(api, self.metrics)
+        self.watch = Watch(settings, self.controller, self.wirer, serving, self.metrics)
+
+    async def health(self) -> tuple[int, str]:
+        return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
+
+    async def admit(self, pod: dict[str, Any], **more: Any) -> dict[str, Any]:
+        """What the webhook answers for a pod."""
+        review = {
+            "apiVersion": "admission.k8s.io/v1",
+            "kind": "AdmissionReview",
+            "request": {
+                "uid": "u1",
+                "operation": "CREATE",
+                "resource": {"group": "", "version": "v1", "resource": "pods"},
+                "userInfo": {"username": "me"},
+                "object": pod,
+                **more,
+            },
+        }
+        response: dict[str, Any] = await in_thread(post, self.webhook, "/wire", review)
+        assert response["response"]["uid"] == "u1"
+        assert response["response"]["allowed"] is True
+        found: dict[str, Any] = response["response"]
+        return found
+
+
+@pytest.fixture
+async def running(
+    server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Running]:
+    monkeypatch.setattr(watch, "BACK_OFF", (0.05,))
+    monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.05,))
+    kopf_log.quieten()
+    one = Running(server, api)
+    one.watch.start()
+    await until(lambda: watched(server))
+    yield one
+    await in_thread(one.watch.stop)
+    assert "kopf" not in {thread.name for thread in threading.enumerate()}
+
+
+def watched(server: ApiServer) -> bool:
+    kinds = ("rosproxies", "pods", "nodes", "services")
+    return all(server.watches(kind) == 1 for kind in kinds)
+
+
+async def until(true: Callable[[], bool], seconds: float = 10.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def get(url: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(url, timeout=5) as reply:
+            return reply.status, reply.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def post(port: int, path: str, body: Any) -> Any:
+    context = ssl.create_default_context(cadata=PAIR.ca.decode())
+    request = urllib.request.Request(
+        f"https://localhost:{port}{path}",
+        json.dumps(body).encode(),
+        {"Content-Type": "application/json"},
+    )
+    with urllib.request.urlopen(request, timeout=5, context=context) as reply:
+        return json.loads(reply.read())
+
+
+async def test_events_wake_and_nothing_is_written(running: Running) -> None:
+    server = running.server
+    before = running.controller.times
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    await until(lambda: running.controller.times > before)
+    before = running.controller.times
+    server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
+    await until(lambda: running.controller.times > before)
+    before = running.controller.times
+    server.drop("pods", "talker", NAMESPACE)
+    await until(lambda: running.controller.times > before)
+    assert {method for method, _, _ in server.requests} == {"GET"}
+
+
+async def test_a_watch_that_is_too_old_begins_anew(running: Running) -> None:
+    lists = len(running.server.asked("GET", "pods"))
+    running.server.end_watches({"type": "ERROR", "object": {"code": 410, "message": "old"}})
+    await until(lambda: len(running.server.asked("GET", "pods")) > lists + 1)
+    await until(lambda: watched(running.server))
+    before = running.controller.times
+    running.server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
+    await until(lambda: running.controller.times > before)
+    assert running.metrics.watch_restarts._value.get() == 0
+
+
+async def test_when_kopf_ends_it_is_started_again(
+    running: Running, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = len(running.server.asked("GET", "pods"))
+    running.server.end_watches({"type": "ERROR", "object": {"code": 500, "message": "etcd"}})
+    await until(lambda: "watching has ended" in caplog.text)
+    await until(lambda: len(running.server.asked("GET", "pods")) > asked + 1)
+    await until(lambda: watched(running.server))
+    before = running.controller.times
+    running.server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
+    await until(lambda: running.controller.times > before)
+    assert (await running.health())[0] == 200
+
+
+async def test_kinds_that_appear_later_are_watched_after_a_restart(running: Running) -> None:
+    running.watch.restart()
+    await until(lambda: running.metrics.watch_restarts._value.get() == 1)
+    await until(lambda: running.server.watches("rosproxies") == 1)
+
+
+async def test_liveness_is_the_controllers(running: Running) -> None:
+    assert await running.health() == (200, '{"alive": "ok"}')
+
+
+async def test_a_hung_controller_is_not_alive(running: Running) -> None:
+    running.controller.reason = "the event loop has not run for 30 s"
+    status, _ = await running.health()
+    assert status == 500
+
+
+async def test_a_missing_rule_is_told_once(
+    server: ApiServer, api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.02,))
+    kopf_log.quieten()
+    text = 'User "x" cannot list resource "nodes" in API group "" at the cluster scope'
+    server.refuse("GET", "nodes", 403, text)
+    one = Running(server, api)
+    one.watch.start()
+    await until(lambda: len(server.asked("GET", "nodes")) > 4)
+    await in_thread(one.watch.stop)
+    told = [record for record in caplog.records if "watching is refused" in record.getMessage()]
+    assert len(told) == 1
+    assert 'resources ["nodes"], verbs ["list"]' in told[0].getMessage()
+
+
+async def test_a_pod_is_wired(running: Running) -> None:
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    pod = pod_obj("talker", INJECT)
+    found = await running.admit(pod)
+    assert "warnings" not in found
+    patch = json.loads(base64.b64decode(found["patch"]))
+    wired = jsonpatch.apply_patch(pod, patch)
+    (service,) = running.server.all("services")
+    uri = f"http://{service['spec']['clusterIP']}:11311"
+    env = {one["name"]: one for one in wired["spec"]["containers"][0]["env"]}
+    assert env["ROS_MASTER_URI"]["value"] == uri
+    assert env["ROS_IP"]["valueFrom"]["fieldRef"]["fieldPath"] == "status.podIP"
+    assert wired["metadata"]["annotations"]["rosproxy.io/master-uri"] == uri
+    assert running.metrics.admissions.labels("wired")._value.get() == 1
+
+
+async def test_a_dry_run_creates_nothing(running: Running) -> None:
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT), dryRun=True)
+    assert "has no cluster IP yet" in found["warnings"][0]
+    assert not running.server.all("services")
+
+
+@pytest.mark.parametrize("status", [403, 500])
+async def test_a_pod_is_admitted_whatever_the_api_server_says(
+    running: Running, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
+    running.server.refuse("GET", "rosproxies", status, "no")
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert found["warnings"][0].startswith("rosproxy: this pod was not wired to a proxy: ")
+    assert "patch" not in found
+
+
+async def test_an_api_server_that_is_just_starting_is_asked_again(running: Running) -> None:
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    running.server.refuse("GET", "rosproxies", 429, "storage is (re)initializing")
+    asyncio.get_running_loop().call_later(0.4, running.server.refusals.clear)
+    assert "patch" in await running.admit(pod_obj("talker", INJECT))
+
+
+async def test_a_pod_waits_for_a_service_that_is_just_made(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before kube-proxy knows it, a connection would be lost for two minutes."""
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.5)
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    await running.admit(pod_obj("first", INJECT))
+    (service,) = running.server.all("services")
+    made = datetime.now(UTC) + timedelta(seconds=3600)
+    service["metadata"]["creationTimestamp"] = made.isoformat()
+    started = time.monotonic()
+    assert "patch" in await running.admit(pod_obj("second", INJECT))
+    assert 0.4 < time.monotonic() - started < 2.0  # also if a clock is wrong
+    service["metadata"]["creationTimestamp"] = "2026-01-01T00:00:00Z"
+    started = time.monotonic()
+    assert "patch" in await running.admit(pod_obj("third", INJECT))
+    assert time.monotonic() - started < 0.4
+
+
+async def test_a_pod_that_nobody_takes_is_told(running: Running) -> None:
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "no RosProxy in namespace robots" in found["warnings"][0]
+    found = await running.admit(pod_obj("talker", {"rosproxy.io/inject": "false"}))
+    assert "warnings" not in found
+
+
+async def test_a_mistake_of_ours_admits_the_pod(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> Any:
+        raise RuntimeError("oops")
+
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.parse_pod", broken)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "the controller failed: RuntimeError('oops')" in found["warnings"][0]
+
+
+async def test_what_kopf_cannot_serve_is_admitted_too(running: Running) -> None:
+    found = await running.admit(pod_obj("talker", INJECT), userInfo=None)
+    assert "the controller failed" in found["warnings"][0]
+
+
+async def test_nonsense_is_refused(running: Running) -> None:
+    bodies: list[Any] = [[], "x", {"request": 3}]
+    for nonsense in bodies:
+        with pytest.raises(urllib.error.HTTPError, match="400") as caught:
+            await in_thread(post, running.webhook, "/wire", nonsense)
+        caught.value.close()
+
+
+def test_everything_that_would_surprise_is_off(tmp_path: Path) -> None:
+    import kopf
+
+    settings = kopf.OperatorSettings()
+    one = Watch(KubernetesSettings(), Woken(), None, None, ClusterMetrics())
+    one.configure(settings)
+    assert not settings.posting.enabled
+    assert settings.scanning.disabled
+    assert settings.peering.standalone
+    assert settings.admission.managed is None
+    assert settings.process.ultimate_exiting_timeout is None
+    assert isinstance(settings.watching.server_timeout, int)  # the API server takes no other

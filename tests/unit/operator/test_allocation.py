@@ -1,0 +1,109 @@
+"""Ports are found in a row, as early as can be, where they were if that can be."""
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.allocation import (
+    PortsExhausted,
+    extended,
+    is_free,
+    negotiate,
+    overlap,
+    within,
+)
+
+WINDOW = PortRange(100, 139)
+PORTS = st.integers(90, 150)
+BLOCKED = st.frozensets(PORTS, max_size=12)
+RANGE = st.builds(lambda first, more: PortRange(first, first + more), PORTS, st.integers(0, 9))
+RANGES = st.lists(RANGE, max_size=4)
+COUNTS = st.integers(1, 12)
+
+
+def every(count: int) -> list[PortRange]:
+    """All ranges of so many ports in the window, in order."""
+    last = WINDOW.last - count + 1
+    return [PortRange(first, first + count - 1) for first in range(WINDOW.first, last + 1)]
+
+
+def free(ports: PortRange, blocked: frozenset[int], ranges: list[PortRange]) -> bool:
+    """What is_free says, said more slowly."""
+    return not any(port in blocked or any(port in r for r in ranges) for port in ports.ports())
+
+
+@given(COUNTS, BLOCKED, RANGES)
+@example(1, frozenset(), [])
+@example(40, frozenset(), [])
+@example(41, frozenset(), [])
+def test_the_first_range_that_is_free(
+    count: int, blocked: frozenset[int], ranges: list[PortRange]
+) -> None:
+    fitting = [ports for ports in every(count) if free(ports, blocked, ranges)]
+    if fitting:
+        assert negotiate(count, WINDOW, blocked, ranges) == fitting[0]
+        return
+    with pytest.raises(PortsExhausted) as error:
+        negotiate(count, WINDOW, blocked, ranges)
+    assert error.value.free == sum(free(one, blocked, ranges) for one in every(1))
+    assert error.value.longest < count
+
+
+@given(COUNTS, BLOCKED, RANGES, RANGE)
+def test_a_preferred_range_is_taken_whole_if_it_is_free(
+    count: int, blocked: frozenset[int], ranges: list[PortRange], prefer: PortRange
+) -> None:
+    longer = PortRange(prefer.first, prefer.first + count - 1)
+    if len(prefer) >= count and free(prefer, blocked, ranges):
+        assert negotiate(count, WINDOW, blocked, ranges, prefer) == prefer
+    elif len(prefer) < count and longer.last <= 139 and free(longer, blocked, ranges):
+        assert negotiate(count, WINDOW, blocked, ranges, prefer) == longer
+    else:
+        fitting = [ports for ports in every(count) if free(ports, blocked, ranges)]
+        if fitting:
+            assert negotiate(count, WINDOW, blocked, ranges, prefer) == fitting[0]
+
+
+@given(COUNTS, BLOCKED, RANGES, RANGE)
+def test_a_range_is_never_made_shorter_and_its_own_ports_do_not_matter(
+    count: int, blocked: frozenset[int], ranges: list[PortRange], ports: PortRange
+) -> None:
+    more = extended(ports, count, WINDOW, blocked, ranges)
+    added = PortRange(ports.last + 1, ports.first + count - 1)
+    if len(ports) >= count:
+        assert more == ports
+    elif free(added, blocked, ranges) and added.last <= WINDOW.last:
+        assert more == PortRange(ports.first, added.last)
+    else:
+        assert more is None
+
+
+@given(BLOCKED, RANGES, RANGE)
+def test_free_means_that_no_port_is_held(
+    blocked: frozenset[int], ranges: list[PortRange], ports: PortRange
+) -> None:
+    assert is_free(ports, blocked, ranges) == free(ports, blocked, ranges)
+
+
+@given(RANGE, RANGE)
+def test_overlap(one: PortRange, other: PortRange) -> None:
+    assert overlap(one, other) == bool(set(one.ports()) & set(other.ports()))
+    assert within(one, other) == (set(one.ports()) <= set(other.ports()))
+
+
+def test_the_error_says_how_many_there_are() -> None:
+    with pytest.raises(PortsExhausted) as error:
+        negotiate(4, PortRange(11400, 11409), {11402, 11406}, [PortRange(11408, 20000)])
+    assert str(error.value) == (
+        "no 4 free ports in a row between 11400 and 11409: 6 of 10 are free, 3 at most in a row"
+    )
+
+
+def test_the_range_of_a_usual_host() -> None:
+    ephemeral = PortRange(32768, 60999)
+    listening = {22, 80, 11311, 11405}
+    window = PortRange(11400, 65535)
+    assert negotiate(32, window, listening, [ephemeral]) == PortRange(11406, 11437)
+    assert negotiate(32, PortRange(32000, 65535), (), [ephemeral]) == PortRange(32000, 32031)
+    assert negotiate(1000, PortRange(32000, 65535), (), [ephemeral]) == PortRange(61000, 61999)

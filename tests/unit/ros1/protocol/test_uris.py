@@ -1,0 +1,233 @@
+"""Addresses in URIs: what is one, what is none, and the inside address in a path."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import (
+    HostPort,
+    is_address,
+    is_loopback,
+    parse_address,
+    parse_host_port,
+    plain_address,
+)
+from rosproxy.ros1.protocol.uris import (
+    InsidePath,
+    inside_path,
+    parse_inside_path,
+    parse_service_uri,
+    parse_slave_uri,
+    service_uri,
+    slave_uri,
+)
+
+NAMES = st.from_regex(r"[a-zA-Z0-9_]([a-zA-Z0-9_.-]{0,30}[a-zA-Z0-9_])?", fullmatch=True)
+ADDRESSES = st.ip_addresses().map(str)
+PORTS = st.integers(1, 65535)
+PLACES = st.builds(HostPort, NAMES | ADDRESSES, PORTS)
+
+AUTHORITIES = {
+    "10.0.0.5:40001": HostPort("10.0.0.5", 40001),
+    "c1:1": HostPort("c1", 1),
+    "3f2a91c0b7de:65535": HostPort("3f2a91c0b7de", 65535),
+    "My_Robot.local:80": HostPort("My_Robot.local", 80),
+    "robot-1.example.com.:80": HostPort("robot-1.example.com.", 80),
+    "größe:80": HostPort("größe", 80),
+    "[::1]:80": HostPort("::1", 80),
+    "[fd00::5]:80": HostPort("fd00::5", 80),
+    "[::ffff:10.0.0.5]:80": HostPort("::ffff:10.0.0.5", 80),
+    "[fe80::1%eth0]:80": HostPort("fe80::1%eth0", 80),
+    "": None,
+    ":": None,
+    ":80": None,
+    "c1": None,
+    "c1:": None,
+    "c1:0": None,
+    "c1:65536": None,
+    "c1:-1": None,
+    "c1:+1": None,
+    "c1:8o": None,
+    "c1:80:80": None,
+    "c1:٨٠": None,
+    "c 1:80": None,
+    "user@c1:80": None,
+    "user:password@c1:80": None,
+    "<c1>:80": None,
+    'c1":80': None,
+    "c1%0a:80": None,
+    "::1:80": None,
+    "fd00::5:80": None,
+    "[::1:80": None,
+    "::1]:80": None,
+    "[::1]": None,
+    "a[::1]:80": None,
+    "c[1]:80": None,
+}
+
+
+@pytest.mark.parametrize(("text", "where"), AUTHORITIES.items())
+def test_host_and_port(text: str, where: HostPort | None) -> None:
+    assert parse_host_port(text) == where
+    assert parse_slave_uri(f"http://{text}/") == where
+    assert parse_slave_uri(f"http://{text}") == where
+    assert parse_slave_uri(f"http://{text}/RPC2?x#y") == where
+    assert parse_service_uri(f"rosrpc://{text}") == where
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "",
+        "c1:80",
+        "//c1:80",
+        "https://c1:80/",
+        "HTTP://c1:80/",
+        "ftp://c1:80/",
+        " http://c1:80/",
+        "rosrpc://c1:80",
+        "http:///c1:80",
+        "http:c1:80",
+        "constructor",
+    ],
+)
+def test_what_is_no_slave_uri(uri: str) -> None:
+    assert parse_slave_uri(uri) is None
+
+
+@pytest.mark.parametrize("uri", ["", "http://c1:80/", "rosrpcs://c1:80", "rosrpc:c1:80"])
+def test_what_is_no_service_uri(uri: str) -> None:
+    assert parse_service_uri(uri) is None
+
+
+@given(PLACES)
+def test_uris_round_trip(where: HostPort) -> None:
+    assert parse_host_port(str(where)) == where
+    assert parse_slave_uri(slave_uri(where)) == where
+    assert parse_service_uri(service_uri(where)) == where
+
+
+@given(st.text())
+def test_any_text_is_parsed_without_raising(text: str) -> None:
+    for start in ("", "http://", "rosrpc://", "http://h:1/", "http://["):
+        parse_slave_uri(start + text)
+        parse_service_uri(start + text)
+        parse_inside_path(start + text)
+        is_loopback(start + text)
+        plain_address(start + text)
+
+
+@pytest.mark.parametrize(
+    ("node", "address", "path"),
+    [
+        (HostPort("10.0.0.5", 40001), "10.0.0.5", "/10.0.0.5:40001/"),
+        (HostPort("c1", 40001), "10.0.0.5", "/c1:40001/10.0.0.5/"),
+        (HostPort("127.0.0.1", 40001), "10.0.0.5", "/127.0.0.1:40001/10.0.0.5/"),
+        (HostPort("fd00::5", 40001), "fd00::5", "/[fd00::5]:40001/"),
+        (HostPort("c1", 40001), "fd00::5", "/c1:40001/fd00::5/"),
+        (HostPort("fe80::1%eth0", 40001), "fe80::1", "/[fe80::1%25eth0]:40001/fe80::1/"),
+        (HostPort("größe", 40001), "10.0.0.5", "/gr%C3%B6%C3%9Fe:40001/10.0.0.5/"),
+    ],
+)
+def test_the_inside_address_in_a_path(node: HostPort, address: str, path: str) -> None:
+    assert inside_path(node, address) == path
+    held = None if node.host == address else address
+    assert parse_inside_path(f"http://robot-host:45000{path}") == InsidePath(node, held)
+
+
+@given(PLACES, ADDRESSES, PLACES)
+def test_inside_paths_round_trip(node: HostPort, address: str, outside: HostPort) -> None:
+    uri = slave_uri(outside, inside_path(node, address))
+    found = parse_inside_path(uri)
+    assert found is not None
+    assert (found.node, found.address or found.node.host) == (node, address)
+    assert parse_slave_uri(uri) == outside
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "",
+        "/",
+        "/RPC2",
+        "/c1/",
+        "/c1:0/",
+        "/c1:x/",
+        "/:40001/",
+        "/c1:40001/c2/",
+        "/c1:40001/10.0.0/",
+        "/c1:40001/10.0.0.5:22/",
+        "/c1:40001/10.0.0.5/x/",
+        "/c1:40001//10.0.0.5/",
+        "/a/c1:40001/",
+        "/user@c1:40001/",
+    ],
+)
+def test_paths_without_an_inside_address(path: str) -> None:
+    assert parse_inside_path(f"http://robot-host:45000{path}") is None
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True),
+        ("127.1.2.3", True),
+        ("::1", True),
+        ("::ffff:127.0.0.1", True),
+        ("0.0.0.0", True),
+        ("::", True),
+        ("localhost", True),
+        ("LocalHost", True),
+        ("c1.localhost", True),
+        ("10.0.0.5", False),
+        ("::2", False),
+        ("localhost.example.com", False),
+        ("mylocalhost", False),
+        ("c1", False),
+        ("", False),
+    ],
+)
+def test_hosts_that_mean_another_machine_to_everybody(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
+
+
+@pytest.mark.parametrize(
+    ("address", "plain"),
+    [
+        ("10.0.0.5", "10.0.0.5"),
+        ("::ffff:10.0.0.5", "10.0.0.5"),
+        ("::FFFF:0a00:0005", "10.0.0.5"),
+        ("fe80::1%eth0", "fe80::1"),
+        ("FD00:0:0::5", "fd00::5"),
+        ("c1", "c1"),
+        ("", ""),
+    ],
+)
+def test_plain_addresses(address: str, plain: str) -> None:
+    assert plain_address(address) == plain
+    assert is_address(plain) is (plain not in ("c1", ""))
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("10.0.0.5", "10.0.0.5"),
+        ("127.0.0.1", "127.0.0.1"),
+        ("::ffff:10.0.0.5", "10.0.0.5"),
+        ("FD00::05", "fd00::5"),
+        ("::1", "::1"),
+        ("0.0.0.0", None),
+        ("::", None),
+        ("224.0.0.1", None),
+        ("fe80::1%eth0", None),
+        ("10.0.0.5%eth0", None),
+        ("10.0.0.0/24", None),
+        ("10.0.0.5:80", None),
+        ("[fd00::5]", None),
+        ("c1", None),
+        (" 10.0.0.5", None),
+        ("", None),
+    ],
+)
+def test_an_address_that_something_may_be_reached_at(text: str, address: str | None) -> None:
+    assert parse_address(text) == address

@@ -1,0 +1,137 @@
+"""The plain form of documents is read as expat reads it, and nothing else is taken for it."""
+
+from typing import Any
+from xmlrpc.client import dumps
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import fast
+from rosproxy.ros1.protocol.xmlrpc.document import DEFAULT_LIMITS, Call, Limits, Value, XmlRpcError
+from tests.unit.builders import cpp_call, cpp_reply, py_call, py_reply
+
+BOUNDS = DEFAULT_LIMITS.depth, DEFAULT_LIMITS.elements
+TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E, exclude_characters="&<>"))
+VALUES = st.recursive(
+    TEXT | st.integers(-(2**31), 2**31 - 1) | st.booleans() | st.floats(allow_nan=False),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TEXT, inner, max_size=4),
+    max_leaves=12,
+)
+VALUE_TAGS = ["value", "string", "int", "i4", "boolean", "double", "base64", "nil"]
+HOLDER_TAGS = ["array", "data", "struct", "member", "name", "param", "params", "fault"]
+PIECES = [*VALUE_TAGS, *HOLDER_TAGS, "methodName", "methodCall", "methodResponse"]
+SOUP = st.lists(
+    st.sampled_from([f"<{name}>" for name in PIECES] + [f"</{name}>" for name in PIECES])
+    | st.sampled_from(
+        ["x", " ", "\r\n", "]]>", "&amp;", "<!---->", "<value/>", "<value >", "\0", "é"]
+    ),
+    max_size=12,
+).map("".join)
+
+
+def by_expat(body: bytes) -> tuple[str, Any]:
+    """What expat makes of a document, and whether it accepts it at all."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fast, "call", lambda *_: None)
+        patch.setattr(fast, "response", lambda *_: None)
+        return read(body)
+
+
+def read(body: bytes) -> tuple[str, Any]:
+    try:
+        if b"methodCall" in body:
+            return "call", xmlrpc.parse_call(body)
+        return "reply", xmlrpc.parse_response(body)
+    except XmlRpcError as error:
+        return "refused", error.code
+
+
+def plainly(body: bytes) -> Call | Value | None:
+    found = fast.call(body, *BOUNDS)
+    return Call(*found) if found else fast.response(body, *BOUNDS)
+
+
+@given(st.lists(VALUES, max_size=4))
+def test_python_s_calls_are_plain_and_read_with_every_offset_as_by_expat(values: list[Any]) -> None:
+    body = py_call("registerPublisher", *values)
+    assert plainly(body) is not None
+    assert read(body) == by_expat(body)
+
+
+@given(VALUES)
+def test_python_s_replies_are_plain_and_read_with_every_offset_as_by_expat(value: Any) -> None:
+    body = py_reply(value)
+    assert plainly(body) is not None
+    assert read(body) == by_expat(body)
+
+
+def test_xmlrpcpp_s_documents_are_plain() -> None:
+    for body in (cpp_call("getPid", "/n", 1, ["a", True]), cpp_reply([1, "ok", ["http://h:1/"]])):
+        assert plainly(body) is not None
+        assert read(body) == by_expat(body)
+
+
+@given(st.lists(VALUES, max_size=2), st.data())
+def test_a_changed_document_is_read_as_by_expat_or_refused_as_by_it(
+    values: list[Any], data: st.DataObject
+) -> None:
+    body = bytearray(py_call("x", *values))
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(body) - 1))
+        body[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+    assert read(bytes(body)) == by_expat(bytes(body))
+
+
+@given(SOUP, st.sampled_from(["methodCall", "methodResponse"]))
+def test_soup_between_sound_tags_is_read_as_by_expat(soup: str, root: str) -> None:
+    name = "<methodName>x</methodName>" if root == "methodCall" else ""
+    for text in (
+        f"<{root}>{name}<params><param><value>{soup}</value></param></params></{root}>",
+        f"<{root}>{name}<params><param>{soup}</param></params></{root}>",
+        f"<{root}>{name}{soup}</{root}>",
+        f"{soup}<{root}>{name}<params></params></{root}>{soup}",
+    ):
+        assert read(text.encode()) == by_expat(text.encode())
+
+
+@pytest.mark.parametrize("depth", range(1, 16))
+def test_depth_is_bounded_as_by_expat(depth: int) -> None:
+    body = py_call("x", [["deep"]])
+    limits = Limits(depth=depth)
+
+    def parsed() -> Any:
+        try:
+            return xmlrpc.parse_call(body, limits)
+        except XmlRpcError as error:
+            return error.code
+
+    found = parsed()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fast, "call", lambda *_: None)
+        assert parsed() == found
+
+
+def test_elements_are_bounded() -> None:
+    body = py_call("x", ["y"] * 100)
+    elements = body.count(b"</")
+    assert fast.call(body, 64, elements) is not None
+    assert fast.call(body, 64, elements - 1) is None
+    with pytest.raises(XmlRpcError, match="more than"):
+        xmlrpc.parse_call(body, Limits(elements=elements - 1))
+
+
+@pytest.mark.parametrize("text", ["&lt;", "é", "\x00"])
+def test_what_needs_an_xml_parser_is_left_to_expat(text: str) -> None:
+    body = f"<methodCall><methodName>x</methodName><params><param><value>{text}</value></param>"
+    body += "</params></methodCall>"
+    assert fast.call(body.encode(), *BOUNDS) is None
+
+
+def test_spaces_cost_no_more_than_their_number() -> None:
+    """Each token begins with any number of them: they must not be tried again and again."""
+    spaces = b" " * 2_000_000
+    body = dumps(("a",), "x").encode().replace(b"<param>", spaces + b"<param>" + spaces)
+    assert fast.call(body, *BOUNDS) is not None
+    assert fast.call(body.replace(b"</param>", b"</parm>"), *BOUNDS) is None

@@ -1,0 +1,126 @@
+"""A node's health, as a script of probe results."""
+
+import pytest
+
+from rosproxy.ros1.registry.health import Change, Health, ProbeResult
+
+A, R, S = ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT
+
+
+@pytest.mark.parametrize(
+    ("probes", "changes", "state"),
+    [
+        ([], [], "new"),
+        ([A], [Change.NONE], "ok"),
+        ([R], [Change.NONE], "failing"),
+        ([S], [Change.NONE], "failing"),
+        ([R, R], [Change.NONE, Change.DOWN], "refused"),
+        ([S, S], [Change.NONE, Change.DOWN], "silent"),
+        ([S, R], [Change.NONE, Change.DOWN], "refused"),
+        ([R, S], [Change.NONE, Change.DOWN], "silent"),
+        ([A, R, A], [Change.NONE] * 3, "ok"),
+        ([R, A, R], [Change.NONE] * 3, "failing"),
+        ([R, R, R], [Change.NONE, Change.DOWN, Change.NONE], "refused"),
+        ([R, R, S], [Change.NONE, Change.DOWN, Change.NONE], "silent"),
+        ([R, R, A], [Change.NONE, Change.DOWN, Change.UP], "ok"),
+        ([S, S, A, A], [Change.NONE, Change.DOWN, Change.UP, Change.NONE], "ok"),
+        (
+            [S, S, A, S, S],
+            [Change.NONE, Change.DOWN, Change.UP, Change.NONE, Change.DOWN],
+            "silent",
+        ),
+    ],
+)
+def test_changes_and_state(probes: list[ProbeResult], changes: list[Change], state: str) -> None:
+    health = Health()
+    assert [health.note(probe, float(i)) for i, probe in enumerate(probes)] == changes
+    assert health.state == state
+    assert health.down == (state in ("refused", "silent"))
+
+
+def test_a_node_that_was_cleaned_up_says_so_until_it_is_registered_again() -> None:
+    health = Health(failures=2, failing_since=0.0, cleaned=True)
+    assert health.state == "cleaned"
+    assert health.note(A, 9.0) is Change.UP
+    assert health.state == "cleaned"
+    health.cleaned = False
+    assert health.state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("probes", "now", "due"),
+    [
+        ([], 0.0, True),  # never looked at
+        ([A], 4.9, False),
+        ([A], 5.0, True),
+        ([A, A], 5.5, False),  # the second was at 1
+        ([R], 0.1, True),  # one failure: ask again at once
+        ([A, S], 1.1, True),
+        ([S, S], 1.9, False),  # down: once a second
+        ([S, S], 2.0, True),
+        ([S, S, A], 6.9, False),
+        ([S, S, A], 7.0, True),
+    ],
+)
+def test_when_to_probe_with_an_interval_of_five_seconds(
+    probes: list[ProbeResult], now: float, due: bool
+) -> None:
+    health = Health()
+    for moment, probe in enumerate(probes):
+        health.note(probe, float(moment))
+    assert health.due(now, 5.0) is due
+
+
+def test_a_short_interval_holds_for_nodes_that_are_down_too() -> None:
+    health = Health()
+    health.note(R, 0.0)
+    health.note(R, 0.0)
+    assert not health.due(0.1, 0.2)
+    assert health.due(0.2, 0.2)
+
+
+def test_a_suspect_is_probed_at_once_and_its_process_id_forgotten() -> None:
+    health = Health(pid=42)
+    health.note(A, 0.0)
+    assert not health.due(1.0, 5.0)
+    health.suspect()
+    assert health.due(1.0, 5.0)
+    assert health.pid != 42
+
+
+@pytest.mark.parametrize(
+    ("health", "now", "after", "due"),
+    [
+        (Health(), 100.0, 30.0, False),
+        (Health(failures=1, failing_since=0.0), 100.0, 30.0, False),
+        (Health(failures=2, failing_since=0.0), 29.9, 30.0, False),
+        (Health(failures=2, failing_since=0.0), 30.0, 30.0, True),
+        (Health(failures=2, failing_since=0.0), 1e9, 0.0, False),  # 0: never
+        (Health(failures=2, failing_since=0.0, cleaned=True), 100.0, 30.0, False),
+        (Health(failures=9, failing_since=90.0), 100.0, 30.0, False),
+    ],
+)
+def test_when_to_clean_up(health: Health, now: float, after: float, due: bool) -> None:
+    assert health.clean_up(now, after) is due
+
+
+def test_the_grace_period_counts_from_the_first_failure_and_starts_anew() -> None:
+    health = Health()
+    for moment, probe in [(0.0, S), (10.0, S), (20.0, A), (30.0, S), (40.0, S)]:
+        health.note(probe, moment)
+    assert not health.clean_up(59.0, 30.0)
+    assert health.clean_up(60.0, 30.0)
+
+
+def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
+    health = Health()
+    health.note(A, 1.0)
+    health.end(2.0)
+    assert (health.down, health.over) == (True, True)
+    assert health.clean_up(2.0, after=30.0)  # at the next look, if it could not be done at once
+    assert not health.clean_up(2.0, after=0.0)
+    health.note(S, 3.0)  # its address is silent, but it won't come back
+    assert (health.down, health.over) == (True, True)
+    assert health.note(A, 4.0) is Change.UP
+    assert (health.down, health.over) == (False, False)
+    assert not health.clean_up(99.0, after=30.0)

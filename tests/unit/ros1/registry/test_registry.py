@@ -1,0 +1,361 @@
+"""The registry: endpoints by address and port, their leases and registrations."""
+
+import pytest
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.health import Health
+from rosproxy.ros1.registry.registry import RangeExhausted, Registry
+from tests.unit.builders import own_uri
+
+PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+
+
+def make_registry(size: int = 4) -> Registry:
+    return Registry(PortRange(45000, 45000 + size - 1))
+
+
+def admit(
+    registry: Registry, uri: str, address: str, source: str | None = None, confirmed: bool = True
+) -> Endpoint:
+    node = parse_slave_uri(uri)
+    assert node
+    place = Place(address, node.host == address, confirmed)
+    return registry.admit(uri, node, place, source or address)
+
+
+def node(registry: Registry, number: int, port: int = 40001) -> Endpoint:
+    address = f"10.0.0.{number}"
+    return admit(registry, own_uri(address, port), address)
+
+
+def register(
+    registry: Registry, endpoint: Endpoint, kind: Kind, name: str, caller_id: str = "/node"
+) -> Registration:
+    api = f"rosrpc://{endpoint.node.host}:50001" if kind is SRV else None
+    held = Registration(kind, name, caller_id, service_api=api)
+    registry.register(endpoint, held)
+    return held
+
+
+def test_an_endpoint_is_keyed_by_address_and_port() -> None:
+    registry = make_registry()
+    first = node(registry, 5)
+    assert node(registry, 5) is first
+    assert node(registry, 5, port=40002) is not first
+    assert node(registry, 6) is not first
+    assert [endpoint.port for endpoint in registry] == [45000, 45001, 45002]
+    assert (first.key, str(first.slave)) == (("10.0.0.5", 40001), "10.0.0.5:40001")
+    assert registry.by_port[45000] is first
+
+
+def test_two_containers_with_the_same_uri_are_two_endpoints() -> None:
+    registry, uri = make_registry(), "http://node:40001/"
+    one, other = admit(registry, uri, "10.0.0.5"), admit(registry, uri, "10.0.0.6")
+    assert one is not other
+    assert registry.by_uri(uri) == [one, other]
+    assert registry.admitted(uri, "10.0.0.5") is one
+    assert registry.admitted(uri, "10.0.0.6") is other
+    assert registry.admitted(uri, "10.0.0.7") is None
+    registry.remove(one)
+    assert registry.admitted(uri, "10.0.0.5") is None
+    assert registry.admitted(uri, "10.0.0.6") is other
+
+
+def test_a_node_that_changes_its_uri_keeps_its_lease() -> None:
+    registry = make_registry()
+    endpoint = admit(registry, "http://c5:40001/", "10.0.0.5")
+    assert admit(registry, own_uri("10.0.0.5"), "10.0.0.5") is endpoint
+    assert endpoint.uri == own_uri("10.0.0.5")
+    assert registry.by_uri("http://c5:40001/") == []
+    assert registry.by_uri(own_uri("10.0.0.5")) == [endpoint]
+
+
+def test_nobody_renames_the_endpoint_of_somebody_else() -> None:
+    """A registration from elsewhere, under another name of the same place, renamed it."""
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    forged = admit(registry, "http://alias:40001/", "10.0.0.5", "10.0.0.66", confirmed=False)
+    assert forged is endpoint
+    assert endpoint.uri == own_uri("10.0.0.5")
+    assert endpoint.place.confirmed
+    assert registry.by_uri("http://alias:40001/") == []
+
+
+def test_an_endpoint_that_was_only_claimed_is_confirmed_by_its_own_address() -> None:
+    registry = make_registry()
+    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", "10.0.0.1", confirmed=False)
+    assert not endpoint.place.confirmed
+    assert node(registry, 5) is endpoint
+    assert endpoint.place.confirmed
+
+
+def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one_goes() -> None:
+    """Removing the old endpoint took the new one's admission along."""
+    registry, uri = make_registry(), "http://node:40001/"
+    old = admit(registry, uri, "10.0.0.5", "10.0.0.9")
+    new = admit(registry, uri, "10.0.0.6", "10.0.0.9")
+    registry.remove(old)
+    assert registry.admitted(uri, "10.0.0.9") is new
+    registry.remove(new)
+    assert registry.admitted(uri, "10.0.0.9") is None
+
+
+def test_the_same_uri_that_comes_back_gets_the_same_port_while_it_can() -> None:
+    registry = make_registry(3)
+    first, second = node(registry, 5), node(registry, 6)
+    registry.remove(first)
+    registry.remove(second)
+    assert node(registry, 6).port == second.port
+    assert node(registry, 5).port == first.port
+    registry.remove(registry.by_port[first.port])
+    for number in (7, 8):
+        node(registry, number)
+    with pytest.raises(RangeExhausted):
+        node(registry, 5)
+    registry.remove(registry.by_port[second.port])
+    assert node(registry, 5).port == second.port
+
+
+def test_a_port_is_used_again_as_late_as_possible() -> None:
+    registry = make_registry(3)
+    registry.remove(node(registry, 5))
+    assert [node(registry, number).port for number in (6, 7, 8)] == [45001, 45002, 45000]
+
+
+def test_an_exhausted_range_says_what_to_do_and_leaves_no_trace() -> None:
+    registry = make_registry(2)
+    registry.pool.block(45001)
+    node(registry, 5)
+    with pytest.raises(RangeExhausted) as caught:
+        node(registry, 6)
+    for part in ("45000-45001", "1 leases held", "1 taken by other programs", "--port-range"):
+        assert part in str(caught.value)
+    assert len(registry) == 1
+    assert registry.by_uri(own_uri("10.0.0.6")) == []
+    assert node(registry, 5).port == 45000
+
+
+def idle(registry: Registry, number: int, since: float | None) -> Endpoint:
+    endpoint = node(registry, number)
+    endpoint.idle_since = since
+    return endpoint
+
+
+def test_the_endpoint_that_was_idle_longest_is_given_up_first() -> None:
+    registry = make_registry()
+    idle(registry, 5, 30.0)
+    longest = idle(registry, 6, 10.0)
+    idle(registry, 7, 20.0)
+    assert registry.reclaimable() is longest
+    longest.connections = 1
+    found = registry.reclaimable()
+    assert found
+    assert found.node.host == "10.0.0.7"
+
+
+def test_an_endpoint_that_waits_for_the_masters_reply_is_not_given_up() -> None:
+    """It has no registration yet, and counted as the one that was idle longest."""
+    registry = make_registry()
+    node(registry, 5)
+    assert registry.reclaimable() is None
+
+
+def test_registrations_keep_an_endpoint_unless_it_was_cleaned_up() -> None:
+    registry = make_registry()
+    endpoint = idle(registry, 5, 10.0)
+    register(registry, endpoint, PUB, "/a")
+    assert endpoint.idle_since is None
+    endpoint.idle_since = 20.0
+    assert registry.reclaimable() is None
+    endpoint.health = Health(failures=2, cleaned=True)
+    assert registry.reclaimable() is endpoint
+    endpoint.connections = 1
+    assert registry.reclaimable() is None
+    endpoint.connections, endpoint.pending = 0, 1
+    assert registry.reclaimable() is None
+
+
+def test_a_call_under_way_keeps_an_endpoint() -> None:
+    registry = make_registry()
+    endpoint = idle(registry, 5, 10.0)
+    endpoint.pending = 1
+    assert not endpoint.idle
+    assert registry.reclaimable() is None
+
+
+def test_restored_endpoints_have_the_port_that_they_had() -> None:
+    registry = make_registry()
+    where, place = HostPort("10.0.0.5", 40001), Place("10.0.0.5", named=True, confirmed=False)
+    endpoint = registry.restore(own_uri("10.0.0.5"), where, place, 45002)
+    assert endpoint
+    assert (endpoint.port, endpoint.trusted) == (45002, False)
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is endpoint
+    other = HostPort("10.0.0.6", 40001), Place("10.0.0.6", named=True)
+    assert registry.restore(own_uri("10.0.0.5"), where, place, 45003) is None  # is there
+    assert registry.restore(own_uri("10.0.0.6"), *other, 45002) is None  # port is taken
+    assert registry.restore(own_uri("10.0.0.6"), *other, 44000) is None  # not in the range
+    assert registry.pool.free == 3
+
+
+def test_what_is_registered_is_found_by_name_kind_and_endpoint() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for kind, name in [(PUB, "/b"), (PUB, "/a"), (SUB, "/a"), (SRV, "/s"), (PARAM, "/p")]:
+        register(registry, endpoint, kind, name)
+    assert endpoint.names(PUB) == ["/a", "/b"]
+    assert endpoint.names(PARAM) == ["/p"]
+    assert endpoint.topics == {"/a", "/b"}
+    assert endpoint.caller_ids == ["/node"]
+    assert endpoint.label == "/node (http://10.0.0.5:40001/)"
+    assert registry.by_caller("/node") is endpoint
+    assert len(list(registry.registrations())) == 5
+    registry.unregister(PUB, "/a", "/node")
+    registry.unregister(PUB, "/a", "/node")
+    registry.unregister(PUB, "/a", "/somebody")
+    assert endpoint.names(PUB) == ["/b"]
+    assert endpoint.names(SUB) == ["/a"]
+
+
+def test_an_endpoint_without_a_name_has_a_label_too() -> None:
+    assert node(make_registry(), 5).label == "unnamed node (http://10.0.0.5:40001/)"
+
+
+def test_a_name_that_registers_from_another_uri_loses_what_it_had() -> None:
+    registry = make_registry()
+    old, new = node(registry, 5), node(registry, 6)
+    for kind, name in [(PUB, "/a"), (SRV, "/s"), (PARAM, "/p")]:
+        register(registry, old, kind, name)
+    register(registry, old, SUB, "/a", "/other")
+    register(registry, new, SUB, "/c")
+    assert old.caller_ids == ["/other"]
+    assert new.names(SUB) == ["/c"]
+    assert registry.by_caller("/node") is new
+    assert registry.service("/s") is None
+
+
+def test_a_service_has_one_provider() -> None:
+    registry = make_registry()
+    old, new = node(registry, 5), node(registry, 6)
+    register(registry, old, SRV, "/s", "/old")
+    held = register(registry, new, SRV, "/s", "/new")
+    assert registry.service("/s") == (new, held)
+    assert old.names(SRV) == []
+    registry.unregister(SRV, "/s", "/old")  # too late: the service is somebody else's
+    assert registry.service("/s") == (new, held)
+    registry.unregister(SRV, "/s", "/new")
+    assert registry.service("/s") is None
+
+
+def test_a_service_registered_anew_takes_its_new_uri() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    register(registry, endpoint, SRV, "/s")
+    again = Registration(SRV, "/s", "/node", service_api="rosrpc://10.0.0.5:50002")
+    registry.register(endpoint, again)
+    assert registry.service("/s") == (endpoint, again)
+    assert registry.service_port(endpoint, "/s") == 50002
+    assert len(endpoint.registrations) == 1
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "api", "port"),
+    [
+        (True, "rosrpc://10.0.0.5:50001", 50001),
+        (True, "rosrpc://somewhere-else:50001", 50001),  # only the port is believed
+        (False, "rosrpc://10.0.0.5:50001", None),
+        (True, None, None),
+        (True, "nonsense", None),
+    ],
+)
+def test_the_port_of_a_service_is_believed_from_the_node_only(
+    confirmed: bool, api: str | None, port: int | None
+) -> None:
+    registry = make_registry()
+    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", confirmed=confirmed)
+    registry.register(endpoint, Registration(SRV, "/s", "/node", service_api=api))
+    assert registry.service_port(endpoint, "/s") == port
+    assert registry.service_port(node(registry, 6), "/s") is None
+    assert registry.service_port(endpoint, "/other") is None
+
+
+def test_removing_an_endpoint_removes_all_that_it_had() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for kind in Kind:
+        register(registry, endpoint, kind, "/a")
+    registry.remove(endpoint)
+    assert len(registry) == 0
+    assert registry.pool.free == 4
+    assert registry.by_caller("/node") is None
+    assert registry.service("/a") is None
+    assert not endpoint.registrations
+
+
+def test_a_removed_endpoint_is_known_by_its_uri_until_its_port_is_somebody_elses() -> None:
+    registry = make_registry(1)
+    endpoint = node(registry, 5)
+    registry.remove(endpoint)
+    assert registry.by_uri(own_uri("10.0.0.5")) == [endpoint]
+    node(registry, 6)
+    assert registry.by_uri(own_uri("10.0.0.5")) == []
+
+
+def test_endpoints_may_be_removed_while_they_are_gone_through() -> None:
+    registry = make_registry()
+    for number in (5, 6, 7):
+        node(registry, number)
+    for endpoint in registry:
+        registry.remove(endpoint)
+    assert len(registry) == 0
+
+
+def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
+    registry = make_registry()
+    endpoint, port = node(registry, 5), 45000
+    held = register(registry, endpoint, PUB, "/a")
+    assert registry.move({endpoint: Place("10.0.0.9", False)}) == [endpoint]
+    assert (endpoint.key, endpoint.port, endpoint.uri) == (
+        ("10.0.0.9", 40001),
+        port,
+        own_uri("10.0.0.5"),
+    )
+    assert registry.at("10.0.0.9", 40001) is endpoint
+    assert registry.at("10.0.0.5", 40001) is None
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is None
+    assert endpoint.registrations == {held.key: held}
+    another = node(registry, 5)
+    assert another is not endpoint
+    assert another.port != port
+
+
+def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> None:
+    registry = make_registry()
+    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", source="10.0.0.1")
+    registry.move({endpoint: Place("10.0.0.9", False)})
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.1") is endpoint
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
+
+
+def test_two_nodes_may_swap_their_addresses() -> None:
+    registry = make_registry()
+    one, other = node(registry, 5), node(registry, 6)
+    places = {one: Place("10.0.0.6", False), other: Place("10.0.0.5", False)}
+    assert registry.move(places) == [one, other]
+    assert registry.at("10.0.0.6", 40001) is one
+    assert registry.at("10.0.0.5", 40001) is other
+    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.6") is one
+    assert registry.admitted(own_uri("10.0.0.6"), "10.0.0.5") is other
+
+
+def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
+    registry = make_registry()
+    one, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
+    places = {third: Place("10.0.0.5", False), one: Place("10.0.0.6", False)}
+    assert registry.move(places) == []
+    assert [e.place.address for e in (one, holder, third)] == ["10.0.0.5", "10.0.0.6", "10.0.0.7"]
+    assert registry.at("10.0.0.5", 40001) is one

@@ -1,0 +1,196 @@
+"""The registry's tables agree with each other after any sequence of operations."""
+
+from collections import Counter
+from typing import Any
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import slave_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.registry import RangeExhausted, Registry
+
+PORTS = PortRange(45000, 45005)
+ADDRESSES = st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"])
+SLAVE_PORTS = st.sampled_from([40001, 40002])
+NAMES = st.sampled_from(["/a", "/b"])
+CALLERS = st.sampled_from(["/n1", "/n2", "/n3"])
+KINDS = st.sampled_from(Kind)
+
+
+class Registries(RuleBasedStateMachine):
+    """A registry, and by its side what it must hold: (kind, name, caller) by endpoint key."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.registry = Registry(PORTS)
+        self.blocked: set[int] = set()
+        self.expected: dict[tuple[Kind, str, str], Endpoint] = {}
+
+    def draw(self, data: st.DataObject) -> Endpoint | None:
+        endpoints = list(self.registry)
+        return data.draw(st.sampled_from(endpoints)) if endpoints else None
+
+    @rule(
+        address=ADDRESSES,
+        port=SLAVE_PORTS,
+        name=st.sampled_from([None, "node"]),
+        source=ADDRESSES,
+        confirmed=st.booleans(),
+    )
+    def admit(
+        self, address: str, port: int, name: str | None, source: str, confirmed: bool
+    ) -> None:
+        where = HostPort(name or address, port)
+        place = Place(address, name is None, confirmed)
+        before = {endpoint.key for endpoint in self.registry}
+        try:
+            endpoint = self.registry.admit(slave_uri(where), where, place, source)
+        except RangeExhausted:
+            assert self.registry.pool.free == 0
+            assert (address, port) not in before
+        else:
+            assert endpoint.key == (address, port)
+            assert self.registry.admitted(slave_uri(where), source) is endpoint
+
+    @rule(address=ADDRESSES, slave=SLAVE_PORTS, port=st.integers(44999, 45006))
+    def restore(self, address: str, slave: int, port: int) -> None:
+        where = HostPort(address, slave)
+        known = any(endpoint.key == (address, slave) for endpoint in self.registry)
+        usable = port in PORTS and port not in self.registry.by_port and port not in self.blocked
+        found = self.registry.restore(slave_uri(where), where, Place(address, True, False), port)
+        assert (found is not None) == (usable and not known)
+        assert found is None or found.port == port
+
+    @rule(data=st.data(), addresses=st.lists(ADDRESSES, min_size=1, max_size=4))
+    def move(self, data: st.DataObject, addresses: list[str]) -> None:
+        places = {}
+        for address in addresses:
+            endpoint = self.draw(data)
+            if endpoint:
+                places[endpoint] = Place(address, False)
+        before = {endpoint: endpoint.key for endpoint in self.registry}
+        admitted = {endpoint: set(endpoint.admissions) for endpoint in self.registry}
+        ports = {endpoint: endpoint.port for endpoint in self.registry}
+        moved = self.registry.move(places)
+        assert {endpoint: endpoint.port for endpoint in self.registry} == ports
+        for endpoint, (old, port) in before.items():
+            if endpoint in moved:
+                new = places[endpoint].address
+                assert endpoint.key == (new, port)
+                for uri in [uri for uri, source in admitted[endpoint] if source == old]:
+                    assert self.registry.admitted(uri, new)
+                assert self.registry.admitted(endpoint.uri, new) in moved
+            else:
+                assert endpoint.key == (old, port)
+                wanted = places.get(endpoint)
+                taken = wanted and self.registry.at(wanted.address, port)
+                assert wanted is None or taken
+
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        endpoint = self.draw(data)
+        if endpoint:
+            self.registry.remove(endpoint)
+            self.expected = {k: e for k, e in self.expected.items() if e is not endpoint}
+
+    @rule(data=st.data(), kind=KINDS, name=NAMES, caller_id=CALLERS)
+    def register(self, data: st.DataObject, kind: Kind, name: str, caller_id: str) -> None:
+        endpoint = self.draw(data)
+        if endpoint is None:
+            return
+        self.registry.register(endpoint, Registration(kind, name, caller_id))
+        kept = self.expected.items()
+        self.expected = {k: e for k, e in kept if k[2] != caller_id or e is endpoint}
+        if kind is Kind.SERVICE:
+            kept = self.expected.items()
+            self.expected = {k: e for k, e in kept if k[:2] != (kind, name)}
+        self.expected[kind, name, caller_id] = endpoint
+
+    @rule(kind=KINDS, name=NAMES, caller_id=CALLERS)
+    def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
+        self.registry.unregister(kind, name, caller_id)
+        self.expected.pop((kind, name, caller_id), None)
+
+    @rule(data=st.data(), caller_id=CALLERS)
+    def drop_caller(self, data: st.DataObject, caller_id: str) -> None:
+        endpoint = self.draw(data)
+        if endpoint:
+            self.registry.drop_caller(endpoint, caller_id)
+            kept = self.expected.items()
+            self.expected = {k: e for k, e in kept if k[2] != caller_id or e is not endpoint}
+
+    @rule(data=st.data())
+    def bind_fails(self, data: st.DataObject) -> None:
+        """Another program has an endpoint's port: the shell gives both up."""
+        endpoint = self.draw(data)
+        if endpoint:
+            self.registry.pool.block(endpoint.port)
+            self.blocked.add(endpoint.port)
+            self.registry.remove(endpoint)
+            self.expected = {k: e for k, e in self.expected.items() if e is not endpoint}
+
+    @rule(data=st.data())
+    def another_program_ends(self, data: st.DataObject) -> None:
+        if self.blocked:
+            port = data.draw(st.sampled_from(sorted(self.blocked)))
+            self.registry.pool.unblock(port)
+            self.blocked.discard(port)
+
+    @invariant()
+    def every_port_is_free_held_or_blocked(self) -> None:
+        pool, held = self.registry.pool, set(self.registry.by_port)
+        assert pool.free + len(held) + pool.blocked == len(PORTS)
+        assert not held & self.blocked
+        assert all(port in PORTS for port in held)
+
+    @invariant()
+    def every_endpoint_is_found_by_port_and_uri_and_admission(self) -> None:
+        for port, endpoint in self.registry.by_port.items():
+            assert endpoint.port == port
+            assert endpoint in self.registry.by_uri(endpoint.uri)
+            assert endpoint.node == HostPort(endpoint.node.host, endpoint.key[1])
+            for uri, source in endpoint.admissions:
+                assert self.registry.admitted(uri, source) is endpoint
+        keys = [endpoint.key for endpoint in self.registry]
+        assert len(keys) == len(set(keys)) == len(self.registry)
+
+    @invariant()
+    def nobody_else_is_found(self) -> None:
+        live = set(self.registry)
+        assert set(self.registry._by_key.values()) == live
+        assert {e for found in self.registry._by_uri.values() for e in found} == live
+        assert set(self.registry._admitted.values()) <= live
+        assert not set(self.registry._former.values()) & live
+        assert not set(self.registry._former) & set(self.registry.by_port)
+        for former in self.registry._former.values():
+            assert former in self.registry.by_uri(former.uri)
+        kept = [e for found in self.registry._former_uris.values() for e in found.values()]
+        assert sorted(e.port for e in kept) == sorted(self.registry._former)
+        last = self.registry._last_port
+        assert all(last[endpoint.key] == endpoint.port for endpoint in live)
+        assert len(last) <= len(PORTS)
+
+    @invariant()
+    def registrations_are_the_expected_ones(self) -> None:
+        found = {held.key: endpoint for endpoint, held in self.registry.registrations()}
+        assert found == self.expected
+        for (kind, name, caller_id), endpoint in self.expected.items():
+            assert self.registry.by_caller(caller_id) is endpoint
+            if kind is Kind.SERVICE:
+                known = self.registry.service(name)
+                assert known
+                assert known[0] is endpoint
+        assert set(self.registry._by_caller) == {key[2] for key in self.expected}
+        for endpoint in self.registry:
+            assert endpoint.callers == Counter(key[2] for key in endpoint.registrations)
+        services = {key[1] for key in self.expected if key[0] is Kind.SERVICE}
+        assert set(self.registry._services) == services
+
+
+TestRegistries: Any = Registries.TestCase
+TestRegistries.settings = settings(stateful_step_count=40)

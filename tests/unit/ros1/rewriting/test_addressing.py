@@ -1,0 +1,311 @@
+"""Which address stands for a node, by who asks: tables of import and export."""
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import InsidePath
+from rosproxy.ros1.registry.endpoint import Place
+from rosproxy.ros1.rewriting.addressing import Addressing
+from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_asker
+
+LITERAL = "http://10.0.0.5:40001/"
+OUTSIDE = "http://robot-host:45000/10.0.0.5:40001/"
+RELAYED = f"http://{PROXY}:45000/10.0.0.5:40001/"
+
+NEIGHBOUR = make_asker("10.0.0.6")
+STRANGER = make_asker("172.20.0.9")  # inside, in a network from which the node can't be reached
+
+
+@pytest.mark.parametrize(
+    ("uri", "address", "advertised"),
+    [
+        (LITERAL, None, OUTSIDE),
+        ("http://c5:40001/", "10.0.0.5", "http://robot-host:45000/c5:40001/10.0.0.5/"),
+        (
+            "http://localhost:40001/",
+            "10.0.0.5",
+            "http://robot-host:45000/localhost:40001/10.0.0.5/",
+        ),
+        (
+            "http://127.0.0.1:40001/",
+            "10.0.0.5",
+            "http://robot-host:45000/127.0.0.1:40001/10.0.0.5/",
+        ),
+        ("http://[fd00::5]:40001/", None, "http://robot-host:45000/[fd00::5]:40001/"),
+        ("http://c5:40001/", "fd00::5", "http://robot-host:45000/c5:40001/fd00::5/"),
+        ("http://10.0.0.5:40001", None, OUTSIDE),
+    ],
+)
+def test_advertised_uris(uri: str, address: str | None, advertised: str) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing, uri, address)
+    assert addressing.advertised_uri(endpoint) == advertised
+    assert addressing.advertised_service(endpoint) == "rosrpc://robot-host:45000"
+    inside = InsidePath(endpoint.node, address)
+    assert addressing.identify(advertised) == (45000, inside)
+    assert addressing.export_slave(uri, make_asker(endpoint.place.address)) == advertised
+
+
+def test_advertised_ports_have_an_offset() -> None:
+    addressing = make_addressing(advertise=(30000, 30009))
+    endpoint = add_node(addressing)
+    outside = "http://robot-host:30000/10.0.0.5:40001/"
+    assert addressing.outside(45009) == HostPort("robot-host", 30009)
+    assert addressing.advertised_uri(endpoint) == outside
+    assert addressing.import_slave(outside, STRANGER) == RELAYED
+    assert addressing.export_slave(RELAYED, STRANGER) == outside
+    assert (
+        addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE
+    )  # a port that means nothing outside
+    assert addressing.identify(OUTSIDE) is None
+
+
+def test_an_advertised_ipv6_host_has_brackets() -> None:
+    addressing = make_addressing(host="fd00::1", networks=["fd01::/64"])
+    endpoint = add_node(addressing, "http://[fd01::5]:40001/")
+    outside = "http://[fd00::1]:45000/[fd01::5]:40001/"
+    assert addressing.advertised_uri(endpoint) == outside
+    assert addressing.advertised_service(endpoint) == "rosrpc://[fd00::1]:45000"
+    assert addressing.import_slave(outside, make_asker("fd01::6")) == "http://[fd01::5]:40001/"
+    far = make_asker("fd02::6", proxy="fd02::1")
+    relayed = "http://[fd02::1]:45000/[fd01::5]:40001/"
+    assert addressing.import_slave(outside, far) == relayed
+    assert addressing.export_slave(relayed, far) == outside
+
+
+IMPORTS = [
+    # who asks, about a node with this host name and address, gets
+    ("the node itself", make_asker("10.0.0.5"), LITERAL, None, LITERAL),
+    ("a neighbour", NEIGHBOUR, LITERAL, None, LITERAL),
+    ("a stranger", STRANGER, LITERAL, None, RELAYED),
+    ("one of another family", make_asker("fd00::6", proxy="fd00::1"), LITERAL, None, None),
+    (
+        "the node, by an unresolvable name",
+        make_asker("10.0.0.5"),
+        "http://c5:40001/",
+        "10.0.0.5",
+        "",
+    ),
+    ("a neighbour, same", NEIGHBOUR, "http://c5:40001/", "10.0.0.5", None),
+    ("a stranger, same", STRANGER, "http://c5:40001/", "10.0.0.5", None),
+    ("the node, by loopback", make_asker("10.0.0.5"), "http://127.0.0.1:40001/", "10.0.0.5", ""),
+    ("a neighbour, same", NEIGHBOUR, "http://127.0.0.1:40001/", "10.0.0.5", None),
+]
+
+
+@pytest.mark.parametrize(("asker", "uri", "address", "given"), [row[1:] for row in IMPORTS])
+def test_what_an_asker_is_given(asker, uri: str, address: str | None, given: str | None) -> None:
+    """None stands for the relayed form, an empty text for the node's own."""
+    addressing = make_addressing()
+    endpoint = add_node(addressing, uri, address)
+    outside = addressing.advertised_uri(endpoint)
+    relayed = outside.replace("robot-host", str(HostPort(asker.proxy, 1))[:-2])
+    expected = {None: relayed, "": uri}.get(given, given)
+    assert addressing.import_slave(outside, asker) == expected
+    assert addressing.export_slave(str(expected), asker) == outside
+
+
+def test_a_name_that_leads_to_the_node_is_given_to_neighbours() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing, "http://c5:40001/", "10.0.0.5", named=True)
+    outside = addressing.advertised_uri(endpoint)
+    assert addressing.import_slave(outside, NEIGHBOUR) == "http://c5:40001/"
+    assert addressing.import_slave(outside, STRANGER) == f"http://{PROXY}:45000/c5:40001/10.0.0.5/"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "networks", "neighbours"),
+    [
+        ("10.0.0.6", "10.0.0.5", ["10.0.0.0/24"], True),
+        ("10.0.1.6", "10.0.0.5", ["10.0.0.0/24"], False),
+        ("10.0.1.6", "10.0.0.5", ["10.0.0.0/24", "10.0.1.0/24"], False),
+        ("10.0.1.6", "10.0.0.5", ["10.0.0.0/24", "10.0.0.0/16"], True),
+        ("10.0.0.6", "10.0.0.5", [], False),
+        ("10.0.0.6", "10.0.0.5", ["fd00::/8"], False),
+        ("fd00::6", "10.0.0.5", ["fd00::/8", "10.0.0.0/8"], False),
+    ],
+)
+def test_neighbours_share_a_network(
+    one: str, other: str, networks: list[str], neighbours: bool
+) -> None:
+    addressing = make_addressing(networks=networks)
+    uri = f"http://{other}:40001/"
+    outside = addressing.advertised_uri(add_node(addressing, uri))
+    assert (addressing.import_slave(outside, make_asker(one)) == uri) is neighbours
+
+
+UNTOUCHED = [
+    "http://laptop:33445/",
+    "http://robot-host:11311/",
+    "http://robot-host:45001/10.0.0.5:40001/",  # another port of ours, which nobody has
+    "http://robot-host:45000/10.0.0.5:40009/",  # a left-over of whoever had the port before
+    "http://robot-host:45000/",
+    "http://robot-host:45000",
+    "http://ROBOT-HOST:45000/10.0.0.5:40001/",
+    "https://robot-host:45000/10.0.0.5:40001/",
+    "rosrpc://robot-host:45000",
+    "http://robot-host:45010/10.0.0.5:40001/",
+    "",
+    "no URI",
+    "http://[::1/",
+]
+
+
+@pytest.mark.parametrize("uri", UNTOUCHED)
+def test_what_is_no_endpoint_of_ours_is_imported_and_exported_as_it_is(uri: str) -> None:
+    addressing = make_addressing()
+    add_node(addressing)
+    for asker in (NEIGHBOUR, STRANGER):
+        assert addressing.import_slave(uri, asker) == uri
+        assert addressing.export_slave(uri, asker) == uri
+
+
+def two_with_the_same_uri() -> tuple[Addressing, str, str]:
+    addressing, uri = make_addressing(), "http://node:40001/"
+    one, other = add_node(addressing, uri, "10.0.0.5"), add_node(addressing, uri, "10.0.0.6")
+    return addressing, addressing.advertised_uri(one), addressing.advertised_uri(other)
+
+
+@pytest.mark.parametrize(
+    ("asker", "first", "second"),
+    [
+        ("10.0.0.5", "http://node:40001/", f"http://{PROXY}:45001/node:40001/10.0.0.6/"),
+        ("10.0.0.6", f"http://{PROXY}:45000/node:40001/10.0.0.5/", "http://node:40001/"),
+        (
+            "10.0.0.7",
+            f"http://{PROXY}:45000/node:40001/10.0.0.5/",
+            f"http://{PROXY}:45001/node:40001/10.0.0.6/",
+        ),
+    ],
+)
+def test_two_containers_with_the_same_uri_each_mean_their_own(
+    asker: str, first: str, second: str
+) -> None:
+    addressing, one, other = two_with_the_same_uri()
+    who = make_asker(asker)
+    assert addressing.import_slaves([one, other], who) == [first, second]
+    assert [addressing.export_slave(uri, who) for uri in (first, second)] == [one, other]
+
+
+def test_a_uri_that_an_asker_would_take_for_its_own_is_not_given_to_it() -> None:
+    """A neighbour's URI that reads like the asker's own led the asker to itself."""
+    addressing, uri = make_addressing(), "http://node:40001/"
+    resolvable = add_node(addressing, uri, "10.0.0.5", named=True)
+    add_node(addressing, uri, "10.0.0.6")
+    outside, asker = addressing.advertised_uri(resolvable), make_asker("10.0.0.6")
+    given = addressing.import_slave(outside, asker)
+    assert given == f"http://{PROXY}:45000/node:40001/10.0.0.5/"
+    assert addressing.export_slave(given, asker) == outside
+
+
+def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
+    """It registers from the gateway's address and is found at its own."""
+    addressing, uri = make_addressing(), "http://node:40001/"
+    add_node(addressing, uri, "10.0.0.6")
+    where = HostPort("node", 40001)
+    place = add_node(addressing, uri, "10.0.0.5", confirmed=False).place
+    endpoint = addressing.registry.admit(uri, where, place, "10.0.0.254")
+    exported = addressing.export_slave(uri, make_asker("10.0.0.254"))
+    assert exported == addressing.advertised_uri(endpoint)
+
+
+def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> None:
+    """Not even its own machine; it itself goes on by its own URI, which tells it who it is."""
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    addressing.registry.move({endpoint: Place("10.0.0.9", named=False, stale=True)})
+    outside = "http://robot-host:45000/10.0.0.5:40001/10.0.0.9/"
+    assert addressing.advertised_uri(endpoint) == outside
+    relayed = f"http://{PROXY}:45000/10.0.0.5:40001/10.0.0.9/"
+    for asker in (NEIGHBOUR, make_asker("10.0.0.9"), make_asker("10.0.0.5"), STRANGER):
+        assert addressing.import_slave(outside, asker) == relayed
+    assert addressing.import_slave(outside, make_asker("10.0.0.9", endpoint=endpoint)) == LITERAL
+    assert addressing.export_slave(LITERAL, make_asker("10.0.0.9")) == outside
+
+
+def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_elses() -> None:
+    """Its literal URI was no longer exported, so that no tool inside could unregister it."""
+    addressing = make_addressing(listen=(45000, 45000))
+    endpoint = add_node(addressing)
+    addressing.registry.remove(endpoint)
+    for asker in (NEIGHBOUR, STRANGER):
+        assert addressing.export_slave(LITERAL, asker) == OUTSIDE
+        assert addressing.export_slave(RELAYED, asker) == OUTSIDE
+        assert addressing.import_slave(OUTSIDE, asker) == OUTSIDE
+        assert addressing.export_slave(OUTSIDE, asker) == OUTSIDE
+    add_node(addressing, "http://10.0.0.7:40001/")
+    assert addressing.export_slave(LITERAL, NEIGHBOUR) == LITERAL
+    assert addressing.import_slave(OUTSIDE, NEIGHBOUR) == OUTSIDE
+
+
+@pytest.mark.parametrize(
+    ("uri", "handed_out"),
+    [
+        (OUTSIDE, True),
+        (RELAYED, True),
+        (f"http://{PROXY}:45007/", True),
+        (LITERAL, False),
+        ("http://laptop:33445/", False),
+        ("http://robot-host:45001/10.0.0.5:40001/", False),
+        (f"http://{PROXY}:11311/", False),
+        ("no URI", False),
+    ],
+)
+def test_uris_that_the_proxy_handed_out(uri: str, handed_out: bool) -> None:
+    addressing = make_addressing()
+    add_node(addressing)
+    assert addressing.handed_out(uri, STRANGER) is handed_out
+
+
+SERVICES = [
+    # who asks, gets
+    (make_asker("10.0.0.5"), "rosrpc://10.0.0.5:50001"),
+    (NEIGHBOUR, "rosrpc://10.0.0.5:50001"),
+    (STRANGER, f"rosrpc://{PROXY}:45000"),
+]
+
+
+@pytest.mark.parametrize(("asker", "given"), SERVICES)
+def test_a_service_is_imported_and_exported(asker, given: str) -> None:
+    addressing = make_addressing()
+    add_registration(addressing, add_node(addressing), Kind.SERVICE, "/s")
+    outside = "rosrpc://robot-host:45000"
+    assert addressing.import_service(outside, "/s", asker) == given
+    assert addressing.export_service(given, "/s", asker) == outside
+
+
+@pytest.mark.parametrize("asker", [asker for asker, _ in SERVICES])
+def test_a_service_that_was_rebuilt_from_the_master(asker) -> None:
+    """Its own URI is not known: the node's TCPROS port serves services as well."""
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    held = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
+    object.__setattr__(held, "service_api", None)
+    outside = "rosrpc://robot-host:45000"
+    assert addressing.import_service(outside, "/s", asker) == f"rosrpc://{PROXY}:45000"
+    endpoint.tcpros_port = 50001
+    given = addressing.import_service(outside, "/s", asker)
+    assert given == dict(SERVICES)[asker]
+    assert addressing.export_service(given, "/s", asker) == outside
+
+
+def test_a_service_that_is_not_known_is_relayed() -> None:
+    """It was guessed to be at the node's TCPROS port, and could not be exported again."""
+    addressing = make_addressing()
+    add_node(addressing).tcpros_port = 50001
+    given = addressing.import_service("rosrpc://robot-host:45000", "/s", NEIGHBOUR)
+    assert given == f"rosrpc://{PROXY}:45000"
+    assert addressing.export_service(given, "/s", NEIGHBOUR) == "rosrpc://robot-host:45000"
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["rosrpc://laptop:5", "rosrpc://robot-host:45001", "rosrpc://robot-host:5", "http://a:1/", ""],
+)
+def test_other_services_are_left_as_they_are(uri: str) -> None:
+    addressing = make_addressing()
+    add_registration(addressing, add_node(addressing), Kind.SERVICE, "/s")
+    for name in ("/s", "/t"):
+        assert addressing.import_service(uri, name, NEIGHBOUR) == uri
+        assert addressing.export_service(uri, name, NEIGHBOUR) == uri

@@ -1,0 +1,165 @@
+"""Import and export are inverses for every URI handed out, in any topology."""
+
+from dataclasses import dataclass
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from tests.unit.builders import make_addressing
+
+ADDRESSES = st.sampled_from(
+    ["10.0.0.5", "10.0.0.6", "10.0.1.5", "10.0.1.6", "172.20.0.2", "fd00::5", "fd00::6", "fd01::5"]
+)
+NAMES = st.sampled_from(["node", "c5", "localhost", "127.0.0.1", "::1", "Größe", "10.0.0.5"])
+SLAVE_PORTS = st.integers(40001, 40003)
+NETWORKS = st.lists(
+    st.sampled_from(["10.0.0.0/24", "10.0.0.0/8", "172.20.0.0/16", "fd00::/64", "fd00::/8"]),
+    max_size=3,
+)
+PROXIES = st.sampled_from(["10.0.0.1", "10.0.1.1", "172.20.0.1", "fd00::1", "fd01::1"])
+HOSTS = st.sampled_from(["robot-host", "Robot_2.example.com", "192.168.1.5", "fd99::1"])
+OFFSETS = st.sampled_from([0, -15000, 5, 100])
+
+
+@dataclass(frozen=True)
+class Member:
+    """A node of a random topology: where it is, what it calls itself, what it serves."""
+
+    address: str
+    name: str | None
+    port: int
+    named: bool
+    service_host: str | None
+
+    def join(self, addressing: Addressing) -> Endpoint:
+        where = HostPort(self.name or self.address, self.port)
+        named = self.named or where.host == self.address
+        place = Place(self.address, named)
+        endpoint = addressing.registry.admit(slave_uri(where), where, place, self.address)
+        caller_id = f"/n{len(addressing.registry)}"
+        api = service_uri(HostPort(self.service_host or where.host, 50000 + endpoint.port % 100))
+        for held in (
+            Registration(Kind.PUBLISHER, "/topic", caller_id),
+            Registration(Kind.SERVICE, f"/s{endpoint.port}", caller_id, service_api=api),
+        ):
+            addressing.registry.register(endpoint, held)
+        return endpoint
+
+
+MEMBERS = st.builds(
+    Member, ADDRESSES, st.none() | NAMES, SLAVE_PORTS, st.booleans(), st.none() | NAMES
+)
+
+
+@st.composite
+def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, list[Endpoint]]:
+    """A proxy with nodes behind it; ``distinct``: no two call themselves the same."""
+    first = 45000 + draw(OFFSETS)
+    addressing = make_addressing(draw(HOSTS), (45000, 45009), (first, first + 9), draw(NETWORKS))
+    members = draw(
+        st.lists(MEMBERS, min_size=1, max_size=7, unique_by=lambda m: (m.address, m.port))
+    )
+    for member in members:
+        uri = slave_uri(HostPort(member.name or member.address, member.port))
+        if not (distinct and addressing.registry.by_uri(uri)):
+            member.join(addressing)
+    return addressing, list(addressing.registry)
+
+
+@st.composite
+def askers(draw: st.DrawFn, addressing: Addressing) -> tuple[Asker, Asker]:
+    """Somebody as the proxy gives it addresses, and as it is when it sends them back."""
+    proxy = draw(PROXIES)
+    endpoint = draw(st.none() | st.sampled_from(list(addressing.registry)))
+    address = endpoint.place.address if endpoint else draw(ADDRESSES)
+    plain = Asker(address, proxy)
+    return draw(st.sampled_from([plain, Asker(address, proxy, endpoint=endpoint)])), plain
+
+
+@given(topologies(), st.data())
+def test_a_slave_uri_handed_out_comes_back_as_it_was(
+    topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
+) -> None:
+    addressing, endpoints = topology
+    given, back = data.draw(askers(addressing))
+    for endpoint in endpoints:
+        outside = addressing.advertised_uri(endpoint)
+        inside = addressing.import_slave(outside, given)
+        assert addressing.export_slave(inside, back) == outside
+        assert inside == endpoint.uri or addressing.handed_out(inside, back)
+        assert parse_slave_uri(inside)
+
+
+@given(topologies(), st.data())
+def test_a_node_is_given_its_own_uri_literally(
+    topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
+) -> None:
+    addressing, endpoints = topology
+    endpoint = data.draw(st.sampled_from(endpoints))
+    outside = addressing.advertised_uri(endpoint)
+    for asker in (
+        Asker(endpoint.place.address, "10.0.0.1"),
+        Asker(endpoint.place.address, "10.0.0.1", endpoint=endpoint),
+    ):
+        assert addressing.import_slave(outside, asker) == endpoint.uri
+        assert addressing.export_slave(endpoint.uri, asker) == outside
+
+
+@given(topologies(distinct=True), st.data())
+def test_a_uri_comes_back_as_it_was_after_its_node_has_gone(
+    topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
+) -> None:
+    addressing, endpoints = topology
+    given, back = data.draw(askers(addressing))
+    outside = [addressing.advertised_uri(endpoint) for endpoint in endpoints]
+    inside = addressing.import_slaves(outside, given)
+    for endpoint in data.draw(st.lists(st.sampled_from(endpoints), unique_by=id)):
+        addressing.registry.remove(endpoint)
+    assert [addressing.export_slave(uri, back) for uri in inside] == outside
+    again = addressing.import_slaves(outside, back)
+    assert [addressing.export_slave(uri, back) for uri in again] == outside
+
+
+@given(topologies(), st.data())
+def test_a_service_uri_handed_out_comes_back_as_it_was(
+    topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
+) -> None:
+    addressing, endpoints = topology
+    given, back = data.draw(askers(addressing))
+    for endpoint in endpoints:
+        outside = addressing.advertised_service(endpoint)
+        for name in (f"/s{endpoint.port}", "/unknown"):
+            inside = addressing.import_service(outside, name, given)
+            assert addressing.export_service(inside, name, back) == outside
+            assert parse_service_uri(inside)
+
+
+@given(topologies(), st.data())
+def test_outside_uris_pass_both_ways(
+    topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
+) -> None:
+    addressing, _ = topology
+    asker, _ = data.draw(askers(addressing))
+    host = data.draw(st.sampled_from(["laptop", "192.168.1.77", addressing.host]))
+    uri = slave_uri(HostPort(host, data.draw(st.integers(1024, 29000))))
+    assert addressing.import_slave(uri, asker) == uri
+    assert addressing.export_slave(uri, asker) == uri
+
+
+@given(topologies())
+def test_the_master_can_be_asked_for_all_that_a_restarted_proxy_needs(
+    topology: tuple[Addressing, list[Endpoint]],
+) -> None:
+    addressing, endpoints = topology
+    for endpoint in endpoints:
+        found = addressing.identify(addressing.advertised_uri(endpoint))
+        assert found
+        port, inside = found
+        assert port == endpoint.port
+        assert inside.node == endpoint.node
+        assert (inside.address or inside.node.host) == endpoint.place.address

@@ -1,0 +1,243 @@
+"""Recovery from what the master knows: claims, who bears them out, and what the master lost."""
+
+from collections.abc import Sequence
+from ipaddress import ip_network
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort, is_inside
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import InsidePath
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.upkeep.recovery import policy
+from rosproxy.ros1.upkeep.recovery.policy import Claim
+from tests.unit.builders import add_node, add_registration, make_addressing
+
+PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+
+
+def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
+    return Registration(kind, name, caller_id, since=since)
+
+
+def graph(uris: dict[str, str], names: Sequence[str] = ("/a",)) -> Graph:
+    return Graph({node: [held(name, node) for name in names] for node in uris}, uris)
+
+
+URIS = [
+    # what the master has for a node, the claim: port, host and port it calls itself, address
+    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5", 40001, "10.0.0.5")),
+    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5", 40001, "10.0.0.5")),
+    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1", 40001, "10.0.0.5")),
+    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "fd00::5", 40001, "fd00::5")),
+    ("http://robot-host:45003/c5:40001/", (45003, "c5", 40001, "c5")),  # refused by address
+    ("http://robot-host:45003/", None),
+    ("http://robot-host:45003", None),
+    ("http://robot-host:45003/RPC2", None),
+    ("http://robot-host:45010/10.0.0.5:40001/", None),
+    ("http://robot-host:44999/10.0.0.5:40001/", None),
+    ("http://another-host:45003/10.0.0.5:40001/", None),
+    ("http://laptop:33445/", None),
+    ("rosrpc://robot-host:45003/10.0.0.5:40001/", None),
+    ("nonsense", None),
+    ("", None),
+]
+
+
+@pytest.mark.parametrize(("uri", "expected"), URIS)
+def test_claims_are_read_from_advertised_uris(
+    uri: str, expected: tuple[int, str, int, str] | None
+) -> None:
+    found = policy.claims(graph({"/n": uri}), make_addressing())
+    if expected is None:
+        assert found == []
+        return
+    (claim,) = found
+    assert (claim.port, *claim.uri.removeprefix("http://").rsplit(":", 1)) == (
+        expected[0],
+        f"[{expected[1]}]" if ":" in expected[1] else expected[1],
+        f"{expected[2]}/",
+    )
+    assert claim.key == (expected[3], expected[2])
+    assert claim.topics == {"/a"}
+
+
+def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
+    addressing = make_addressing(advertise=(30000, 30009))
+    uris = {
+        "/n": "http://robot-host:30003/10.0.0.5:1/",
+        "/m": "http://robot-host:45003/10.0.0.5:1/",
+    }
+    assert [claim.port for claim in policy.claims(graph(uris), addressing)] == [45003]
+
+
+def test_names_that_share_a_uri_are_one_claim() -> None:
+    uri = "http://robot-host:45003/10.0.0.5:40001/"
+    (claim,) = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing())
+    assert {one.caller_id for one in claim.registrations} == {"/n", "/m"}
+
+
+def test_a_node_without_registrations_or_without_a_uri() -> None:
+    addressing = make_addressing()
+    uri = "http://robot-host:45003/10.0.0.5:40001/"
+    (claim,) = policy.claims(Graph({}, {"/n": uri}), addressing)
+    assert claim.registrations == []
+    assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing) == []
+
+
+def claim(port: int, address: str, topics: Sequence[str] = (), slave: int = 40001) -> Claim:
+    inside = InsidePath(HostPort(address, slave))
+    return Claim(port, inside, [held(topic) for topic in topics])
+
+
+A, B = "10.0.0.5", "10.0.0.6"
+SETTLED = [
+    # claims, what the nodes asked said (by index), the ports and addresses kept
+    ([], {}, []),
+    ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], {}, [(1, A), (2, B)]),
+    # one port, two nodes: a left-over, or a forgery of many topics that no node bears out
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: {"/a"}}, [(1, A)]),
+    ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"])], {0: None, 1: {"/b"}}, [(1, B)]),
+    ([claim(1, A, ["/a"]), claim(1, B, ["/b"])], {0: {"/x"}, 1: {"/b"}}, [(1, B)]),
+    # a forgery that leads to a real node, but claims too much of it
+    (
+        [claim(1, A, ["/a", "/b"]), claim(1, B, ["/c", "/x", "/y"])],
+        {0: {"/a", "/b"}, 1: {"/c"}},
+        [(1, A)],
+    ),
+    # one node, two ports: as many topics as it has, no more
+    (
+        [claim(1, A, ["/a"]), claim(2, A, ["/a", "/b"])],
+        {0: {"/a", "/b"}, 1: {"/a", "/b"}},
+        [(2, A)],
+    ),
+    # nobody answered: the one with more registrations
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {}, [(1, B)]),
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: None, 1: None}, [(1, B)]),
+    # an answer that bears out nothing is still better than none
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: set()}, [(1, A)]),
+]
+
+
+@pytest.mark.parametrize(("found", "said", "kept"), SETTLED)
+def test_one_claim_is_kept_for_each_port_and_each_node(
+    found: list[Claim], said: dict[int, set[str] | None], kept: list[tuple[int, str]]
+) -> None:
+    answers = {i: None if topics is None else frozenset(topics) for i, topics in said.items()}
+    settled = policy.settle(found, answers)
+    assert sorted((one.port, one.address) for one in settled) == kept
+
+
+@pytest.mark.parametrize(
+    ("found", "ports"),
+    [
+        ([], []),
+        ([claim(1, A), claim(2, B)], []),
+        ([claim(1, A), claim(2, A, slave=40002)], []),
+        ([claim(1, A), claim(1, B), claim(2, A, slave=40002)], [1, 1]),
+        ([claim(1, A), claim(2, A), claim(3, B)], [1, 2]),
+    ],
+)
+def test_claims_to_the_same_port_or_node_are_contested(
+    found: list[Claim], ports: list[int]
+) -> None:
+    assert [one.port for one in policy.contested(found)] == ports
+
+
+CLAIMS = st.lists(
+    st.builds(
+        claim,
+        st.integers(1, 4),
+        st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"]),
+        st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True),
+    ),
+    max_size=6,
+)
+
+
+@given(CLAIMS, st.dictionaries(st.integers(0, 5), st.none() | st.frozensets(st.sampled_from("ab"))))
+def test_settling_leaves_no_contest_and_forgets_nobody_without_one(
+    found: list[Claim], said: dict[int, frozenset[str] | None]
+) -> None:
+    settled = policy.settle(found, said)
+    assert policy.contested(settled) == []
+    rivals = policy.contested(found)
+    assert all(one in settled for one in found if one not in rivals)
+
+
+@pytest.mark.parametrize(
+    ("address", "allowed"),
+    [
+        ("10.0.0.5", True),
+        ("fd00::5", True),
+        ("10.0.1.5", False),
+        ("127.0.0.1", False),
+        ("::1", False),
+        ("0.0.0.0", False),
+        ("169.254.169.254", False),
+        ("8.8.8.8", False),
+        ("c5", False),
+        ("localhost", False),
+        ("", False),
+    ],
+)
+def test_only_addresses_in_an_inside_network_are_recovered(address: str, allowed: bool) -> None:
+    networks = [ip_network("10.0.0.0/24"), ip_network("fd00::/64")]
+    assert is_inside(address, networks) is allowed
+    assert not is_inside(address, [])
+
+
+@pytest.mark.parametrize(
+    ("registered", "said", "confirmed"),
+    [
+        (["/rosout", "/chatter"], {"/rosout", "/chatter"}, True),
+        (["/rosout", "/chatter", "/gone"], {"/rosout", "/chatter"}, True),
+        (["/rosout", "/chatter"], {"/rosout", "/other"}, False),  # every node has /rosout
+        (["/rosout", "/chatter"], set(), False),
+        (["/rosout"], {"/rosout", "/other"}, True),
+        (["/rosout"], set(), False),
+        ([], {"/rosout"}, False),
+    ],
+)
+def test_a_node_bears_out_what_the_master_says_of_it(
+    registered: list[str], said: set[str], confirmed: bool
+) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for name in registered:
+        add_registration(addressing, endpoint, PUB, name)
+    add_registration(addressing, endpoint, SRV, "/chatter")
+    assert policy.confirmed_by(endpoint, said) is confirmed
+
+
+LOST = [
+    # ours, the master's, what is lost
+    ([], [], []),
+    ([held("/a")], [held("/a")], []),
+    ([held("/a")], [], [held("/a")]),
+    ([held("/a")], [held("/a", "/other")], [held("/a")]),
+    ([held("/a")], [held("/a", kind=SUB)], [held("/a")]),
+    ([held("/a"), held("/b")], [held("/a")], [held("/b")]),
+    ([held("/a", since=9.9)], [], [held("/a", since=9.9)]),
+    ([held("/a", since=10.0)], [], []),  # made while the master was being asked
+    ([held("/a", since=11.0)], [], []),
+    # parameters are not in the master's state: lost if their node is
+    ([held("/p", kind=PARAM)], [], []),
+    ([held("/a"), held("/p", kind=PARAM)], [held("/a")], []),
+    ([held("/a"), held("/p", kind=PARAM)], [], [held("/a"), held("/p", kind=PARAM)]),
+    ([held("/a"), held("/b"), held("/p", kind=PARAM)], [held("/b")], [held("/a")]),
+    ([held("/a"), held("/p", "/m", PARAM)], [], [held("/a")]),
+]
+
+
+@pytest.mark.parametrize(("ours", "masters", "lost"), LOST)
+def test_what_the_master_has_lost(
+    ours: list[Registration], masters: list[Registration], lost: list[Registration]
+) -> None:
+    state: dict[str, list[Registration]] = {}
+    for one in masters:
+        state.setdefault(one.caller_id, []).append(one)
+    assert policy.lost(ours, state, before=10.0) == lost

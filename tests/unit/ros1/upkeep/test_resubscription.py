@@ -1,0 +1,194 @@
+"""Who has no connection to a publisher behind the proxy: no relay, no UDPROS, no forwarding."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.upkeep.resubscription import policy
+from rosproxy.ros1.upkeep.resubscription.policy import BusRow, Subscription
+from tests.unit.builders import add_node, add_registration, make_addressing
+
+PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
+LAPTOP, ROBOT, ELSEWHERE = "192.168.1.77", "192.168.1.5", "172.17.0.1"
+HOSTS = {"/a": [LAPTOP], "/b": [LAPTOP], "/c": [ROBOT], "/d": []}
+
+
+def publisher(*topics: str) -> Endpoint:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for topic in topics:
+        add_registration(addressing, endpoint, PUB, topic)
+    return endpoint
+
+
+def subscribed(endpoint: Endpoint, *names: str, topic: str = "/t") -> list[Subscription]:
+    return [Subscription(endpoint, topic, name) for name in names]
+
+
+def names(found: Iterable[Subscription]) -> list[str]:
+    return [one.caller_id for one in found]
+
+
+def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
+    addressing = make_addressing()
+    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
+    add_registration(addressing, first, PUB, "/t")
+    add_registration(addressing, first, SUB, "/in")
+    for topic in ("/t", "/u"):
+        add_registration(addressing, second, PUB, topic, "/other")
+    held = {
+        "/a": [Registration(SUB, "/t", "/a"), Registration(SUB, "/in", "/a")],
+        "/b": [Registration(PUB, "/t", "/b"), Registration(SUB, "/u", "/b")],
+        "/c": [Registration(SRV, "/t", "/c")],
+    }
+    assert policy.subscriptions(held, [first, second], addressing) == [
+        Subscription(first, "/t", "/a"),
+        Subscription(second, "/t", "/a"),
+        Subscription(second, "/u", "/b"),
+    ]
+    assert policy.subscriptions(held, [first], addressing) == [Subscription(first, "/t", "/a")]
+    assert policy.subscriptions({}, [first], addressing) == []
+
+
+def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for name in ("/one", "/two"):
+        add_registration(addressing, endpoint, PUB, "/t", name)
+    held = {"/a": [Registration(SUB, "/t", "/a")]}
+    assert policy.subscriptions(held, [endpoint], addressing) == [
+        Subscription(endpoint, "/t", "/a")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("address", "options", "count"),
+    [
+        ("10.0.0.6", {}, 0),
+        ("10.0.0.6", {"named": False}, 1),  # its host name leads nowhere: neighbours need the proxy
+        ("10.0.1.6", {}, 1),  # in another network
+        ("172.20.0.7", {}, 1),  # in none
+    ],
+)
+def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
+    address: str, options: dict[str, Any], count: int
+) -> None:
+    addressing = make_addressing(networks=("10.0.0.0/24", "10.0.1.0/24"))
+    speaker = add_node(addressing, f"http://{address}:40001/", address, **{"named": True} | options)
+    add_registration(addressing, speaker, PUB, "/t", "/speaker")
+    add_registration(addressing, speaker, SUB, "/t", "/speaker")
+    ear = add_node(addressing)
+    held = {
+        "/ear": [add_registration(addressing, ear, SUB, "/t", "/ear")],
+        "/speaker": [Registration(SUB, "/t", "/speaker")],
+    }
+    found = policy.subscriptions(held, [speaker], addressing)
+    assert found == subscribed(speaker, "/ear")[:count]
+
+
+@pytest.mark.parametrize(
+    ("relay", "left"),
+    [
+        ((45000, "/t", "/a"), ["/b"]),
+        ((45001, "/t", "/a"), ["/a", "/b"]),  # another publisher of that topic
+        ((45000, "/u", "/a"), ["/a", "/b"]),
+        ((45000, "/t", "/c"), ["/a", "/b"]),
+    ],
+)
+def test_a_relay_serves_one_subscriber_of_one_topic_of_one_publisher(
+    relay: policy.Connection, left: list[str]
+) -> None:
+    wanted = subscribed(publisher("/t"), "/a", "/b")
+    assert names(policy.without_relay(wanted, {relay})) == left
+
+
+ROWS = [
+    ([0, "/a", "o", "TCPROS", "/t", True, "text"], BusRow("/t", "/a", "TCPROS")),
+    ([7, "/a", "o", "UDPROS", "/t", 1], BusRow("/t", "/a", "UDPROS")),
+    ([1, "/a", "o", "INTRAPROCESS", "/t"], BusRow("/t", "/a", "INTRAPROCESS")),
+    ([1, "http://laptop:5/", "i", "TCPROS", "/t"], None),
+    ([1, 2, "o", "TCPROS", "/t"], None),
+    ([1, "/a", "o"], None),
+    ("row", None),
+    (None, None),
+]
+
+
+@pytest.mark.parametrize(("row", "found"), ROWS)
+def test_a_row_of_bus_info_is_read(row: Any, found: BusRow | None) -> None:
+    assert policy.read_bus([row]) == ([found] if found else [])
+
+
+@pytest.mark.parametrize("value", [None, 0, "text", {}, []])
+def test_bus_info_of_another_form_tells_nothing(value: Any) -> None:
+    assert policy.read_bus(value) == []
+
+
+def test_a_subscriber_by_udpros_is_not_silent_and_one_by_tcpros_may_be() -> None:
+    endpoint = publisher("/t")
+    bus = {endpoint: [BusRow("/t", "/a", "UDPROS"), BusRow("/t", "/b", "TCPROS")]}
+    assert names(policy.silent(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
+    assert names(policy.silent(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == ["/a"]
+    assert names(policy.silent(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
+
+
+FORWARDED = [
+    # connections that the kernel forwards, by peer; who is named by the publisher; who is silent
+    ({}, [], ["/a", "/b", "/c"]),
+    ({LAPTOP: 2}, [], ["/c"]),
+    ({LAPTOP: 3}, [], ["/c"]),  # one too many: an old one that the kernel has not forgotten
+    ({LAPTOP: 2, ROBOT: 1}, [], []),
+    ({ROBOT: 1}, [], ["/a", "/b"]),
+    ({LAPTOP: 1, ROBOT: 1}, [], ["/a", "/b"]),  # which of the two is not known
+    ({LAPTOP: 1, ROBOT: 1}, ["/a"], ["/b"]),
+    ({LAPTOP: 1, ROBOT: 1}, ["/a", "/b"], ["/a", "/b"]),  # one of them has vanished
+    ({ELSEWHERE: 3}, [], []),  # the peers' addresses are hidden
+    ({ELSEWHERE: 2}, ["/a", "/c"], ["/b"]),
+    ({ELSEWHERE: 2}, [], ["/a", "/b", "/c"]),
+    ({LAPTOP: 2, ELSEWHERE: 1}, [], ["/c"]),
+]
+
+
+@pytest.mark.parametrize(("peers", "named", "found"), FORWARDED)
+def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_silent_one(
+    peers: dict[str, int], named: list[str], found: list[str]
+) -> None:
+    endpoint = publisher("/t")
+    endpoint.fast_peers = peers
+    bus = {endpoint: [BusRow("/t", name, "TCPROS") for name in named]}
+    left = subscribed(endpoint, "/a", "/b", "/c")
+    assert names(policy.silent(left, bus, HOSTS)) == found
+
+
+def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
+    addressing = make_addressing()
+    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
+    first.fast_peers = {LAPTOP: 5}
+    left = [*subscribed(first, "/a"), *subscribed(second, "/a")]
+    assert policy.silent(left, {}, HOSTS) == subscribed(second, "/a")
+
+
+def test_a_host_that_is_not_found_has_no_connections() -> None:
+    endpoint = publisher("/t")
+    endpoint.fast_peers = {LAPTOP: 2}
+    assert names(policy.silent(subscribed(endpoint, "/a", "/d"), {}, HOSTS)) == ["/d"]
+
+
+def test_a_udpros_subscriber_needs_no_connection_in_the_kernel() -> None:
+    endpoint = publisher("/t")
+    endpoint.fast_peers = {LAPTOP: 1}
+    bus = {endpoint: [BusRow("/t", "/a", "UDPROS")]}
+    assert policy.silent(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
+
+
+def test_only_the_publishers_without_connection_are_withdrawn() -> None:
+    addressing = make_addressing()
+    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
+    far = "http://laptop:5/"
+    uris = [addressing.advertised_uri(first), far, addressing.advertised_uri(second)]
+    assert policy.publishers_left(uris, {first}, addressing) == uris[1:]
+    assert policy.publishers_left(uris, {first, second}, addressing) == [far]
+    assert policy.publishers_left(uris, set(), addressing) == uris
