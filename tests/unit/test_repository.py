@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 from pathlib import Path
 from statistics import median
 
@@ -75,6 +76,18 @@ def test_readme_names_tests_that_exist() -> None:
 def test_scripts_can_be_run() -> None:
     scripts = [*(ROOT / "scripts").glob("*.sh"), ROOT / ".ci/run"]
     assert not [path.name for path in scripts if not path.stat().st_mode & 0o111]
+
+
+def test_images_are_tagged_with_the_version() -> None:
+    """The chart pulls that tag: its appVersion is the same (tests/chart)."""
+    from rosproxy import __version__
+
+    make = ["make", "--dry-run", "image", "push", "REGISTRY=registry.example/ros"]
+    said = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in ("rosproxy", "rosproxy-operator"):
+        image = f"registry.example/ros/{name}:{__version__}"
+        assert f"--tag {image} " in said
+        assert f"docker push {image}\n" in said
 
 
 def test_docker_page_names_every_option_label_and_metric() -> None:
