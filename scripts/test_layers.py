@@ -4,12 +4,14 @@
     python scripts/test_layers.py                  what `make test-all` runs
     python scripts/test_layers.py unit ros         these layers only
 
-How it works. A layer is a directory under tests/. Two things happen at the same time: the layers
-that need nothing (unit, integration) run in this thread, and a second one prepares what the others
-need: packages, programs, images, each by a script that does nothing where its work is done already.
-When both have ended, the layers with real nodes, engines and clusters run in lanes: the layers of a
-lane one after another, the lanes side by side, since real programs mostly wait. They don't start
-earlier because they mind a machine that is busy with compiling.
+How it works. A layer is a directory under tests/. There are two halves, each in lanes: what is in
+a lane runs one after another, the lanes run side by side.
+
+  1. The integration tests, which mind a busy machine, have a processor for themselves. Beside them
+     what other layers need is prepared: packages, programs and images, by scripts that do nothing
+     where their work is done already. After that the layers of plain computing run: unit, chart.
+  2. The layers with real nodes, engines and clusters, a lane for each: these mostly wait. They
+     don't start earlier because they mind a machine that is busy with compiling.
 
 With --smoke, only tests marked `smoke` run of the layers that have such, and layers without are
 left to `make test-all`. So all that `make test` runs is part of `make test-all`.
@@ -23,7 +25,6 @@ No test is tried twice.
 import argparse
 import os
 import platform
-import shlex
 import signal
 import subprocess
 import sys
@@ -39,28 +40,35 @@ ROOT = Path(__file__).resolve().parent.parent
 LOGS = ROOT / "build/test-logs"
 CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
+ALL, MARKED, NONE = "all", "marked", "none"
 
-ROS = "scripts/install-ros.sh"
-DOCKER = "scripts/install-docker.sh"
-COMPOSE = "scripts/install-compose.sh"
-KUBERNETES = "scripts/install-kubernetes.sh"
-IMAGES = f"{shlex.quote(sys.executable)} -m tests.docker.images"
+ROS, ENGINE, COMPOSE, KUBERNETES, IMAGES = PREPARATIONS = (
+    "install-ros",
+    "install-docker",
+    "install-compose",
+    "install-kubernetes",
+    "build-images",
+)
+COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
+    IMAGES: [sys.executable, "-m", "tests.docker.images"]
+}
 
 
 @dataclass(frozen=True)
 class Layer:
     """A directory of tests, and how it is run.
 
-    ``lane``: 0 needs nothing prepared. ``setup``: commands that prepare this machine for the layer;
-    ``smoke_setup``: those of them that its smoke needs, None if it has none. ``workers``: how many
-    processes of pytest share the tests, one file each at a time. ``obstacle`` says why it can't run
-    here, if so.
+    ``real``: it belongs to the second half. ``setup``: what prepares this machine for it, of COMMANDS;
+    ``smoke_setup``: those of them that its smoke needs. ``smoke``: ALL of its tests are in the
+    smoke, those that are MARKED, or NONE. ``workers``: how many processes of pytest share the
+    tests, one file each at a time. ``obstacle`` says why it can't run here, if so.
     """
 
     name: str
-    lane: int = 0
+    real: bool = False
+    smoke: str = NONE
     setup: tuple[str, ...] = ()
-    smoke_setup: tuple[str, ...] | None = None
+    smoke_setup: tuple[str, ...] = ()
     workers: int = 0
     obstacle: Callable[[], str | None] = lambda: None
 
@@ -69,7 +77,7 @@ class Layer:
         words += ["--durations=15", "-o", f"cache_dir={LOGS}/{self.name}-cache"]
         if self.workers:
             words += ["-n", str(self.workers), "--dist=loadfile"]
-        return words + (["-m", "smoke"] if smoke and self.lane else [])
+        return words + (["-m", "smoke"] if smoke and self.smoke == MARKED else [])
 
 
 @dataclass(frozen=True)
@@ -110,14 +118,17 @@ def effective_capabilities() -> int:
     return 0
 
 
-LAYERS = (
-    Layer("unit", workers=2),
-    Layer("integration", workers=2),
-    Layer("ros", 1, (ROS,), (ROS,), workers=2, obstacle=debian_root_obstacle),
-    Layer("docker", 2, (DOCKER, COMPOSE, IMAGES), (DOCKER, IMAGES), obstacle=debian_root_obstacle),
-    Layer("chart", 3, (KUBERNETES,), obstacle=debian_root_obstacle),
-    Layer("kubernetes", 3, (DOCKER, KUBERNETES, IMAGES), obstacle=debian_root_obstacle),
+UNIT = Layer("unit", smoke=ALL)
+INTEGRATION = Layer("integration", smoke=ALL)
+CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
+ROS_NODES = Layer("ros", True, MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
+DOCKER_ENGINE = Layer(
+    "docker", True, MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
 )
+CLUSTER = Layer(
+    "kubernetes", True, setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle
+)
+LAYERS = (UNIT, INTEGRATION, CHART, ROS_NODES, DOCKER_ENGINE, CLUSTER)
 
 
 class Run:
@@ -133,30 +144,28 @@ class Run:
     def all(self) -> list[Outcome]:
         """Prepare and run; the outcomes in the order of the layers."""
         LOGS.mkdir(parents=True, exist_ok=True)
-        numbers = sorted({layer.lane for layer in self.layers})
-        lanes = [[one for one in self.layers if one.lane == number] for number in numbers]
-        first = lanes.pop(0) if numbers[0] == 0 else []
-        with ThreadPoolExecutor(max(1, len(lanes))) as pool:
-            preparation = pool.submit(self._prepare)
-            outcomes = self._lane(first)
-            preparation.result()
-            for more in pool.map(self._lane, lanes):
+        with ThreadPoolExecutor() as pool:
+            integration = pool.submit(self._lane, [INTEGRATION])
+            self._prepare()
+            outcomes = self._lane([UNIT, CHART]) + integration.result()
+            real = [[layer] for layer in LAYERS if layer.real]
+            for more in pool.map(self._lane, real):
                 outcomes += more
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
     def _prepare(self) -> None:
         able = [layer for layer in self.layers if layer.obstacle() is None]
         for step in dict.fromkeys(step for layer in able for step in self._steps(layer)):
-            code, text = self._run(step.rpartition("/")[2].rpartition(".")[2], shlex.split(step))
+            code, text = self._run(step, COMMANDS[step])
             if code:
                 self._failed.add(step)
                 self._say(f"{step} failed:\n{text}")
 
     def _steps(self, layer: Layer) -> tuple[str, ...]:
-        return layer.setup if not self.smoke else layer.smoke_setup or ()
+        return layer.smoke_setup if self.smoke else layer.setup
 
     def _lane(self, layers: list[Layer]) -> list[Outcome]:
-        return [self._layer(layer) for layer in layers]
+        return [self._layer(layer) for layer in layers if layer in self.layers]
 
     def _layer(self, layer: Layer) -> Outcome:
         obstacle = layer.obstacle()
@@ -192,7 +201,7 @@ class Run:
         lines = ["", f"Test layers, {minutes} min {seconds} s in all:"]
         for outcome in outcomes:
             mark = "ok" if outcome.good and outcome.ran else "--" if outcome.good else "FAILED"
-            only = " (smoke)" if self.smoke and outcome.layer.lane else ""
+            only = " (smoke)" if self.smoke and outcome.layer.smoke == MARKED else ""
             lines.append(f"  {outcome.layer.name + only:<16} {mark:<7} {outcome.text}")
         if self.smoke:
             lines.append(
@@ -226,7 +235,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = [layer for layer in LAYERS if not options.layers or layer.name in options.layers]
     if options.smoke:
-        wanted = [one for one in wanted if not one.lane or one.smoke_setup is not None]
+        wanted = [layer for layer in wanted if layer.smoke != NONE]
     run = Run(wanted, options.smoke)
     outcomes = run.all()
     print(run.summary(outcomes))
