@@ -58,7 +58,7 @@ COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
 class Layer:
     """A directory of tests, and how it is run.
 
-    ``real``: it belongs to the second half. ``setup``: what prepares this machine for it, of COMMANDS;
+    ``real``: it belongs to the second half. ``setup``: what prepares this machine for it;
     ``smoke_setup``: those of them that its smoke needs. ``smoke``: ALL of its tests are in the
     smoke, those that are MARKED, or NONE. ``workers``: how many processes of pytest share the
     tests, one file each at a time. ``obstacle`` says why it can't run here, if so.
