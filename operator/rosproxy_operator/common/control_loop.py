@@ -1,4 +1,4 @@
-"""The loop of an operator, the same for every engine: look, act, and wait for a reason to look again.
+"""The loop of an operator, for any engine: look, act, and wait for a reason to look again.
 
 A reason is an event (`wake`), a time (`wake_in`, or what the look returned), or the resync. A look
 is level-triggered: it sees everything, so an event says no more than that there was one, and a

@@ -1,4 +1,4 @@
-"""An event loop whose clock jumps: when everything waits, it is at once as late as is waited for."""
+"""An event loop whose clock jumps: when everything waits, it is as late as is waited for."""
 
 import asyncio
 import selectors
