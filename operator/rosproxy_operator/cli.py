@@ -305,7 +305,7 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        reason = str(error) if "HTTP" in str(error) else f"no controller answers at {url}"
+        reason = str(error) if "HTTP" in str(error) else f"no operator answers at {url}"
         click.echo(f"rosproxy-operator: {reason}", err=True)
         sys.exit(1)
 

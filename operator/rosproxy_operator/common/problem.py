@@ -1,4 +1,4 @@
-"""What is wrong, as all controllers tell it."""
+"""What is wrong, as it is told for every engine."""
 
 from dataclasses import dataclass
 

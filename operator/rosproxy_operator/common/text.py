@@ -1,4 +1,4 @@
-"""Text for people, as all controllers tell it."""
+"""Text for people, as it is told for every engine."""
 
 
 def bounded(text: str, most: int) -> str:

@@ -1,4 +1,4 @@
-"""Running the Docker controller's commands."""
+"""Running the commands for Docker."""
 
 import asyncio
 import json
@@ -25,12 +25,12 @@ ONCE = 60.0
 
 
 def run(settings: DockerSettings) -> None:
-    """Run the controller until a signal ends it; its proxies go on. Raises SettingError."""
+    """Run the operator until a signal ends it; its proxies go on. Raises SettingError."""
     asyncio.run(_run(settings))
 
 
 def run_once(settings: DockerSettings) -> list[Problem]:
-    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
+    """DockerSnapshot and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
     return asyncio.run(_run_once(settings))
 
 

@@ -1,4 +1,4 @@
-"""What there is on a host, for ``status`` and ``plan``: found out without a running controller."""
+"""What there is on a host, for ``status`` and ``plan``: found out without a running operator."""
 
 import asyncio
 import time
@@ -12,17 +12,15 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
-from rosproxy_operator.docker.details import Inspector
 from rosproxy_operator.docker.planner.actions import Action
 from rosproxy_operator.docker.planner.model import Container, Key, Proxy, Sandbox
-from rosproxy_operator.docker.planner.plan import Plan, plan
+from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.report import line
 from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
-from rosproxy_operator.docker.sense import sense, unresolved
-from rosproxy_operator.docker.snapshot import Look, Observer
+from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 Own = TypeVar("Own", Proxy, Sandbox)
 PATIENCE = 3.0
@@ -33,45 +31,42 @@ PATIENCE = 3.0
 class Survey:
     """One look at a host, what would be done there, and what its proxies say, by name."""
 
-    look: Look
-    plan: Plan
+    look: DockerSnapshot
+    plan: DockerPlan
     said: Mapping[str, Json | ProxyError]
     problems: tuple[Problem, ...]
 
     @property
     def actions(self) -> list[Action]:
         """What would be done, but for what the engine is busy with and tells nothing of."""
-        own: list[Proxy | Sandbox] = [*self.look.observed.proxies, *self.look.observed.sandboxes]
-        busy = {each.key for each in own if each.container.name in self.look.unsure}
-        return [a for group in self.plan.groups if group.key not in busy for a in group.actions]
+        groups = (*self.plan.groups, *self.plan.deferred)
+        return [action for group in groups for action in group.actions]
 
 
 async def survey(settings: PlanSettings) -> Survey:
-    """Look at the engine and ask all proxies. Raises EngineError."""
+    """DockerSnapshot at the engine and ask all proxies. Raises EngineError."""
     engine, masters, proxies = DockerClient(), MasterResolver(_nothing), ProxyClient()
-    observer = Observer(engine, settings, Inspector(engine, _nothing))
+    observer = DockerObserver(engine, settings, masters, _nothing)
     try:
-        look = await sense(observer, masters, settings, PATIENCE)
-        planned = plan(look.observed, settings, Memory(), time.monotonic())
-        answers = await asyncio.gather(
-            *(_ask(proxies, HostPort(way.host, way.port)) for way in look.ways.values())
-        )
+        look = await observer.look(PATIENCE)
+        planned = plan(look.state, look.labels, settings, DockerMemory(), time.monotonic())
+        ways = look.access.values()
+        answers = await asyncio.gather(*(_ask(proxies, access.admin) for access in ways))
     finally:
         await proxies.close()
-    said = dict(zip(look.ways, answers, strict=True))
+    said = dict(zip(look.access, answers, strict=True))
     silent = [
         silence(name, answer, look, settings.uplink)
         for name, answer in said.items()
         if isinstance(answer, ProxyError)
     ]
-    problems = (*planned.problems, *unresolved(look, masters, settings), *silent)
-    return Survey(look, planned, said, problems)
+    return Survey(look, planned, said, (*planned.problems, *silent))
 
 
 def describe(found: Survey, settings: PlanSettings) -> Json:
     """A survey as JSON: what `rosproxy_operator.docker.planner.report.render` shows."""
-    observed = found.look.observed
-    keys = {wish.id: wish.key for wish in found.plan.wishes if wish.key in observed.keys}
+    observed = found.look.state
+    keys = {member.id: member.key for member in found.plan.members if member.key in observed.keys}
     listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
     return {
         "version": __version__,
@@ -92,7 +87,7 @@ def _name(key: Key | None) -> str | None:
 
 def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
     """One row per proxy; its sandbox is only told of where it is what is wrong."""
-    observed, name = found.look.observed, proxy_name(key)
+    observed, name = found.look.state, proxy_name(key)
     process = _best([p for p in observed.proxies if p.key == key], name)
     box = _best([box for box in observed.sandboxes if box.key == key], sandbox_name(key))
     answer = found.said.get(process.container.name) if process else None

@@ -13,7 +13,7 @@ WINDOW = PortRange(11400, 65535)
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The controller's options that decide what is planned.
+    """The operator's options that decide what is planned.
 
     ``master_uri`` and ``advertise_host`` are for containers without a label of their own and may
     be empty. ``ports`` is the least number of ports that a proxy gets, ``window`` where they are

@@ -42,7 +42,7 @@ _SLUG = 30
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """What a container's labels say that this controller made. ``role`` is one of ``ROLE_…``."""
+    """What a container's labels say that this operator made. ``role`` is one of ``ROLE_…``."""
 
     role: str
     key: Key
@@ -86,7 +86,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
 
 
 def read_own(labels: Mapping[str, str]) -> Own | None:
-    """What the labels of a container of this controller say.
+    """What the labels of a container of this operator say.
 
     None if they are not those of one, or not whole.
     """
