@@ -263,7 +263,7 @@ async def test_health_starts_fast() -> None:
     """Docker runs it every few seconds: it must not load the proxy's own machinery."""
     code = (
         "import sys; sys.argv = ['rosproxy', 'health', '--admin', '127.0.0.1:1']\n"
-        "from rosproxy.cli import main\n"
+        "from rosproxy.cli.main import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         "heavy = {'aiohttp', 'asyncio', 'prometheus_client', 'urllib.request'}\n"
