@@ -58,7 +58,7 @@ class DockerController:
         self._last: tuple[DockerSnapshot, DockerPlan] | None = None
 
     async def run(self) -> None:
-        """DockerSnapshot after the engine until cancelled. Proxies go on without an operator."""
+        """Look after the engine until cancelled. Proxies go on without an operator."""
         self._events.start()
         self._tasks.repeat(self._masters.refresh, AGAIN_UNRESOLVED, "resolving masters")
         try:
@@ -67,7 +67,7 @@ class DockerController:
             await self._close()
 
     async def run_once(self, seconds: float) -> list[Problem]:
-        """DockerSnapshot and act until nothing is left to do, for so many seconds at most.
+        """Look and act until nothing is left to do, for so many seconds at most.
 
         Returns what is not as it should be. Raises LookFailed if the engine can't be reached.
         """

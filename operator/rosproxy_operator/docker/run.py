@@ -30,7 +30,7 @@ def run(settings: DockerSettings) -> None:
 
 
 def run_once(settings: DockerSettings) -> list[Problem]:
-    """DockerSnapshot and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
+    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
     return asyncio.run(_run_once(settings))
 
 

@@ -44,7 +44,7 @@ class Survey:
 
 
 async def survey(settings: PlanSettings) -> Survey:
-    """DockerSnapshot at the engine and ask all proxies. Raises EngineError."""
+    """Look at the engine and ask all proxies. Raises EngineError."""
     engine, masters, proxies = DockerClient(), MasterResolver(_nothing), ProxyClient()
     observer = DockerObserver(engine, settings, masters, _nothing)
     try:
