@@ -12,15 +12,15 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.problem_log import ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.apply import Applier
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.apply import ClusterApplier
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.events import stamp
-from rosproxy_operator.kubernetes.planner.model import Observed, ProxyPod
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
-from rosproxy_operator.kubernetes.planner.state import Memory
-from rosproxy_operator.kubernetes.proxy_sync import ProxySync
-from rosproxy_operator.kubernetes.snapshot import Cluster, Observer
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.snapshot import Cluster, SnapshotReader
 from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
@@ -50,14 +50,14 @@ class KubernetesController:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._tasks = Tasks()
         self._proxies = ProxyClient()
-        self._observer = Observer(api)
-        self._applier = Applier(api, self._proxies, self._tasks, metrics.count)
-        self._conversations = ProxySync(self._tasks, self._proxies, self._again.set)
+        self._observer = SnapshotReader(api)
+        self._applier = ClusterApplier(api, self._proxies, self._tasks, metrics.count)
+        self._conversations = ClusterProxySync(self._tasks, self._proxies, self._again.set)
         self.concern = EventFilter()
         self.appeared: Callable[[], None] = lambda: None
         self._missing = False
         self._timer: asyncio.TimerHandle | None = None
-        self._memory = Memory()
+        self._state = ClusterState()
         self._log = ProblemLog()
         self._failures = 0
         self._looking_since: float | None = None
@@ -104,11 +104,13 @@ class KubernetesController:
         except ApiError as error:
             self._failed(error)
         except TimeoutError:
-            self._failed(ApiError(Kind.AWAY, f"the API server took more than {LONGEST_LOOK:.0f} s"))
+            self._failed(
+                ApiError(ErrorKind.AWAY, f"the API server took more than {LONGEST_LOOK:.0f} s")
+            )
         except Exception as error:
             if not self._failures:
                 log.exception("a look failed; going on")
-            self._failed(ApiError(Kind.OTHER, f"the controller failed: {error!r}"))
+            self._failed(ApiError(ErrorKind.OTHER, f"the controller failed: {error!r}"))
 
     async def look(self) -> None:
         """One look and what follows from it. Raises ApiError."""
@@ -119,9 +121,9 @@ class KubernetesController:
             self._conversations.hold(cluster.proxies)
             observed = cluster.observed(self._conversations.answers, self._applier.failures)
             planned = plan(
-                observed, self._settings.plan, self._memory, time.monotonic(), stamp(time.time())
+                observed, self._settings.plan, self._state, time.monotonic(), stamp(time.time())
             )
-            self._memory, self._again_in = planned.memory, planned.again_in
+            self._state, self._again_in = planned.state, planned.again_in
             self._metrics.look_time.observe(time.monotonic() - started)
             log.debug("looked in %.3f s", time.monotonic() - started)
             self.concern.learn(cluster)
@@ -131,7 +133,7 @@ class KubernetesController:
             self._looking_since, self._looked_at = None, time.monotonic()
         self._looked(cluster, planned)
 
-    async def _act(self, planned: Plan, observed: Observed) -> None:
+    async def _act(self, planned: ClusterPlan, observed: ClusterSnapshot) -> None:
         before = dict(self._applier.failures)
         await self._applier.carry_out(planned.actions, observed)
         if self._applier.failures != before:
@@ -139,7 +141,7 @@ class KubernetesController:
         elif planned.actions:
             self._look_in(SETTLED)
 
-    def _looked(self, cluster: Cluster, planned: Plan) -> None:
+    def _looked(self, cluster: Cluster, planned: ClusterPlan) -> None:
         if self._failures:
             log.info("looking works again")
         self._failures, self._error = 0, None
@@ -154,14 +156,14 @@ class KubernetesController:
         metrics.rosproxies.set(len(cluster.rosproxies))
         metrics.pods.set(len(cluster.selected))
         metrics.problems.set(len(problems))
-        metrics.show_proxies(map(_state, cluster.proxies))
+        metrics.show_proxies(map(_proxy_state, cluster.proxies))
 
     def _failed(self, error: ApiError) -> None:
-        away = error.kind is Kind.AWAY
+        away = error.kind is ErrorKind.AWAY
         if str(error) != self._error:
             log.log(logging.WARNING if away else logging.ERROR, "%s", error)
         self._failures += 1
-        self._missing = self._missing or error.kind is Kind.GONE
+        self._missing = self._missing or error.kind is ErrorKind.GONE
         self._error = str(error)
         self._metrics.looks.labels("unavailable" if away else "failed").inc()
         self._metrics.api_up.set(0 if away else 1)
@@ -192,7 +194,7 @@ class KubernetesController:
         await self._proxies.close()
 
 
-def _state(proxy: ProxyPod) -> str:
+def _proxy_state(proxy: ProxyPod) -> str:
     if proxy.stuck:
         return "stuck"
     return "ready" if proxy.ready else "starting"

@@ -28,7 +28,7 @@ class Wakeable(Protocol):
         """Why it is not alive; None if it is."""
 
 
-class Dead(Exception):
+class NotAlive(Exception):
     """The controller is not alive."""
 
 
@@ -63,7 +63,7 @@ def _lifetime(
     async def alive(**_: Any) -> str:
         reason = controller.dead()
         if reason:
-            raise Dead(reason)
+            raise NotAlive(reason)
         return "ok"
 
     @kopf.on.cleanup(registry=handlers, id="cleanup")
@@ -96,7 +96,6 @@ def _webhook(handlers: kopf.OperatorRegistry, wirer: Injector) -> None:
         operations=["CREATE"],
         labels={INJECT: kopf.PRESENT},
         ignore_failures=True,
-        side_effects=True,
     )
     async def wire(
         body: kopf.Body,

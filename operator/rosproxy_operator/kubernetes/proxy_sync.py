@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
-from rosproxy_operator.kubernetes.planner.model import Answer, ProxyPod
+from rosproxy_operator.kubernetes.planner.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT
 from rosproxy_operator.kubernetes.planner.proxy_status import answer, no_answer
 
@@ -26,7 +26,7 @@ AT_ONCE = 32
 """Proxies that are asked at the same time."""
 
 
-class Conversation:
+class ProxyPoller:
     """Asks one proxy again and again, and tells it which pods are gone until it has heard.
 
     ``changed`` is called when what is known of it has changed.
@@ -40,7 +40,7 @@ class Conversation:
         changed: Callable[[], None],
     ) -> None:
         self.where = address_of(proxy)
-        self.answer: Answer | None = None
+        self.answer: ProxyReport | None = None
         self._token = proxy.token
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
@@ -111,16 +111,16 @@ class Conversation:
         return time.monotonic() - self._since > seconds
 
 
-class ProxySync:
+class ClusterProxySync:
     """All conversations, one for each proxy's pod that has an address."""
 
     def __init__(self, tasks: Tasks, proxies: ProxyClient, changed: Callable[[], None]) -> None:
         self._tasks, self._proxies, self._changed = tasks, proxies, changed
         self._room = asyncio.Semaphore(AT_ONCE)
-        self._all: dict[str, tuple[Conversation, asyncio.Task[None]]] = {}
+        self._all: dict[str, tuple[ProxyPoller, asyncio.Task[None]]] = {}
 
     @property
-    def answers(self) -> dict[str, Answer]:
+    def answers(self) -> dict[str, ProxyReport]:
         """What is known, by the uid of the proxy's pod; of one that is just starting, nothing."""
         return {uid: one.answer for uid, (one, _) in self._all.items() if one.answer is not None}
 
@@ -134,7 +134,7 @@ class ProxySync:
                 del self._all[uid]
         for uid, proxy in wanted.items():
             if uid not in self._all:
-                one = Conversation(proxy, self._proxies, self._room, self._changed)
+                one = ProxyPoller(proxy, self._proxies, self._room, self._changed)
                 task = self._tasks.spawn(one.run(), f"conversation with {proxy.pod.id}")
                 self._all[uid] = one, task
 

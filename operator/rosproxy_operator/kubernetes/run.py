@@ -9,7 +9,7 @@ from rosproxy_operator.common.health import Health
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.watch import Watch
+from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
@@ -64,8 +64,10 @@ def _watch(
     api: Api,
     keeper: CertificateRotation | None,
     metrics: ClusterMetrics,
-) -> Watch:
+) -> ClusterWatch:
     if settings.webhook is None or keeper is None:
-        return Watch(settings, controller, None, None, metrics)
+        return ClusterWatch(settings, controller, None, None, metrics)
     server = WebhookServer(settings.webhook.bind, keeper)
-    return Watch(settings, controller, Injector(api, metrics), server, metrics)
+    return ClusterWatch(
+        settings, controller, Injector(api, metrics, controller.wake), server, metrics
+    )

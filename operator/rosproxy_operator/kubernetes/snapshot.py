@@ -10,19 +10,19 @@ from typing import TypeVar
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.masters import master_service
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
+    ClusterNode,
+    ClusterSnapshot,
     Failure,
     InvalidRosProxy,
     Name,
-    Node,
-    Observed,
     Pod,
     ProxyPod,
+    ProxyReport,
+    ProxyService,
     RosProxy,
-    Service,
 )
 from rosproxy_operator.kubernetes.planner.objects import node as parse_node
 from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_prox
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.planner.spec import Unusable, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import InvalidField, invalid, rosproxy
 
 T = TypeVar("T")
 AT_ONCE = 8
@@ -50,18 +50,18 @@ class Cluster:
 
     rosproxies: tuple[RosProxy, ...]
     unusable: Mapping[Name, InvalidRosProxy]
-    nodes: Mapping[str, Node]
+    nodes: Mapping[str, ClusterNode]
     pods: tuple[Pod, ...]
     proxies: tuple[ProxyPod, ...]
-    services: Mapping[Name, Service]
+    services: Mapping[Name, ProxyService]
     masters: Mapping[Name, tuple[str, str]]
     selected: frozenset[str]
 
     def observed(
-        self, answers: Mapping[str, Answer], failures: Mapping[Name, tuple[Failure, ...]]
-    ) -> Observed:
+        self, answers: Mapping[str, ProxyReport], failures: Mapping[Name, tuple[Failure, ...]]
+    ) -> ClusterSnapshot:
         """The same for planning."""
-        return Observed(
+        return ClusterSnapshot(
             rosproxies=self.rosproxies,
             nodes=self.nodes,
             pods=self.pods,
@@ -74,7 +74,7 @@ class Cluster:
         )
 
 
-class Observer:
+class SnapshotReader:
     """Looks at a cluster."""
 
     def __init__(self, api: Api) -> None:
@@ -121,7 +121,7 @@ class Observer:
         for found in self._listed_rosproxies():
             try:
                 usable.append(rosproxy(found))
-            except Unusable as error:
+            except InvalidField as error:
                 what = invalid(found, error)
                 unusable[what.id] = what
         return usable, unusable
@@ -130,10 +130,10 @@ class Observer:
         try:
             return self._api.rosproxies()
         except ApiError as error:
-            if error.kind is not Kind.GONE:
+            if error.kind is not ErrorKind.GONE:
                 raise
             raise ApiError(
-                Kind.GONE,
+                ErrorKind.GONE,
                 "the cluster has no RosProxies: install the CustomResourceDefinition "
                 "rosproxies.rosproxy.io (it comes with the chart and with manifests/)",
             ) from None
@@ -142,7 +142,7 @@ class Observer:
         found = map(parse_proxy_pod, self._api.own("pods"))
         return [proxy for proxy in found if proxy]
 
-    def _services(self) -> dict[Name, Service]:
+    def _services(self) -> dict[Name, ProxyService]:
         found = map(parse_service, self._api.own("services"))
         return {service.of: service for service in found if service}
 
@@ -168,7 +168,7 @@ class Observer:
         try:
             found = self._api.pods(of.id.namespace, label_selector(of.spec, of.id.name))
         except ApiError as error:
-            if error.kind is not Kind.INVALID:
+            if error.kind is not ErrorKind.INVALID:
                 raise
             text = f"spec.podSelector: {error}"
             return InvalidRosProxy(of.id, of.uid, of.generation, text, of.status)

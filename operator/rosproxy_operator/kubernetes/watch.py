@@ -44,7 +44,7 @@ class Endless:
             yield _BETWEEN_TRIES[-1]
 
 
-class Watch:
+class ClusterWatch:
     """Watches the cluster and serves liveness and webhook, in a thread."""
 
     def __init__(

@@ -16,7 +16,7 @@ from aiohttp import web
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.webhook import certificates
-from rosproxy_operator.kubernetes.webhook.certificates import Pair
+from rosproxy_operator.kubernetes.webhook.certificates import KeyPair
 from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation
 
@@ -58,7 +58,7 @@ class WebhookServer:
         finally:
             await runner.cleanup()
 
-    async def _keep(self, context: ssl.SSLContext, served: Pair) -> None:
+    async def _keep(self, context: ssl.SSLContext, served: KeyPair) -> None:
         """Serve another certificate as soon as there is one."""
         while True:
             await asyncio.sleep(CHECK)

@@ -14,7 +14,7 @@ from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.planner.model import ProxyPod
 from rosproxy_operator.kubernetes.planner.objects import proxy_pod
-from rosproxy_operator.kubernetes.proxy_sync import ProxySync
+from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
 UP = {"master": {"up": True}, "nodes": []}
@@ -48,7 +48,7 @@ class Told(ProxyClient):
 class Talk:
     def __init__(self) -> None:
         self.proxies, self.tasks, self.changes = Told(), Tasks(), 0
-        self.all = ProxySync(self.tasks, self.proxies, self.changed)
+        self.all = ClusterProxySync(self.tasks, self.proxies, self.changed)
 
     def changed(self) -> None:
         self.changes += 1
