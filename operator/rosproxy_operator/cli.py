@@ -312,10 +312,11 @@ def health() -> None:
 
 def _or_exit(work: Callable[[], Any]) -> Any:
     """Do something that may find no engine, and say so in one line."""
+    from rosproxy_operator.common.control_loop import LookFailed
     from rosproxy_operator.docker.errors import EngineError
 
     try:
         return work()
-    except EngineError as error:
+    except (EngineError, LookFailed) as error:
         click.echo(f"rosproxy-operator: {error}", err=True)
         sys.exit(1)

@@ -9,7 +9,7 @@ import time
 from rosproxy import __version__
 from rosproxy.cli.terminal import WATCH_INTERVAL, draw, size, write
 from rosproxy_operator.common.health import Health
-from rosproxy_operator.common.metrics import Metrics
+from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.errors import EngineError
@@ -30,7 +30,7 @@ def run(settings: DockerSettings) -> None:
 
 
 def run_once(settings: DockerSettings) -> list[Problem]:
-    """Look and act until nothing is left to do; what is not as wanted. Raises EngineError."""
+    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
     return asyncio.run(_run_once(settings))
 
 
@@ -74,7 +74,7 @@ async def _run(settings: DockerSettings) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    metrics = Metrics()
+    metrics = DockerMetrics()
     controller = DockerController(settings, metrics)
     health = Health(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
@@ -89,4 +89,4 @@ async def _run(settings: DockerSettings) -> None:
 
 
 async def _run_once(settings: DockerSettings) -> list[Problem]:
-    return await DockerController(settings, Metrics()).run_once(ONCE)
+    return await DockerController(settings, DockerMetrics()).run_once(ONCE)

@@ -41,12 +41,12 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         api.server,
         settings.admin,
     )
-    keeper = (
+    rotation = (
         CertificateRotation(source(api, settings.webhook), metrics) if settings.webhook else None
     )
-    watch = _watch(settings, controller, api, keeper, metrics)
+    watch = _watch(settings, controller, api, rotation, metrics)
     controller.appeared = watch.restart
-    running = [controller.run(), stopped.wait(), *([keeper.run()] if keeper else [])]
+    running = [controller.run(), stopped.wait(), *([rotation.run()] if rotation else [])]
     tasks = [asyncio.ensure_future(work) for work in running]
     watch.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -62,12 +62,12 @@ def _watch(
     settings: KubernetesSettings,
     controller: KubernetesController,
     api: Api,
-    keeper: CertificateRotation | None,
+    rotation: CertificateRotation | None,
     metrics: ClusterMetrics,
 ) -> ClusterWatch:
-    if settings.webhook is None or keeper is None:
+    if settings.webhook is None or rotation is None:
         return ClusterWatch(settings, controller, None, None, metrics)
-    server = WebhookServer(settings.webhook.bind, keeper)
+    server = WebhookServer(settings.webhook.bind, rotation)
     return ClusterWatch(
         settings, controller, Injector(api, metrics, controller.wake), server, metrics
     )

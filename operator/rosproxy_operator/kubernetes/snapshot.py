@@ -1,9 +1,13 @@
-"""A look at the cluster: everything that matters is listed anew, so that nothing is ever missed."""
+"""A look at the cluster: everything that matters is listed anew, so that nothing is ever missed.
+
+First the RosProxies, then side by side nodes, the operator's own pods and Services, masters'
+Services and selected pods, then all pods on the nodes that matter. All of it or nothing.
+"""
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -13,14 +17,11 @@ from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.masters import master_service
 from rosproxy_operator.kubernetes.planner.model import (
-    ClusterNode,
     ClusterSnapshot,
-    Failure,
     InvalidRosProxy,
     Name,
     Pod,
     ProxyPod,
-    ProxyReport,
     ProxyService,
     RosProxy,
 )
@@ -41,47 +42,14 @@ _IDS = re.compile(r"\b[0-9a-f]{32,64}\b")
 _LONGEST = 300
 
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """What one look has found, before anything is known of what the proxies answer.
-
-    ``selected`` are the uids of the pods that a RosProxy selects.
-    """
-
-    rosproxies: tuple[RosProxy, ...]
-    unusable: Mapping[Name, InvalidRosProxy]
-    nodes: Mapping[str, ClusterNode]
-    pods: tuple[Pod, ...]
-    proxies: tuple[ProxyPod, ...]
-    services: Mapping[Name, ProxyService]
-    masters: Mapping[Name, tuple[str, str]]
-    selected: frozenset[str]
-
-    def observed(
-        self, answers: Mapping[str, ProxyReport], failures: Mapping[Name, tuple[Failure, ...]]
-    ) -> ClusterSnapshot:
-        """The same for planning."""
-        return ClusterSnapshot(
-            rosproxies=self.rosproxies,
-            nodes=self.nodes,
-            pods=self.pods,
-            proxies=self.proxies,
-            services=self.services,
-            masters=self.masters,
-            answers=answers,
-            unusable=self.unusable,
-            failures=failures,
-        )
-
-
 class SnapshotReader:
-    """Looks at a cluster."""
+    """Lists what matters in a cluster."""
 
     def __init__(self, api: Api) -> None:
         self._api = api
         self._room = asyncio.Semaphore(AT_ONCE)
 
-    async def look(self) -> Cluster:
+    async def read(self) -> ClusterSnapshot:
         """List everything; all of it or nothing. Raises ApiError.
 
         RosProxies come first and from the API server's store: a proxy that belongs to none of them
@@ -99,7 +67,7 @@ class SnapshotReader:
         refused = {id: each for id, each in selected.items() if isinstance(each, InvalidRosProxy)}
         found = [pod for each in selected.values() if isinstance(each, list) for pod in each]
         others = await self._on_nodes({*(pod.node for pod in found), *(p.on for p in proxies)})
-        return Cluster(
+        return ClusterSnapshot(
             rosproxies=tuple(each for each in usable if each.id not in refused),
             unusable={**unusable, **refused},
             nodes=nodes,

@@ -51,7 +51,7 @@ def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departur
     found: dict[str, tuple[str, ...]] = {}
     strange: dict[tuple[str, str], float] = {}
     for proxy in observed.proxies:
-        answer, node = observed.answers.get(proxy.pod.uid), observed.nodes.get(proxy.on)
+        answer, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.on)
         if answer is None or not answer.answered or node is None or not node.ready:
             continue
         place = _Site(node, proxy, pods.get(proxy.on, ()), frozenset(known[proxy.on]))
@@ -122,7 +122,7 @@ def _kept(
     observed: ClusterSnapshot, node: str, known: Mapping[str, float], now: float
 ) -> dict[str, float]:
     """Which addresses are worth remembering: those that a proxy names, or may name yet."""
-    answers = [observed.answers.get(one.pod.uid) for one in observed.proxies if one.on == node]
+    answers = [observed.reports.get(one.pod.uid) for one in observed.proxies if one.on == node]
     if not all(answer is not None and answer.answered for answer in answers):
         return {ip: at for ip, at in known.items() if now - at < LONGEST}
     named = {address for answer in answers if answer is not None for address in answer.nodes}

@@ -297,9 +297,10 @@ class ClusterSnapshot:
 
     ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
-    wrong; one of them is empty. ``answers`` are by the uid of the proxy's pod. ``unusable`` are the
-    RosProxies that can't be read at all: what they have is left as it is. ``failures`` are those of
-    the last try to carry something out.
+    wrong; one of them is empty. ``selected`` are the uids of the pods that a RosProxy selects.
+    ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
+    ``reports`` are what the proxies say of themselves, by the uid of the pod, ``failures`` those of
+    the last try to carry something out: neither is listed, the controller puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -308,6 +309,7 @@ class ClusterSnapshot:
     proxies: tuple[ProxyPod, ...] = ()
     services: Mapping[Name, ProxyService] = field(default_factory=dict)
     masters: Mapping[Name, tuple[str, str]] = field(default_factory=dict)
-    answers: Mapping[str, ProxyReport] = field(default_factory=dict)
+    selected: frozenset[str] = frozenset()
+    reports: Mapping[str, ProxyReport] = field(default_factory=dict)
     unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
     failures: Mapping[Name, tuple[Failure, ...]] = field(default_factory=dict)

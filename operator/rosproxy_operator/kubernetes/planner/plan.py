@@ -169,7 +169,7 @@ def _state(context: ClusterContext, place: ProxyPlace) -> NodeState:
         range=context.ranges.given.get(place) if wanted else kept,
         proxy=current,
         pods=context.view.wanted.get(place, ()),
-        answer=context.observed.answers.get(current.pod.uid) if current else None,
+        answer=context.observed.reports.get(current.pod.uid) if current else None,
         problem=problem,
         reason=reason,
     )

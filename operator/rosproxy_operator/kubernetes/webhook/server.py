@@ -37,14 +37,14 @@ class WebhookServer:
     in the midst of one. Connections that stand go on.
     """
 
-    def __init__(self, bind: HostPort, keeper: CertificateRotation) -> None:
-        self._bind, self._keeper = bind, keeper
+    def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
+        self._bind, self._rotation = bind, rotation
 
     async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
         """Serve until cancelled."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
-        while (pair := self._keeper.pair) is None:  # noqa: ASYNC110 - set in another thread
+        while (pair := self._rotation.pair) is None:  # noqa: ASYNC110 - set in another thread
             await asyncio.sleep(CHECK)
         certificates.load(context, pair)
         runner = web.AppRunner(_application(fn), access_log=None, shutdown_timeout=ENDING)
@@ -62,7 +62,7 @@ class WebhookServer:
         """Serve another certificate as soon as there is one."""
         while True:
             await asyncio.sleep(CHECK)
-            pair = self._keeper.pair
+            pair = self._rotation.pair
             if pair is not None and pair != served:
                 try:
                     certificates.load(context, pair)

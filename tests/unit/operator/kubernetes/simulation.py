@@ -273,7 +273,7 @@ class Cluster:
             proxies=tuple(own),
             services={one.of: one for one in services},
             masters=dict.fromkeys(masters, there),
-            answers={
+            reports={
                 uid: ProxyReport(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
                 for uid, known in self.ros.items()
                 if uid in self.running()

@@ -14,7 +14,7 @@ TALKER, LISTENER = "10.244.1.7", "10.244.1.8"
 
 def seen(*things: Any, names: tuple[str, ...] = (TALKER,), **more: Any) -> ClusterSnapshot:
     answer = ProxyReport(True, True, nodes=dict.fromkeys(names, ("/a",)))
-    return observed(rosproxy(), proxy(), *things, **{"answers": {PROXY: answer}} | more)
+    return observed(rosproxy(), proxy(), *things, **{"reports": {PROXY: answer}} | more)
 
 
 def remembering(*things: Any) -> ClusterState:
@@ -128,9 +128,9 @@ def test_pods_in_the_nodes_own_network_are_no_reason_to_call_its_address_gone() 
 
 
 def test_a_proxy_that_does_not_answer_is_told_nothing_and_nothing_is_forgotten() -> None:
-    silent = seen(answers={PROXY: ProxyReport(False, error="refused")})
+    silent = seen(reports={PROXY: ProxyReport(False, error="refused")})
     found = gone(silent, KNOWN, 1.0)
     assert found.gone == {}
     assert TALKER in found.state.addresses["one"]
-    unasked = gone(replace(silent, answers={}), found.state, 2.0)
+    unasked = gone(replace(silent, reports={}), found.state, 2.0)
     assert gone(seen(), unasked.state, 3.0).gone == {PROXY: (TALKER,)}

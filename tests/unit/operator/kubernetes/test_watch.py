@@ -46,7 +46,7 @@ class Woken:
 
     def __init__(self) -> None:
         self.makes: Callable[[], object] = lambda: None
-        self.concern = EventFilter()
+        self.event_filter = EventFilter()
         self.times = 0
         self.reason: str | None = None
 
@@ -64,12 +64,12 @@ class Running:
     def __init__(self, server: ApiServer, api: Api) -> None:
         self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
         self.liveness, self.webhook = free_port(), free_port()
-        keeper = CertificateRotation(CertificateDirectory(""), self.metrics)
-        keeper.pair = PAIR
+        rotation = CertificateRotation(CertificateDirectory(""), self.metrics)
+        rotation.pair = PAIR
         settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
-        serving = WebhookServer(HostPort("127.0.0.1", self.webhook), keeper)
-        self.wirer = Injector(api, self.metrics, self.controller.wake)
-        self.watch = ClusterWatch(settings, self.controller, self.wirer, serving, self.metrics)
+        serving = WebhookServer(HostPort("127.0.0.1", self.webhook), rotation)
+        self.injector = Injector(api, self.metrics, self.controller.wake)
+        self.watch = ClusterWatch(settings, self.controller, self.injector, serving, self.metrics)
 
     async def health(self) -> tuple[int, str]:
         return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
