@@ -1,8 +1,16 @@
-"""Reconciling a cluster: look, plan, carry out, tell. The loop around that is `ControlLoop`."""
+"""Reconciling a cluster: look, plan, carry out, tell. The loop around that is `ControlLoop`.
+
+The way of a RosProxy, in one direction: `watch` tells of events and `event_filter` drops those that
+say nothing new; the others wake the loop. A look lists everything anew (`snapshot`), adds what the
+proxies say of themselves (`proxy_sync`), decides (`planner.plan`), and carries out what was
+decided (`apply`): Services and pods, then the RosProxies' statuses and the Events. Nothing is
+decided from an event alone, and nothing here decides.
+"""
 
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
@@ -11,15 +19,15 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.problem_log import ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.apply import Applier
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.apply import ClusterApplier
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.events import stamp
-from rosproxy_operator.kubernetes.planner.model import Observed, ProxyPod
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
-from rosproxy_operator.kubernetes.planner.state import Memory
-from rosproxy_operator.kubernetes.proxy_sync import ProxySync
-from rosproxy_operator.kubernetes.snapshot import Cluster, Observer
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.snapshot import SnapshotReader
 from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
@@ -35,7 +43,7 @@ LONGEST_LOOK = 90.0
 class KubernetesController:
     """Reconciles one cluster. `run` it in an event loop.
 
-    `wake`, `concern` and `dead` may be called from other threads, all else only from that loop.
+    `wake`, `event_filter` and `dead` may be used from other threads, all else only from that loop.
     ``appeared`` is called when the CRD is there that was missing before.
     """
 
@@ -47,13 +55,13 @@ class KubernetesController:
         self.wake, self.dead, self.unready = loop.wake_threadsafe, loop.dead, loop.unready
         self._tasks = Tasks()
         self._proxies = ProxyClient()
-        self._observer = Observer(api)
-        self._applier = Applier(api, self._proxies, self._tasks, metrics.count)
-        self._conversations = ProxySync(self._tasks, self._proxies, loop.wake)
-        self.concern = EventFilter()
+        self._snapshots = SnapshotReader(api)
+        self._applier = ClusterApplier(api, self._proxies, self._tasks, metrics.count)
+        self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, loop.wake)
+        self.event_filter = EventFilter()
         self.appeared: Callable[[], None] = lambda: None
         self._missing = False
-        self._memory = Memory()
+        self._state = ClusterState()
         self._log = ProblemLog()
 
     async def run(self) -> None:
@@ -69,48 +77,46 @@ class KubernetesController:
         try:
             return await self._look()
         except ApiError as error:
-            self._missing = self._missing or error.kind is Kind.GONE
-            raise LookFailed(str(error), away=error.kind is Kind.AWAY) from error
+            self._missing = self._missing or error.kind is ErrorKind.GONE
+            raise LookFailed(str(error), away=error.kind is ErrorKind.AWAY) from error
 
     async def _look(self) -> float | None:
         started = time.monotonic()
-        cluster = await self._observer.look()
-        self._conversations.hold(cluster.proxies)
-        observed = cluster.observed(self._conversations.answers, self._applier.failures)
-        planned = plan(
-            observed, self._settings.plan, self._memory, time.monotonic(), stamp(time.time())
-        )
-        self._memory = planned.memory
+        seen = await self._snapshots.read()
+        self._proxy_sync.follow(seen.proxies)
+        seen = replace(seen, reports=self._proxy_sync.reports, failures=self._applier.failures)
+        planned = plan(seen, self._settings.plan, self._state, time.monotonic(), stamp(time.time()))
+        self._state = planned.state
         self._metrics.look_time.observe(time.monotonic() - started)
         log.debug("looked in %.3f s", time.monotonic() - started)
-        self.concern.learn(cluster)
-        self._conversations.tell(planned.gone)
-        await self._act(planned, observed)
-        self._looked(cluster, planned)
+        self.event_filter.learn(seen)
+        self._proxy_sync.report_gone(planned.gone)
+        await self._act(planned, seen)
+        self._report(seen, planned)
         return planned.again_in
 
-    async def _act(self, planned: Plan, observed: Observed) -> None:
+    async def _act(self, planned: ClusterPlan, seen: ClusterSnapshot) -> None:
         before = dict(self._applier.failures)
-        await self._applier.carry_out(planned.actions, observed)
+        await self._applier.carry_out(planned.actions, seen)
         if self._applier.failures != before:
             self._loop.wake()  # the status is to tell
         elif planned.actions:
             self._loop.wake_in(SETTLED)
 
-    def _looked(self, cluster: Cluster, planned: Plan) -> None:
+    def _report(self, seen: ClusterSnapshot, planned: ClusterPlan) -> None:
         if self._missing:
             self._missing = False
             self.appeared()
         problems: list[Problem] = [*planned.problems, *self._applier.problems.values()]
         self._log.update(problems)
         metrics = self._metrics
-        metrics.rosproxies.set(len(cluster.rosproxies))
-        metrics.pods.set(len(cluster.selected))
+        metrics.rosproxies.set(len(seen.rosproxies))
+        metrics.pods.set(len(seen.selected))
         metrics.problems.set(len(problems))
-        metrics.show_proxies(map(_state, cluster.proxies))
+        metrics.show_proxies(map(_proxy_state, seen.proxies))
 
 
-def _state(proxy: ProxyPod) -> str:
+def _proxy_state(proxy: ProxyPod) -> str:
     if proxy.stuck:
         return "stuck"
     return "ready" if proxy.ready else "starting"

@@ -4,7 +4,7 @@ from typing import Any
 
 from rosproxy.net.addresses import parse_host_port, plain_address
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.planner.model import Answer, Json
+from rosproxy_operator.kubernetes.planner.model import Json, ProxyReport
 from rosproxy_operator.kubernetes.planner.values import number, part, parts, word
 
 LONGEST = 300
@@ -14,7 +14,7 @@ RECENT = 300.0
 """Seconds that a problem counts: a proxy tells the last ones, however old they are."""
 
 
-def answer(status: Any) -> Answer:
+def answer(status: Any) -> ProxyReport:
     """What a proxy's ``/status`` says (``rosproxy.admin.status.describe``). Never raises.
 
     Nodes that it has given up already, and unregistered, are not among its nodes.
@@ -22,7 +22,7 @@ def answer(status: Any) -> Answer:
     master = part(status, "master")
     up = master.get("up") is True
     nodes = tuple(one for one in parts(status, "nodes") if one.get("state") != _GIVEN_UP)
-    return Answer(
+    return ProxyReport(
         answered=True,
         master_up=up,
         error="" if up else _short(word(master, "error") or "not asked yet"),
@@ -33,9 +33,9 @@ def answer(status: Any) -> Answer:
     )
 
 
-def no_answer(error: str) -> Answer:
+def no_answer(error: str) -> ProxyReport:
     """What is known of a proxy that does not answer."""
-    return Answer(answered=False, error=_short(error))
+    return ProxyReport(answered=False, error=_short(error))
 
 
 def _nodes(nodes: tuple[Json, ...]) -> dict[str, tuple[str, ...]]:

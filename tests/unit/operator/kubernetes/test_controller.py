@@ -15,8 +15,9 @@ from rosproxy_operator.kubernetes import controller as module
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.planner.model import Observed
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.settings import KubernetesSettings
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
@@ -89,6 +90,21 @@ async def test_a_labelled_pod_gets_a_proxy(server: ApiServer, running: Running) 
     await until(lambda: told() == "http://10.96.0.7:11311")
 
 
+async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
+    server: ApiServer, api: Api, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The webhook waits for the Service that the controller makes."""
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.0)
+    await until(lambda: running.looks() > 0)
+    put_all(server)
+    injector = Injector(api, running.metrics, running.controller.wake)
+    wiring = await injector.wiring(pod_obj("talker", INJECT), dry_run=False)
+    (service,) = server.all("services")
+    uri = f"http://{service['spec']['clusterIP']}:11311"
+    assert wiring.annotations == {"rosproxy.io/master-uri": uri}
+    assert len(server.asked("POST", "services")) == 1
+
+
 async def test_it_settles(server: ApiServer, running: Running) -> None:
     """Nothing is written when nothing happens."""
     put_all(server)
@@ -135,7 +151,7 @@ async def test_a_mistake_of_ours_does_not_end_it(
 ) -> None:
     await until(lambda: running.looks() > 0)
 
-    def broken(*_: Any) -> Plan:
+    def broken(*_: Any) -> ClusterPlan:
         raise RuntimeError("oops")
 
     real = plan
@@ -187,9 +203,9 @@ async def test_a_proxy_is_asked_and_told(
     real = plan
     gone: dict[str, tuple[str, ...]] = {}
 
-    def planned(observed: Observed, *rest: Any) -> Plan:
+    def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
         found = real(observed, *rest)
-        return Plan(found.actions, found.problems, found.memory, {**gone}, found.again_in)
+        return ClusterPlan(found.actions, found.problems, found.state, {**gone}, found.again_in)
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)
