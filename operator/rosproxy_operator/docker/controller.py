@@ -6,8 +6,7 @@ import time
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import DockerMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
 from rosproxy_operator.docker.apply import DockerApplier

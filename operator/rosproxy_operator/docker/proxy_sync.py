@@ -3,13 +3,15 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from ipaddress import IPv4Network
 from typing import Any
 
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_news import (
     AGAIN,
@@ -18,7 +20,6 @@ from rosproxy_operator.docker.planner.proxy_news import (
     Places,
     facts,
     gone,
-    node_addresses,
 )
 from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
@@ -100,7 +101,7 @@ class ProxyUpdater:
         status = await self._proxies.status(where)
         known = self._facts  # not older than need be: its nodes may have come since the last look
         address = known.master_address
-        if address and status.get("master", {}).get("address") != address:
+        if address and status.master.address != address:
             await self._proxies.master_address(where, token, address)
             log.info("%s: its master is now at %s", self.name, address)
         now = time.monotonic()
@@ -123,9 +124,9 @@ class ProxyUpdater:
             self._since = time.monotonic()
         self.error = error
 
-    def _body(self, status: Mapping[str, Any], known: NetworkFacts, now: float) -> dict[str, Any]:
+    def _body(self, status: ProxyStatus, known: NetworkFacts, now: float) -> dict[str, Any]:
         self._places.look(known, now)
-        nodes = node_addresses(status)
+        nodes = nodes_by_address(status).keys()
         arrived = [
             {"address": arrival.address, "names": sorted(arrival.names)}
             for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)

@@ -4,12 +4,14 @@ import asyncio
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rosproxy import __version__
-from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.planner.actions import Action
@@ -33,8 +35,13 @@ class Survey:
 
     look: DockerSnapshot
     plan: DockerPlan
-    said: Mapping[str, Json | ProxyError]
+    said: Mapping[str, ProxyStatus | ProxyError]
     problems: tuple[Problem, ...]
+
+    def answer(self, proxy: str) -> ProxyStatus | None:
+        """What a proxy says of itself, by its container's name; None if it does not answer."""
+        said = self.said.get(proxy)
+        return None if isinstance(said, ProxyError) else said
 
     @property
     def actions(self) -> list[Action]:
@@ -90,27 +97,25 @@ def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
     observed, name = found.look.state, proxy_name(key)
     process = _best([p for p in observed.proxies if p.key == key], name)
     box = _best([box for box in observed.sandboxes if box.key == key], sandbox_name(key))
-    answer = found.said.get(process.container.name) if process else None
-    said = answer if isinstance(answer, dict) else {}
-    its_master, ports = said.get("master") or {}, said.get("ports") or {}
+    said = found.answer(process.container.name) if process else None
     own = box or process
     networks = box.container.networks if box else frozenset()
     return {
         "name": name,
         "master_uri": key.master_uri,
-        "master_address": its_master.get("address") or "",
-        "master_up": its_master.get("up"),
+        "master_address": (said.master.address if said else None) or "",
+        "master_up": said.master.up if said else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
         "state": process.container.state if process else "absent",
-        "reachable": bool(said),
+        "reachable": said is not None,
         "networks": sorted(networks - {settings.uplink}),
-        "data_plane": (said.get("data_plane") or {}).get("plane"),
-        "used": ports.get("used"),
-        "free": ports.get("free"),
+        "data_plane": said.data_plane.plane if said and said.data_plane else None,
+        "used": said.ports.used if said else None,
+        "free": said.ports.free if said else None,
         "problems": [
             *_amiss(box, sandbox_name(key)),
-            *(f"{p['subject']}: {p['text']}" for p in said.get("problems") or ()),
+            *(f"{one.subject}: {one.text}" for one in (said.problems if said else ())),
         ],
     }
 
@@ -129,8 +134,8 @@ def _amiss(box: Sandbox | None, name: str) -> Iterator[str]:
 
 def _container(container: Container, proxy: str | None, found: Survey) -> Json:
     addresses = {a.network: a.address for a in container.attachments if a.address}
-    answer = found.said.get(proxy or "")
-    nodes = answer.get("nodes", ()) if isinstance(answer, dict) else ()
+    answer = found.answer(proxy or "")
+    nodes = nodes_by_address(answer) if answer else {}
     return {
         "name": container.name,
         "state": container.state,
@@ -138,25 +143,16 @@ def _container(container: Container, proxy: str | None, found: Survey) -> Json:
         "networks": sorted(container.networks),
         "addresses": addresses,
         "nodes": [
-            _node(node)
-            for node in nodes
-            if _host(node) in addresses.values() and node.get("state") != "cleaned"
+            {
+                "names": list(node.nodes),
+                "address": node.address,
+                "advertised_uri": node.advertised_uri,
+                "state": node.state,
+            }
+            for address in dict.fromkeys(addresses.values())
+            for node in nodes.get(address, ())
         ],
     }
-
-
-def _node(node: Mapping[str, Any]) -> Json:
-    return {
-        "names": node.get("nodes", []),
-        "address": node.get("address", ""),
-        "advertised_uri": node.get("advertised_uri", ""),
-        "state": node.get("state", ""),
-    }
-
-
-def _host(node: Mapping[str, Any]) -> str:
-    where = parse_host_port(str(node.get("address", "")))
-    return where.host if where else ""
 
 
 def _meant(container: Container, found: Survey) -> bool:
@@ -164,7 +160,7 @@ def _meant(container: Container, found: Survey) -> bool:
     return any(problem.subject == f"container {container.name}" for problem in found.problems)
 
 
-async def _ask(proxies: ProxyClient, where: HostPort) -> Json | ProxyError:
+async def _ask(proxies: ProxyClient, where: HostPort) -> ProxyStatus | ProxyError:
     try:
         return await proxies.status(where)
     except ProxyError as error:

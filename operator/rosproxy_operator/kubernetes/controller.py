@@ -15,8 +15,7 @@ from dataclasses import replace
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier

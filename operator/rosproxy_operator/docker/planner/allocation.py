@@ -4,8 +4,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import PortsExhausted, extended, is_free, negotiate, within
-from rosproxy_operator.common.moves import RETRY_FOR, Move
+from rosproxy_operator.common.allocation import (
+    RETRY_FOR,
+    Move,
+    PortsExhausted,
+    extended,
+    is_free,
+    negotiate,
+    within,
+)
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import STARTED, Desired, HostState, Key, Sandbox
 from rosproxy_operator.docker.planner.settings import PlanSettings

@@ -4,9 +4,8 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, ip_address
-from typing import Any
 
-from rosproxy.net.addresses import is_address, parse_host_port
+from rosproxy.net.addresses import is_address
 from rosproxy_operator.docker.planner.model import STARTED, Container, HostState, Member, Proxy
 from rosproxy_operator.docker.planner.specs import master
 
@@ -143,13 +142,6 @@ def facts(
         ),
         running=frozenset(container.id for container in running),
     )
-
-
-def node_addresses(status: Mapping[str, Any]) -> frozenset[str]:
-    """The addresses of a proxy's nodes, from its status; not of those it has given up already."""
-    nodes = (node for node in status.get("nodes", ()) if node.get("state") != "cleaned")
-    found = (parse_host_port(str(node.get("address", ""))) for node in nodes)
-    return frozenset(where.host for where in found if where)
 
 
 def gone(

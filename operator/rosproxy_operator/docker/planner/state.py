@@ -4,8 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import within
-from rosproxy_operator.common.moves import MOVED_FOR, TAKEN_FOR, Move
+from rosproxy_operator.common.allocation import MOVED_FOR, TAKEN_FOR, Move, within
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.moves import Move
+from rosproxy_operator.common.allocation import Move
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,

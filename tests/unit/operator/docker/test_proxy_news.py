@@ -20,7 +20,6 @@ from rosproxy_operator.docker.planner.proxy_news import (
     Places,
     facts,
     gone,
-    node_addresses,
 )
 
 KEY = Key("http://robot:11311", "192.0.2.10")
@@ -106,13 +105,6 @@ def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
     nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
     assert gone(nodes, known.taken, known.subnets) == ["172.18.0.6"]
     assert gone(nodes, known.taken, ()) == []
-
-
-def test_the_addresses_of_nodes() -> None:
-    ended = {"address": "172.18.0.7:4001", "state": "cleaned"}
-    status = {"nodes": [{"address": "172.18.0.6:4001"}, {"address": "[fd00::1]:1"}, {}, ended]}
-    assert node_addresses(status) == {"172.18.0.6", "fd00::1"}
-    assert node_addresses({}) == frozenset()
 
 
 OLD, NEW = "172.18.0.5", "172.18.0.9"

@@ -188,7 +188,7 @@ async def test_a_proxy_is_asked_and_told(
     told: list[Any] = []
 
     async def status(_: web.Request) -> web.Response:
-        return web.json_response({"master": {"up": True}, "nodes": []})
+        return web.json_response({"settings": {}, "master": {"up": True}, "nodes": []})
 
     async def containers(request: web.Request) -> web.Response:
         told.append((request.headers["Authorization"], await request.json()))
