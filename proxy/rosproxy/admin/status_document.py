@@ -178,10 +178,10 @@ def read_status(document: object) -> ProxyStatus:
     return _as_far_as_it_fits(document, ProxyStatus)
 
 
-def to_json(status: ProxyStatus) -> dict[str, Any]:
-    """The status as plain data to be encoded as JSON."""
-    document: dict[str, Any] = msgspec.to_builtins(status)
-    return document
+def to_json(document: msgspec.Struct) -> dict[str, Any]:
+    """A document as plain data to be encoded as JSON."""
+    plain: dict[str, Any] = msgspec.to_builtins(document)
+    return plain
 
 
 def _as_far_as_it_fits(value: object, kind: type[Document]) -> Document:

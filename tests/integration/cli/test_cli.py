@@ -230,7 +230,8 @@ async def test_watch_draws_until_interrupted(proxy: Proxy, node: Node) -> None:
         await proxy.stop()
         await until(lambda: "no rosproxy answers" in screen.read(), "the proxy was missed")
         assert await screen.interrupt() == 0
-    assert screen.text.startswith("\x1b[H")
+    assert "\x1b[?1049h" in screen.text  # a screen of its own, which is left again
+    assert "\x1b[?1049l" in screen.text
     assert "Traceback" not in screen.text
 
 
