@@ -117,7 +117,7 @@ def docker(
     """
     from rosproxy.settings import SettingError
     from rosproxy.telemetry import logs
-    from rosproxy_operator.settings import parse_docker_settings
+    from rosproxy_operator.docker.settings import parse_docker_settings
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
@@ -267,7 +267,7 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
     """
     from rosproxy.settings import SettingError
-    from rosproxy_operator.settings import parse_kubernetes_settings
+    from rosproxy_operator.kubernetes.settings import parse_kubernetes_settings
 
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")

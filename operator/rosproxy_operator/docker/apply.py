@@ -27,7 +27,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     container_config,

@@ -18,8 +18,8 @@ from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.settings import DockerSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
-from rosproxy_operator.settings import DockerSettings
 
 log = logging.getLogger(__name__)
 

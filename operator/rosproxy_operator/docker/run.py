@@ -13,10 +13,10 @@ from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.report import plan_text, render
-from rosproxy_operator.docker.planner.settings import PlanSettings
-from rosproxy_operator.docker.status import Survey, describe, survey
-from rosproxy_operator.settings import DockerSettings
+from rosproxy_operator.docker.settings import DockerSettings
+from rosproxy_operator.docker.status import describe, survey
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,8 @@ def show_plan(settings: PlanSettings) -> None:
 def show_status(settings: PlanSettings, as_json: bool) -> None:
     """Print what there is on the host. Raises EngineError."""
     found = asyncio.run(survey(settings))
-    write(_text(found, settings, as_json, size()[0], None))
+    status = describe(found, settings)
+    write(json.dumps(status, indent=2) if as_json else render(status, size()[0]))
 
 
 def watch_status(settings: PlanSettings) -> None:
@@ -53,18 +54,11 @@ def watch_status(settings: PlanSettings) -> None:
 
     def draw(columns: int, lines: int | None) -> str:
         try:
-            return _text(asyncio.run(survey(settings)), settings, False, columns, lines)
+            return render(describe(asyncio.run(survey(settings)), settings), columns, lines)
         except EngineError as error:
             return f"{time.strftime('%H:%M:%S')} {error}"
 
     watch(draw)
-
-
-def _text(
-    found: Survey, settings: PlanSettings, as_json: bool, columns: int, lines: int | None
-) -> str:
-    status = describe(found, settings)
-    return json.dumps(status, indent=2) if as_json else render(status, columns, lines)
 
 
 async def _run(settings: DockerSettings) -> None:

@@ -23,10 +23,10 @@ from rosproxy_operator.docker.planner.model import (
     HostPorts,
     HostState,
     Network,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import ROLE_SANDBOX, admin_port, read_own
 
 

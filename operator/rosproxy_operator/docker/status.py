@@ -15,10 +15,9 @@ from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.planner.actions import Action
-from rosproxy_operator.docker.planner.model import Container, Key, Proxy, Sandbox
+from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.report import line
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence

@@ -26,8 +26,8 @@ from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 

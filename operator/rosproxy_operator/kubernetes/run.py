@@ -9,11 +9,11 @@ from rosproxy_operator.common.health import Health
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 

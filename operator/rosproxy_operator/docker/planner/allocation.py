@@ -14,8 +14,14 @@ from rosproxy_operator.common.allocation import (
     within,
 )
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.model import STARTED, Desired, HostState, Key, Sandbox
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    STARTED,
+    Desired,
+    HostState,
+    Key,
+    PlanSettings,
+    Sandbox,
+)
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
 from rosproxy_operator.docker.planner.state import SERVING, DockerMemory, PortRefusal
 

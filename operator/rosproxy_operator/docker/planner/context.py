@@ -11,11 +11,11 @@ from rosproxy_operator.docker.planner.model import (
     Desired,
     HostState,
     Key,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.selection import free_name
-from rosproxy_operator.docker.planner.settings import PlanSettings
 
 
 @dataclass(frozen=True, slots=True)

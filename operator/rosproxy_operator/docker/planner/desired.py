@@ -1,15 +1,24 @@
 """From members to the proxies that there ought to be."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.data_planes import chosen, outvoted
+from rosproxy_operator.docker.planner.label_values import DATA_PLANE
 from rosproxy_operator.docker.planner.membership import BUILT_IN
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, Network
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    Desired,
+    HostState,
+    Key,
+    Member,
+    Network,
+    PlanSettings,
+)
 from rosproxy_operator.docker.planner.state import DockerMemory
+
+_PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
+"""Who asks for what the proxy can't do by itself goes first."""
 
 
 def desire(
@@ -44,7 +53,7 @@ def desire(
     )
     wanted = {name for member in every if member.alive for name in member.networks}
     bad_networks = (_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
-    return desired, (*bad_networks, *outvoted(desired))
+    return desired, (*bad_networks, *_outvoted(desired))
 
 
 def _one(
@@ -62,7 +71,7 @@ def _one(
 
 
 def _data_plane(key: Key, members: Iterable[Member], settings: PlanSettings) -> DataPlane:
-    return chosen((member for member in members if member.key == key), settings.data_plane)
+    return chosen_plane((member for member in members if member.key == key), settings.data_plane)
 
 
 def _kept(key: Key, recent: Iterable[Member], observed: HostState) -> frozenset[str]:
@@ -91,4 +100,30 @@ def _bad_network(name: str, uplink: str) -> Problem:
         f"can't be joined: its name sorts before that of the uplink network {uplink}, so the "
         "engine would move the proxy's published ports to it: give it another name, or start the "
         "operator with an --uplink that sorts first",
+    )
+
+
+def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
+    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
+    asked = {member.data_plane for member in members}
+    return next((plane for plane in _PLANES if plane in asked), default)
+
+
+def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
+    """Tell the containers that share a proxy with one that asks for something else."""
+    for one in desired:
+        for member in one.members:
+            if member.data_plane not in (None, one.data_plane):
+                yield Problem(
+                    f"container {member.container}", _outvoted_text(member, one), fatal=False
+                )
+
+
+def _outvoted_text(member: Member, one: Desired) -> str:
+    other = next(
+        (w.container for w in one.members if w.data_plane == one.data_plane), "another one"
+    )
+    return (
+        f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves {other}, which "
+        f"asks for {one.data_plane}; give both the same"
     )

@@ -6,7 +6,7 @@ from typing import get_args
 from rosproxy.net.addresses import is_address, is_loopback
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.docker.planner.settings import MOST_PORTS
+from rosproxy_operator.docker.planner.model import MOST_PORTS
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"

@@ -17,8 +17,14 @@ from rosproxy_operator.docker.planner.label_values import (
 )
 from rosproxy_operator.docker.planner.masters import looks_for, master_uri
 from rosproxy_operator.docker.planner.membership import networks
-from rosproxy_operator.docker.planner.model import ALIVE, Container, HostState, Key, Member
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    ALIVE,
+    Container,
+    HostState,
+    Key,
+    Member,
+    PlanSettings,
+)
 from rosproxy_operator.docker.planner.specs import MANAGED, master
 
 _PREFIX = "rosproxy"

@@ -18,10 +18,17 @@ from rosproxy_operator.docker.planner.context import PlanContext
 from rosproxy_operator.docker.planner.desired import desire
 from rosproxy_operator.docker.planner.labels import LabelReading, find_members
 from rosproxy_operator.docker.planner.masters import unresolved
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, Proxy, Sandbox
+from rosproxy_operator.docker.planner.model import (
+    Desired,
+    HostState,
+    Key,
+    Member,
+    PlanSettings,
+    Proxy,
+    Sandbox,
+)
 from rosproxy_operator.docker.planner.process import process_steps, retired
 from rosproxy_operator.docker.planner.sandbox import leave, sandbox_steps
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
 

@@ -12,8 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import DataPlane, SettingError, parse_range
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.docker.planner.model import Key
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"

@@ -16,11 +16,11 @@ from rosproxy_operator.docker.planner.model import (
     Key,
     Member,
     Network,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     fingerprint,
     master,

@@ -11,10 +11,9 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
-from rosproxy_operator.docker.planner.data_planes import chosen
-from rosproxy_operator.docker.planner.model import STARTED, Key, Member
+from rosproxy_operator.docker.planner.desired import chosen_plane
+from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
@@ -323,7 +322,7 @@ class Hosts:
         for key in sorted({member.key for member in live}):
             if not fatal & {f"proxy image {SETTINGS.image}", f"proxy {proxy_name(key)}"}:
                 mine = [member for member in live if member.key == key]
-                plane = chosen(mine, SETTINGS.data_plane)
+                plane = chosen_plane(mine, SETTINGS.data_plane)
                 self.check_key(key, {n for member in mine for n in member.networks & fine}, plane)
                 for member in mine:
                     if f"container {member.container}" not in told:

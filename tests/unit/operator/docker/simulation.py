@@ -25,11 +25,11 @@ from rosproxy_operator.docker.planner.model import (
     HostPorts,
     HostState,
     Network,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,

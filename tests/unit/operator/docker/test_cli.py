@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rosproxy_operator.cli import main
-from rosproxy_operator.settings import DEFAULT_ADMIN, parse_docker_settings
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, parse_docker_settings
 
 GIVEN = {
     "master_uri": None,

@@ -12,10 +12,9 @@ from rosproxy_operator.docker.planner.actions import (
     ProxySpec,
     SandboxSpec,
 )
-from rosproxy_operator.docker.planner.model import Container, Proxy, Sandbox
+from rosproxy_operator.docker.planner.model import Container, PlanSettings, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.report import line
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     fingerprint,

@@ -8,8 +8,14 @@ import pytest
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.aliases import assign
 from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Network
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    Container,
+    Desired,
+    HostState,
+    Key,
+    Network,
+    PlanSettings,
+)
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory, noticed
 from tests.unit.operator.docker.builders import (

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels import master_hosts, read_labels
-from rosproxy_operator.docker.planner.model import Container, Key, Member
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,

@@ -23,9 +23,8 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import HostState, Key, Network
+from rosproxy_operator.docker.planner.model import HostState, Key, Network, PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.settings import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     fingerprint,
     proxy_name,
