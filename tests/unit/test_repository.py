@@ -128,11 +128,11 @@ def reference() -> str:
 
 def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.common.metrics import Metrics
+    from rosproxy_operator.common.metrics import DockerMetrics
     from rosproxy_operator.docker.planner.label_values import LABELS
 
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
-    metrics = [family.name for family in Metrics().registry.collect()]
+    metrics = [family.name for family in DockerMetrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
     text = reference()
     assert not [word for word in [*options, *LABELS, *own] if word not in text]
