@@ -5,21 +5,23 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from tests.integration.http_fake import Answer, HttpFake, Request, ok, value
+from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, ok, value
 from tests.integration.net import (
     HOST,
     NODE,
     OTHER_NODE,
     PROXY,
     connect,
+    greet,
     knock,
     post,
     refuses,
     rpc,
+    service_header,
+    topic_header,
     until,
     xml,
 )
-from tests.integration.node import greet, service_header, topic_header
 
 SECRET = b"<html>the other host's secret</html>"
 
@@ -29,14 +31,14 @@ class Victim:
 
     def __init__(self) -> None:
         self.answer: Answer = ok(SECRET)
-        self.seen: list[Request] = []
-        self.http = HttpFake(self._respond)
+        self.seen: list[FakeRequest] = []
+        self.http = FakeHttpServer(self._respond)
 
     @property
     def port(self) -> int:
         return self.http.address[1]
 
-    async def _respond(self, request: Request) -> Answer:
+    async def _respond(self, request: FakeRequest) -> Answer:
         self.seen.append(request)
         return self.answer
 

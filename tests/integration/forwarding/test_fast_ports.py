@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import Where
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
 from rosproxy.forwarding.kernel import targets as kernel_targets
@@ -12,8 +13,16 @@ from rosproxy.forwarding.kernel.targets import KernelTargets
 from rosproxy.forwarding.kernel.tools import Tools
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
-from tests.integration.net import NODE, OTHER_NODE, THIRD_NODE, Where, refuses, rpc, until
-from tests.integration.node import greet, topic_header
+from tests.integration.net import (
+    NODE,
+    OTHER_NODE,
+    THIRD_NODE,
+    greet,
+    refuses,
+    rpc,
+    topic_header,
+    until,
+)
 
 TCPROS = [["TCPROS"]]
 

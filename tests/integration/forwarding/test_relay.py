@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from rosproxy.forwarding import relay, relay_set
-from tests.integration.net import Wire, connect, refuses, until
-from tests.integration.node import read_header, topic_header
+from tests.integration.net import Wire, connect, read_header, refuses, topic_header, until
 
 BOTH_LOOPS = True
 THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.BLOCK_SIZE, relay.PIPE_SIZE]
@@ -41,8 +40,10 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
     arrived: asyncio.Future[Wire] = asyncio.get_running_loop().create_future()
     over = asyncio.Event()
 
-    async def hold(node: Any, wire: Wire, header: Any) -> None:
-        arrived.set_result(wire)
+    async def hold(
+        node: Any, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Any
+    ) -> None:
+        arrived.set_result(Wire(reader, writer))
         await over.wait()
 
     before, node.stream = node.stream, hold
