@@ -9,7 +9,7 @@ from rosproxy.demo.fake_http import Where, free_ports, where
 from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings, parse_settings
-from tests.integration.net import HOST, PROXY
+from tests.integration.net import HOST, PROXY, refuses, until
 
 PORTS = 8
 """How many ports a proxy of the tests has for nodes, unless told otherwise."""
@@ -73,6 +73,19 @@ class Proxy:
             self._stopped = True
             async with asyncio.timeout(5):
                 await self.app.stop()
+
+    def metric(self, name: str, **labels: str) -> float:
+        """What a metric stands at; 0 if there is none of these labels yet."""
+        registry = self.app.context.metrics.registry
+        return registry.get_sample_value(f"rosproxy_{name}", labels) or 0
+
+    async def serves(self, node: FakeNode) -> bool:
+        """Whether a node's port is open."""
+        return not await refuses(self.lease(node))
+
+    async def quiet(self) -> None:
+        """Wait until no connection is relayed any more."""
+        await until(lambda: not self.metric("open_connections"), "all relays end")
 
     def endpoint(self, node: FakeNode) -> Endpoint:
         """What the proxy knows of a node."""

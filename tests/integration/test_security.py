@@ -213,6 +213,6 @@ async def test_a_forged_claim_does_not_displace_the_real_node(master, make_proxy
     await forge(master, "/evil2", port + 1, here, *topics)
     fresh = await make_proxy(port_range=str(proxy.settings.ports.listen))
     await until(lambda: len(fresh.app.context.registry), "the node is found")
-    await until(lambda: fresh.app._leases.is_open(fresh.endpoint(node)), "the node is served")
+    await until(lambda: fresh.serves(node), "the node is served")
     assert fresh.uri(node) == uri
     assert (await rpc(uri, "getPid", "/outside"))[2] == node.pid

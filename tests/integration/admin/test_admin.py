@@ -127,7 +127,7 @@ async def test_metrics_of_a_proxy_at_work(
     await _talk(proxy, node)
     await rpc(proxy.lease(node), "getPid", "/outside")
     await until(lambda: not master.holds("publishers", "/dead"), "cleaned up")
-    await until(proxy.app.context.metrics.cleanups._value.get, "counted")
+    await until(lambda: proxy.metric("cleanups_total"), "counted")
     found = await metrics(proxy)
     assert found["rosproxy_leases_used"] in (1, 2)
     assert found["rosproxy_leases_used"] + found["rosproxy_leases_free"] == 8
@@ -159,7 +159,7 @@ async def _talk(proxy: Proxy, node: FakeNode) -> None:
     async with connect(proxy.lease(node)) as wire:
         await wire.send(b"\xff\xff\xff\x7fnonsense")
         await wire.outcome()
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await proxy.quiet()
 
 
 async def test_an_open_connection_is_counted(proxy: Proxy, node: FakeNode) -> None:
@@ -179,7 +179,7 @@ async def test_strangers_cannot_multiply_series(proxy: Proxy, node: FakeNode) ->
         async with connect(proxy.lease(node)) as wire:
             await wire.send(topic_header(f"/made_up_{number}", f"/caller_{number}"))
             await read_header(wire)
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await proxy.quiet()
     found = await metrics(proxy)
     assert not [name for name in found if "made_up" in name or "method_" in name]
     assert not [name for name in found if "caller_" in name]

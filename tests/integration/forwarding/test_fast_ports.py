@@ -161,8 +161,8 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     host, lease = proxy.lease(node)
     assert await refuses((host, lease + 2))
     await proxy.restart()
-    leases, registry = proxy.app._leases, proxy.app.context.registry
-    await until(lambda: any(map(leases.is_open, registry)), "the node is recovered")
+    await until(lambda: len(proxy.app.context.registry), "the node is found")
+    await until(lambda: proxy.serves(node), "the node is served")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
     assert proxy.app.status()["ports"]["free"] == 3
     others = [await make_node(f"/n{number}", OTHER_NODE) for number in range(3)]

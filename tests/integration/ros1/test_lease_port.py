@@ -120,7 +120,7 @@ async def test_a_client_that_leaves_inside_its_header_is_survived(proxy, node):
                 if reset:
                     wire.reset()
     assert (await greet(proxy.lease(node), header))["callerid"] == "/talker"
-    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
+    await proxy.quiet()
 
 
 async def test_a_service_on_a_port_of_its_own_is_found(proxy, make_node):
@@ -255,7 +255,7 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
     for part in (str(proxy.settings.ports.listen), "2 leases held", "--port-range"):
         assert part in text
     assert text in caplog.text
-    assert proxy.app.context.metrics.exhausted._value.get() == 1
+    assert proxy.metric("range_exhausted_total") == 1
     # The others go on, and in a multicall each call has its own answer.
     calls = [
         {"methodName": "getPid", "params": ["/n2"]},

@@ -132,7 +132,7 @@ async def test_an_update_does_not_overtake_the_registration_before_it(proxy, mas
     far = f"http://{OUTSIDE}:4000/"
     await rpc(uri, "publisherUpdate", "/master", "/chatter", [far])
     assert registering.done()
-    assert await registering == [1, "subscribed", []]
+    assert await registering == [1, "Subscribed to [/chatter]", []]
     assert node.updates() == [[far]]
 
 
