@@ -94,7 +94,7 @@ def parse_range(option: str, text: str) -> PortRange:
     """Parse ``first-last``. Raises SettingError that names ``option``."""
     found = _RANGE.fullmatch(text)
     if found is None:
-        raise SettingError(option, f"{text[:40]!r} is not a range such as 45000-45099")
+        raise SettingError(option, f"{text[:40]!r} is not a range such as 11000-11099")
     ports = PortRange(int(found[1]), int(found[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
         raise SettingError(option, f"{text!r} must rise and lie between 1 and 65535")

@@ -106,7 +106,7 @@ def main() -> None:
 )
 @click.option(
     "--port-range",
-    default="45000-45099",
+    default="11000-11099",
     metavar="A-B",
     help="Ports to listen on, one per inside node.",
 )
