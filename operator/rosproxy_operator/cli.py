@@ -10,13 +10,12 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.main import Commands as ProxyCommands
-from rosproxy.cli.main import log_options
+from rosproxy.cli.options import Commands, log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
 
-class OperatorCommands(ProxyCommands):
+class OperatorCommands(Commands):
     """Commands whose usage errors begin with this program's name."""
 
     program = "rosproxy-operator"
