@@ -13,22 +13,21 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import End, Where, where
 from rosproxy.settings import SettingError
-from tests.integration.http_fake import End
 from tests.integration.net import (
     HOST,
     MASTER,
     NODE,
-    Where,
     connect,
     exchange,
     post,
+    read_header,
     rpc,
+    topic_header,
     until,
-    where,
     xml,
 )
-from tests.integration.node import read_header, topic_header
 from tests.integration.process import Process, clean_environment, command_line
 from tests.integration.proxy import Proxy, options_for, settings_for
 
@@ -243,7 +242,7 @@ async def test_a_signal_ends_it_in_2_seconds_with_connections_open(
     await node.publish(process.master)
     await hung.publish(process.master)
     lease = where(master.holds("publishers", "/chatter")[0])
-    stuck = where(master.book.nodes["/hung"])
+    stuck = where(master.nodes["/hung"])
     hung.hang, master.answers["getParam"] = True, End.HANG
     get = b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n"
     async with AsyncExitStack() as stack:
