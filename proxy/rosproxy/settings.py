@@ -7,8 +7,13 @@ from ipaddress import ip_address, ip_network
 from typing import Any, Literal
 
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort, Network, parse_address, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.net.addresses import (
+    HostPort,
+    Network,
+    parse_address,
+    parse_authority,
+    parse_host_port,
+)
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
@@ -107,7 +112,7 @@ def _master_uri(uri: str | None) -> str:
             "--master-uri",
             "missing; give the real master, e.g. http://robot:11311 (ROS_MASTER_URI)",
         )
-    if parse_slave_uri(uri) is None:
+    if not uri.startswith("http://") or parse_authority(uri) is None:
         raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
     return uri
 

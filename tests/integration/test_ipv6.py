@@ -111,5 +111,5 @@ async def test_recovery_over_ipv6(
         port_range=str(proxy6.settings.ports.listen),
     )
     await until(lambda: len(fresh.app.context.registry), "the node is found")
-    await until(lambda: fresh.app._leases.is_open(fresh.endpoint(node6)), "it is served")
+    await until(lambda: fresh.app.leases.is_open(fresh.endpoint(node6)), "it is served")
     assert (await rpc(uri, "getPid", "/outside"))[2] == node6.pid

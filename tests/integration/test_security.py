@@ -52,7 +52,7 @@ async def victim() -> AsyncIterator[Victim]:
 @pytest.fixture
 def _as_if_not_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tests' addresses are loopback, where a node's word counts for even less."""
-    monkeypatch.setattr("rosproxy.ros1.registry.leases.is_loopback", lambda address: False)
+    monkeypatch.setattr("rosproxy.ros1.servers.admission.is_loopback", lambda address: False)
 
 
 async def test_a_forged_request_topic_reply_leads_nowhere_else(proxy, node, victim):
@@ -211,6 +211,6 @@ async def test_a_forged_claim_does_not_displace_the_real_node(master, make_proxy
     await forge(master, "/evil2", port + 1, here, *topics)
     fresh = await make_proxy(port_range=str(proxy.settings.ports.listen))
     await until(lambda: len(fresh.app.context.registry), "the node is found")
-    await until(lambda: fresh.app._leases.is_open(fresh.endpoint(node)), "the node is served")
+    await until(lambda: fresh.app.leases.is_open(fresh.endpoint(node)), "the node is served")
     assert fresh.uri(node) == uri
     assert (await rpc(uri, "getPid", "/outside"))[2] == node.pid

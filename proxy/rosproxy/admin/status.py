@@ -14,7 +14,6 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.telemetry.metrics import state_of
 from rosproxy.telemetry.problems import Problem
 
 
@@ -84,7 +83,7 @@ def _ports(context: Context) -> dict[str, Any]:
         "listen": str(ports.listen),
         "advertise": str(ports.advertise),
         "used": len(context.registry),
-        "free": fast_ports.left(context.registry),
+        "free": fast_ports.left(pool, context.registry),
         "blocked": pool.blocked,
     }
 
@@ -96,7 +95,7 @@ def _node(context: Context, endpoint: Endpoint, relays: list[Relay]) -> dict[str
         "address": str(endpoint.slave),
         "advertised_uri": context.addressing.advertised_uri(endpoint),
         "port": endpoint.port,
-        "state": state_of(endpoint),
+        "state": endpoint.state,
         "publishes": endpoint.names(Kind.PUBLISHER),
         "subscribes": endpoint.names(Kind.SUBSCRIBER),
         "services": endpoint.names(Kind.SERVICE),

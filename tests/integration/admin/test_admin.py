@@ -59,16 +59,16 @@ async def test_health_and_readiness_follow_the_master(
 ) -> None:
     await master.stop()
     proxy = await make_proxy()
-    await until(lambda: proxy.app._watch.error, "the master was missed")
+    await until(lambda: proxy.app.master_monitor.error, "the master was missed")
     code, text = await ask(proxy, "/readyz")
     assert code == 503
     assert text.startswith(f"master {master.uri}: ")
     assert await ask(proxy, "/healthz") == (200, "ok\n")
     await master.start()
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     assert await ask(proxy, "/readyz") == (200, "ok\n")
     await master.stop()
-    await until(lambda: not proxy.app._watch.up, "the master was missed again")
+    await until(lambda: not proxy.app.master_monitor.up, "the master was missed again")
     assert (await ask(proxy, "/readyz"))[0] == 503
     assert await ask(proxy, "/healthz") == (200, "ok\n")
 
@@ -156,7 +156,7 @@ async def _talk(proxy: Proxy, node: Node) -> None:
     async with connect(proxy.lease(node)) as wire:
         await wire.send(b"\xff\xff\xff\x7fnonsense")
         await wire.outcome()
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await until(lambda: not proxy.app.tcpros.relays, "the connections have ended")
 
 
 async def test_an_open_connection_is_counted(proxy: Proxy, node: Node) -> None:
@@ -176,7 +176,7 @@ async def test_strangers_cannot_multiply_series(proxy: Proxy, node: Node) -> Non
         async with connect(proxy.lease(node)) as wire:
             await wire.send(topic_header(f"/made_up_{number}", f"/caller_{number}"))
             await read_header(wire)
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await until(lambda: not proxy.app.tcpros.relays, "the connections have ended")
     found = await metrics(proxy)
     assert not [name for name in found if "made_up" in name or "method_" in name]
     assert not [name for name in found if "caller_" in name]

@@ -387,9 +387,9 @@ async def test_retiring(
         assert triple[0] == -1
         assert "retired" in triple[1]
     assert await tell(proxy, "/retire") == {"unregistered": 0}
-    await proxy.app._watch.look()
-    await proxy.app._watch._restore_lost()
-    await proxy.app._keeper.look()
+    await proxy.app.master_monitor.look()
+    await proxy.app.master_monitor._restore_lost()
+    await proxy.app.prober.look()
     assert not everything(master)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)
     ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
@@ -402,7 +402,7 @@ async def test_retiring_waits_for_registrations_under_way(
     import asyncio
 
     proxy = await make_proxy(**PATIENT)
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     master.delay = 0.3
     registering = asyncio.create_task(node.publish(proxy.master))
     await until(lambda: len(proxy.app.context.registry), "it is admitted")

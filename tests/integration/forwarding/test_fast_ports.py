@@ -6,9 +6,8 @@ import pytest
 
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
-from rosproxy.forwarding.kernel import targets as kernel_targets
-from rosproxy.forwarding.kernel.policy import World
-from rosproxy.forwarding.kernel.targets import KernelTargets
+from rosproxy.forwarding.kernel import syncer
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
@@ -28,8 +27,8 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
 
     monkeypatch.setattr(kernel_plane, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(kernel_targets, "forwarding", World)
-    monkeypatch.setattr(KernelTargets, "_is_own", lambda targets, address: False)
+    monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
+    monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
     monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
     return made
 
@@ -152,7 +151,7 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     host, lease = proxy.lease(node)
     assert await refuses((host, lease + 2))
     await proxy.restart()
-    leases, registry = proxy.app._leases, proxy.app.context.registry
+    leases, registry = proxy.app.leases, proxy.app.context.registry
     await until(lambda: any(map(leases.is_open, registry)), "the node is recovered")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
     assert proxy.app.status()["ports"]["free"] == 3

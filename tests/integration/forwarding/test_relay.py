@@ -57,7 +57,7 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
 
 async def quiet(proxy: Any) -> None:
     """Wait until all relays have ended."""
-    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
+    await until(lambda: not proxy.app.tcpros.relays, "all relays end")
 
 
 async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lease):
@@ -161,7 +161,7 @@ async def test_bytes_arrive_intact_both_ways_at_once(
     assert got_outside == hashlib.sha256(outward).hexdigest()
     assert got_inside == hashlib.sha256(inward).hexdigest()
     await quiet(proxy)
-    traffic = proxy.app._tcpros.traffic()
+    traffic = proxy.app.tcpros.traffic()
     assert traffic.sent[("topic", "/chatter")] == len(outward)
     assert traffic.received[("topic", "/chatter")] == len(inward)
 
@@ -198,7 +198,7 @@ async def test_the_status_tells_of_open_connections(proxy, node, lease):
     async with relayed(node, lease) as ends:
         await ends.inside.send(b"x" * 1000)
         await ends.outside.exactly(1000)
-        await until(lambda: proxy.app._tcpros.relays[0].sent, "the bytes are counted")
+        await until(lambda: proxy.app.tcpros.relays[0].sent, "the bytes are counted")
         (shown,) = proxy.app.status()["nodes"][0]["connections"]
         assert {**shown, "sent_rate": 0, "received_rate": 0} == {
             "kind": "topic",
@@ -315,7 +315,7 @@ async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, 
     async with AsyncExitStack() as stack:
         for _ in range(10):
             await stack.enter_async_context(relayed(node, lease))
-        assert len(proxy.app._tcpros.relays) == 10
+        assert len(proxy.app.tcpros.relays) == 10
     await quiet(proxy)
 
 
@@ -384,7 +384,7 @@ def buffers(proxy: Any) -> set[tuple[int, int]]:
             one.inside.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF),
             one.outside.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF),
         )
-        for one in proxy.app._tcpros.relays
+        for one in proxy.app.tcpros.relays
     }
 
 

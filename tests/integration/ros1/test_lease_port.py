@@ -96,7 +96,7 @@ async def test_a_malformed_header_is_answered_with_an_error(proxy, node, header)
 
 
 async def test_a_header_that_never_ends_costs_a_time_out(proxy, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.net.acceptor.FIRST_BYTES_TIMEOUT", 0.2)
+    monkeypatch.setattr("rosproxy.net.sockets.SILENCE_TIMEOUT", 0.2)
     await node.publish(proxy.master)
     for sent in (b"", b"\x01\0", topic_header()[:-1]):
         async with connect(proxy.lease(node)) as wire:
@@ -116,7 +116,7 @@ async def test_a_client_that_leaves_inside_its_header_is_survived(proxy, node):
                 if reset:
                     wire.reset()
     assert (await greet(proxy.lease(node), header))["callerid"] == "/talker"
-    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
+    await until(lambda: not proxy.app.tcpros.relays, "all relays end")
 
 
 async def test_a_service_on_a_port_of_its_own_is_found(proxy, make_node):

@@ -10,21 +10,21 @@ import socket
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
-from rosproxy.forwarding.relay import Relay, reset_on_close
+from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
-from rosproxy.net import listeners
-from rosproxy.net.acceptor import Acceptor, first_bytes
+from rosproxy.net import sockets
+from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort, is_inside
-from rosproxy.net.dialing import dial
-from rosproxy.net.http_server import Call, XmlRpcServer
 from rosproxy.net.interfaces import address_towards
 from rosproxy.ros1.alias import policy as core
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.servers.dispatch import dispatch
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer
 from rosproxy.telemetry.problems import Problem
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class Alias:
         self._server = XmlRpcServer(self._call, "rosproxy: a ROS node on the master's host\n")
         self._closed = False
 
-    async def hand_over(self, uris: Iterable[str]) -> None:
+    async def listen_for(self, uris: Iterable[str]) -> None:
         """Have the ports listen that these URIs lead to, before an inside node is given them."""
         address = self._context.upstream.master_address
         if self._host is None or address is None or self._closed:
@@ -62,7 +62,7 @@ class Alias:
             if port not in self._gone:
                 self._stand_in(port, uri, address)
 
-    def toward_inside(self, body: bytes, call: xmlrpc.Call) -> bytes:
+    def import_call(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
         address = self._context.upstream.master_address
         if self._host is None or address is None:
@@ -111,7 +111,7 @@ class Alias:
         if not self._make_room():
             return f"is one too many: {MOST_PORTS} others stand in for nodes and are in use"
         try:
-            sock = listeners.listen(self._context.settings.bind, port)
+            sock = sockets.listen(self._context.settings.bind, port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
         self._acceptors[port] = Acceptor(
@@ -152,7 +152,7 @@ class Alias:
     async def _refuses(self, port: int) -> bool:
         """Whether nobody listens at a port of the master's host."""
         try:
-            (await dial(self._target(port), LOOK_TIMEOUT)).close()
+            (await sockets.dial(self._target(port), LOOK_TIMEOUT)).close()
         except ConnectionRefusedError:
             return True
         except OSError as error:
@@ -196,21 +196,15 @@ class Alias:
             return
         if port in self._used:
             self._used[port] = self._context.now()
-        first = await first_bytes(conn)
-        if len(first) < 4:
-            conn.close()
-        elif speaks_http(first):
-            await self._server.serve(conn)
-        else:
-            await self._relay(port, conn, peer)
+        await dispatch(conn, self._server, partial(self._relay, port, peer))
 
-    async def _relay(self, port: int, conn: socket.socket, peer: str) -> None:
+    async def _relay(self, port: int, peer: str, conn: socket.socket) -> None:
         """Relay TCPROS as it is."""
         try:
-            node = await dial(self._target(port), CONNECT_TIMEOUT)
+            node = await sockets.dial(self._target(port), CONNECT_TIMEOUT)
         except OSError as error:
             log.debug("port %d of %s: %s", port, self._host, error)
-            reset_on_close(conn)
+            sockets.reset_on_close(conn)
             conn.close()
             if isinstance(error, ConnectionRefusedError):
                 self._leave(port)
@@ -223,7 +217,7 @@ class Alias:
         if relay.port in self._used:
             self._used[relay.port] = self._context.now()
 
-    async def _call(self, call: Call) -> bytes:
+    async def _call(self, call: IncomingCall) -> bytes:
         """A node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
             raise Unreachable(f"the address of {self._host} leads back to the proxy itself")

@@ -68,8 +68,7 @@ class NodeClient:
     async def learn_tcpros_port(self, endpoint: Endpoint) -> int | None:
         """Ask an endpoint's node for its TCPROS port anew and note it."""
         said = await self.describe(endpoint.slave)
-        endpoint.topic_ports.clear()
-        endpoint.tcpros_port = said.tcpros_port if said else None
+        endpoint.replace_tcpros_ports(said.tcpros_port if said else None)
         return endpoint.tcpros_port
 
     async def _topics(self, where: HostPort, method: str) -> dict[str, str]:

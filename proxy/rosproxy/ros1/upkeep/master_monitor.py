@@ -39,7 +39,7 @@ class MasterMonitor:
         self.round_trip: float | None = None
         self.since = context.now()
 
-    async def recovered(self) -> None:
+    async def ensure(self) -> None:
         """Wait until the registry is rebuilt from the master. Raises Unreachable."""
         if not self._recovered:
             await self._await_recovery()
@@ -70,7 +70,7 @@ class MasterMonitor:
             async with asyncio.timeout(LOOK_TIMEOUT):
                 pid = await self._context.upstream.ask_master("getPid")
             self.round_trip = self._context.now() - started
-            await self.recovered()
+            await self.ensure()
             await self._check(pid)
             self._mark(True)
         except (Unreachable, MasterError) as error:

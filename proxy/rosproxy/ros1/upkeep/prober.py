@@ -5,6 +5,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import replace
 
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
@@ -12,7 +13,6 @@ from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import Change, ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.recovery.policy import Claim, confirmed_by
 from rosproxy.ros1.upkeep.registrar import Registrar
 
@@ -32,7 +32,7 @@ class Prober:
     """Looks after all endpoints."""
 
     def __init__(
-        self, context: Context, leases: Leases, nodes: NodeClient, upkeep: Registrar
+        self, context: Context, leases: Leases[Endpoint], nodes: NodeClient, upkeep: Registrar
     ) -> None:
         self._context, self._leases, self._nodes, self._upkeep = context, leases, nodes, upkeep
         self._probing: set[Endpoint] = set()

@@ -154,8 +154,7 @@ class Registrar:
         said = await self._nodes.describe(endpoint.slave)
         if said is None:
             return
-        endpoint.topic_ports.clear()
-        endpoint.tcpros_port = said.tcpros_port
+        endpoint.replace_tcpros_ports(said.tcpros_port)
         stale = policy.left_over(endpoint, said.published, said.subscribed, started)
         await self._forget(endpoint, stale)
 

@@ -11,7 +11,7 @@ from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.upkeep.adoption import policy
 from rosproxy.ros1.upkeep.adoption.policy import Stray
-from tests.unit.builders import add_node, add_registration, make_addressing
+from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
 C1 = Arrival("10.0.0.5", frozenset({"c1", "3f2a91c0b7de"}))
@@ -237,21 +237,6 @@ def test_topics_that_a_node_no_longer_has() -> None:
         addressing.registry.register(endpoint, held(name, kind=kind, since=since))
     gone = policy.vanished(endpoint, ["/kept"], {"/kept": "type"}, before=5.0)
     assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
-
-
-def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
-    addressing = make_addressing()
-    endpoint = add_node(addressing)
-    add_registration(addressing, endpoint, PUB, "/a")
-    ours, other = addressing.advertised_uri(endpoint), "http://laptop:1/"
-    endpoint.settles_at = 5.0
-    assert policy.outdated("/a", [other], addressing, now=4.0)
-    assert policy.outdated("/a", [], addressing, now=4.0)
-    assert not policy.outdated("/a", [other, ours], addressing, now=4.0)
-    assert not policy.outdated("/a", [other], addressing, now=5.0)
-    assert not policy.outdated("/b", [other], addressing, now=4.0)
-    addressing.registry.unregister(PUB, "/a", "/talker")
-    assert not policy.outdated("/a", [other], addressing, now=4.0)
 
 
 REASONS = [

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from rosproxy.admin.requests import Arrival
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
@@ -16,8 +17,8 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.upkeep.adoption import policy
 from rosproxy.ros1.upkeep.adoption.policy import Stray, Verdict
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -48,9 +49,14 @@ class Adopter:
     """Finds nodes that registered around the proxy, and makes the master know them through it."""
 
     def __init__(
-        self, context: Context, leases: Leases, nodes: NodeClient, upkeep: Registrar
+        self,
+        context: Context,
+        leases: Leases[Endpoint],
+        admission: NodeAdmission,
+        nodes: NodeClient,
+        upkeep: Registrar,
     ) -> None:
-        self._context, self._leases = context, leases
+        self._context, self._leases, self._admission = context, leases, admission
         self._nodes, self._upkeep = nodes, upkeep
         self._one_at_a_time = asyncio.Lock()
 
@@ -73,7 +79,7 @@ class Adopter:
             self._context.problems.add(name, why)
         return adopted
 
-    async def heed(self, endpoint: Endpoint, caller_id: str) -> None:
+    async def take_over(self, endpoint: Endpoint, caller_id: str) -> None:
         """Before a name registers: take back what the same node registered around the proxy.
 
         The master would else call shutdown at the node's own URI. Raises Unreachable.
@@ -89,7 +95,7 @@ class Adopter:
             except MasterError as error:
                 raise Unreachable(str(error)) from error
 
-    async def spared(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
+    async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
         """Whether a ``shutdown`` at an endpoint is only due to what its own node has registered.
 
         The master sends it to a name that changes its URI, at the one before. If that is a former
@@ -176,7 +182,7 @@ class Adopter:
         named = place.host in await resolve(self._context.upstream.reach(node).host)
         asker = Asker(place.host, "", found[0].caller_id)
         where = Place(place.host, named, confirmed=False)
-        endpoint = self._leases.take_in(uri, node, where, asker)
+        endpoint = self._admission.take_in(uri, node, where, asker)
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.pending += 1

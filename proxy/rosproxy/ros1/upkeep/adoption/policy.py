@@ -194,20 +194,6 @@ def vanished(
     ]
 
 
-def outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float) -> bool:
-    """Whether a ``publisherUpdate`` lacks a publisher that is being registered anew.
-
-    A newer one follows; a subscriber inside need not drop its connection in between.
-    """
-    listed = set(uris)
-    return any(
-        endpoint.settles_at > now
-        and endpoint.publishes(topic)
-        and addressing.advertised_uri(endpoint) not in listed
-        for endpoint in addressing.registry
-    )
-
-
 def _merit(stray: Stray, topics: set[str]) -> int | None:
     """How well a node's own topics bear out that it is the stray; None if not at all."""
     shared = stray.topics & topics

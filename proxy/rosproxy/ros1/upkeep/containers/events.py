@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosproxy.admin import requests
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.node import NodeClient, SelfDescription
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import policy
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -35,7 +35,7 @@ class Parts:
     """What news is acted on with; ``cut`` ends the TCPROS connections through a port."""
 
     context: Context
-    leases: Leases
+    leases: Leases[Endpoint]
     nodes: NodeClient
     upkeep: Registrar
     strays: Adopter

@@ -36,7 +36,7 @@ class PublisherUpdates:
         """Tell an endpoint's node, in the form that it can use; whether it has answered."""
         asker = self._context.node_asker(endpoint)
         imported = self._context.addressing.import_slaves(publishers, asker)
-        await self._mirror.hand_over(publishers)
+        await self._mirror.listen_for(publishers)
         return await self._send(endpoint.slave, topic, imported)
 
     async def _send(self, where: HostPort, topic: str, publishers: Sequence[str]) -> bool:
