@@ -29,12 +29,13 @@ from rosproxy.ros1.servers.slave import SlaveApi
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import XmlRpcServer, XmlRpcService
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
-from rosproxy.ros1.upkeep.containers.events import ContainerEvents, Parts
+from rosproxy.ros1.upkeep.containers.events import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.prober import TICK, Prober
-from rosproxy.ros1.upkeep.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription.publisher_updates import PublisherUpdates
-from rosproxy.ros1.upkeep.resubscription.resubscriber import SILENT_TICK, Resubscriber
+from rosproxy.ros1.upkeep.prober.prober import PROBE_TICK, Prober
+from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
+from rosproxy.ros1.upkeep.recovery.recovery import Recovery
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscription.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.settings import SettingError, Settings
 
 log = logging.getLogger(__name__)
@@ -56,20 +57,21 @@ class App:
         )
         self.alias = Alias(context)
         updates = PublisherUpdates(context, self.alias)
-        silent = Resubscriber(context, updates, self.tcpros.topic_connections, plane.look)
+        self.registrar = registrar = Registrar(context, nodes, updates)
+        self._resubscriber = Resubscriber(context, registrar, updates, self.tcpros, plane)
         self.leases = leases = Leases(
             context.registry,
             PortBank(settings.bind),
             plane,
-            silent,
+            self._resubscriber,
             context.tasks,
             context.problems,
         )
         self._admission = NodeAdmission(context, leases, nodes)
-        self.registrar = Registrar(context, nodes, updates, silent)
-        self.prober = Prober(context, leases, nodes, self.registrar)
-        self.master_monitor = MasterMonitor(context, self.prober, self.registrar, plane)
-        self._adopter = Adopter(context, leases, self._admission, nodes, self.registrar)
+        self._recovery = Recovery(context, leases, nodes, registrar, self._resubscriber, plane)
+        self.prober = Prober(context, leases, nodes, registrar, self._resubscriber, self._recovery)
+        self.master_monitor = MasterMonitor(context, self._recovery, registrar)
+        self._adopter = Adopter(context, leases, self._admission, nodes, registrar)
         slave = SlaveApi(context, leases, self.alias, self._adopter)
         slaves = XmlRpcServer(slave, "rosproxy: slave API of a ROS node behind it\n")
         leases.server = NodeServer(slaves, self.tcpros)
@@ -83,9 +85,7 @@ class App:
         self._reserve_range()
         await self.plane.start()
         settings = self.settings
-        master = MasterApi(
-            self.context, self._admission, self.alias, self.master_monitor, self._adopter
-        )
+        master = MasterApi(self.context, self._admission, self.alias, self._recovery, self._adopter)
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
@@ -95,10 +95,10 @@ class App:
         await self._start_admin()
         repeat = self.context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
-        repeat(self.prober.look, TICK, "looking after nodes")
+        repeat(self.prober.look, PROBE_TICK, "looking after nodes")
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
-        repeat(self.registrar.look_for_silent, SILENT_TICK, "looking for silent subscribers")
-        repeat(self.alias.tidy, TIDY_INTERVAL, "looking after mirrored ports")
+        repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
+        repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
@@ -120,19 +120,19 @@ class App:
         return describe(self.context, self.master_monitor, self.tcpros, self.alias, self.plane)
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
-        parts = Parts(
+        containers = ContainerEvents(
             self.context,
             self.leases,
             nodes,
             self.registrar,
             self._adopter,
-            self.master_monitor.ensure,
-            self._cut,
+            self._recovery,
+            self.tcpros,
+            self.plane,
         )
-        containers = ContainerEvents(parts)
         actions = {
             "/probe": self._probe,
-            "/containers": containers.hear,
+            "/containers": containers.handle,
             "/master-address": self._set_master_address,
             "/retire": containers.retire,
         }
@@ -162,13 +162,6 @@ class App:
             upstream.master_address = address
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
-
-    def _cut(self, port: int) -> None:
-        """End the connections through a lease, also those that the kernel forwards."""
-        self.tcpros.cut(port)
-        endpoint = self.context.registry.by_port.get(port)
-        if endpoint is not None:
-            self.plane.cut(endpoint)
 
     def _check_bind(self) -> None:
         try:

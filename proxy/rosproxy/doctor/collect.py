@@ -163,7 +163,7 @@ class _Survey:
 
     async def graph(self, facts: Facts) -> Facts:
         """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
-        ask = self._master.ask_master
+        ask = self._master.call_master
         graph = replies.graph(await ask("getSystemState"))
         names, services = sorted(graph.names()), sorted(graph.services)
         uris = await self._look_up("lookupNode", names)
@@ -203,7 +203,7 @@ class _Survey:
     async def _ask_master(self) -> tuple[Attempt, bool]:
         """How the master answers ``getPid``, and whether it is the proxy that refuses a loop."""
         try:
-            reply = await self._master.master(xmlrpc.dump_call("getPid", CALLER_ID))
+            reply = await self._master.post_to_master(xmlrpc.dump_call("getPid", CALLER_ID))
             xmlrpc.parse_reply(reply)
             loads(reply)
         except Unreachable as error:
@@ -221,14 +221,14 @@ class _Survey:
 
     async def _simulated_time(self) -> bool:
         try:
-            said = await self._master.ask_master("getParam", "/use_sim_time")
+            said = await self._master.call_master("getParam", "/use_sim_time")
         except MasterError:
             return False
         return said in ("1", "true", 1)
 
     async def _look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
         wanted = list(names)
-        found = await self._master.batch([(method, [CALLER_ID, name]) for name in wanted])
+        found = await self._master.multicall([(method, [CALLER_ID, name]) for name in wanted])
         pairs = zip(wanted, found, strict=False)
         return {name: uri for name, uri in pairs if isinstance(uri, str)}
 
@@ -244,7 +244,7 @@ class _Survey:
 
     async def _pid(self, where: HostPort) -> Attempt:
         try:
-            pid = await self._nodes.ask_node(where, WITHIN, "getPid")
+            pid = await self._nodes.call_node(where, WITHIN, "getPid")
         except (Unreachable, MasterError) as error:
             return _attempt(error)
         if isinstance(pid, int):
@@ -265,7 +265,7 @@ class _Survey:
 
     async def _words(self, where: HostPort) -> Words:
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
-        ask = self._nodes.ask_node
+        ask = self._nodes.call_node
         return replies.words(*[await ask(where, WITHIN, method) for method in methods])
 
     async def _data_port(self, facts: Facts, node: Node, topic: str) -> tuple[str, Attempt]:
@@ -274,7 +274,7 @@ class _Survey:
         if where is None or node.words is None:
             return "", Attempt()
         try:
-            answer = await self._nodes.ask_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
+            answer = await self._nodes.call_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
         except (Unreachable, MasterError) as error:
             return "", _attempt(error)
         target = replies.data_port(answer)

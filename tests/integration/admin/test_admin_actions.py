@@ -388,7 +388,7 @@ async def test_retiring(
         assert "retired" in triple[1]
     assert await tell(proxy, "/retire") == {"unregistered": 0}
     await proxy.app.master_monitor.look()
-    await proxy.app.master_monitor._restore_lost()
+    await proxy.app.registrar.register_lost()
     await proxy.app.prober.look()
     assert not everything(master)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)

@@ -1,4 +1,4 @@
-"""The mirror: which ports it takes, which it gives up, and what it changes in replies."""
+"""The alias: which ports it takes, which it gives up, and what it changes in replies."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ def settings(**options: Any) -> Settings:
     ],
 )
 def test_only_a_host_name_can_lead_to_the_proxy(master_uri: str, host: str | None) -> None:
-    assert policy.mirrored_host(master_uri) == host
+    assert policy.aliased_host(master_uri) == host
 
 
 def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = False) -> list[str]:
@@ -95,7 +95,7 @@ def test_uris_that_a_publisher_update_names(
     assert list(slave_api.announced_publishers(call)) == expected
 
 
-def test_only_ports_of_the_masters_host_are_mirrored() -> None:
+def test_only_ports_of_the_masters_host_need_a_port() -> None:
     uris = [
         URI,
         SERVICE,
@@ -109,11 +109,11 @@ def test_only_ports_of_the_masters_host_are_mirrored() -> None:
         "http://robot/",
         "",
     ]
-    found = policy.to_mirror(uris, ROBOT, make_addressing("robot"))
+    found = policy.ports_needed(uris, ROBOT, make_addressing("robot"))
     assert found == {40001: URI, 40003: SERVICE, 40004: "http://ROBOT:40004/"}
 
 
-def test_ports_that_the_proxy_needs_itself_are_no_mirrors() -> None:
+def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
     own = settings(publish_master=11411, admin=HostPort("0.0.0.0", 11312))
     assert {port: policy.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
         45000: "lies in --port-range 45000-45009",

@@ -1,4 +1,4 @@
-"""The mirror: ports of the proxy that stand in for nodes on the master's host.
+"""The master's host name as an alias of the proxy: which ports it needs, and what is rewritten.
 
 In a container network the master's host name may lead to the proxy, so that ``ROS_MASTER_URI``
 need not change. Nodes outside that run on the master's host give that very name in their own
@@ -18,7 +18,7 @@ from rosproxy.ros1.rewriting.slave_api import ros_triple, send_to, tcpros_addres
 from rosproxy.settings import Settings
 
 
-def mirrored_host(master_uri: str) -> str | None:
+def aliased_host(master_uri: str) -> str | None:
     """The master's host if it is a name that can lead to the proxy, in lower case."""
     where = parse_slave_uri(master_uri)
     if where is None or is_address(where.host) or is_loopback(where.host):
@@ -26,10 +26,10 @@ def mirrored_host(master_uri: str) -> str | None:
     return where.host.lower()
 
 
-def to_mirror(uris: Iterable[str], host: str, addressing: Addressing) -> dict[int, str]:
-    """The ports that have to be mirrored, each with a URI that names it.
+def ports_needed(uris: Iterable[str], host: str, addressing: Addressing) -> dict[int, str]:
+    """The ports that have to stand in for those of ``host``, each with a URI that names it.
 
-    An address of the proxy's own is not, even where the proxy is advertised by the same name.
+    An address of the proxy's own is none, even where the proxy is advertised by the same name.
     """
     found: dict[int, str] = {}
     for uri in uris:
@@ -45,7 +45,7 @@ def is_service(uri: str) -> bool:
 
 
 def obstacle(port: int, settings: Settings) -> str | None:
-    """What the proxy itself needs a port for, so that it can't be mirrored; None if nothing."""
+    """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
         return f"lies in --port-range {settings.ports.listen}"
     for option, own in (
@@ -59,7 +59,7 @@ def obstacle(port: int, settings: Settings) -> str | None:
 
 
 def advice(port: int, why: str, address: str) -> str:
-    """What to tell where a port can't be mirrored, and what to do; ``address`` is the master's."""
+    """What is wrong where a port can't stand in, and the cure; ``address`` is the master's."""
     return (
         f"inside nodes can't reach it: port {port} {why}. Start that node with ROS_IP={address}, "
         "so that it gives its address instead of its host name"
@@ -67,7 +67,7 @@ def advice(port: int, why: str, address: str) -> str:
 
 
 def least_used(used: Mapping[int, float], busy: Collection[int]) -> int | None:
-    """The mirrored port to give up first: the one unused for the longest time and not ``busy``.
+    """The port to give up first: the one unused for the longest time and not ``busy``.
 
     ``used`` tells when, in seconds, each was last of use.
     """
@@ -89,7 +89,7 @@ def direct_call(call: Call, body: bytes, host: str, address: str) -> bytes:
 
 
 def direct_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
-    """A node's reply, with the address in place of the mirrored host where a topic is to be had.
+    """A node's reply, with the address in place of the host's name where a topic is to be had.
 
     So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
     """

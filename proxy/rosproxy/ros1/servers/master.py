@@ -49,7 +49,7 @@ class MasterApi:
             raise
         try:
             if request.plain:
-                reply = await self._context.upstream.master(request.body)
+                reply = await self._context.upstream.post_to_master(request.body)
             else:
                 reply = await self._rewrite(request)
         except Unreachable:
@@ -66,7 +66,7 @@ class MasterApi:
             exported = master_api.export_request(request, admissions, addressing)
             if exported.body is None:
                 return exported.refused_reply()
-            answer = await self._context.upstream.master(exported.body)
+            answer = await self._context.upstream.post_to_master(exported.body)
             reply = master_api.read_reply(exported, answer)
             self._note(reply, request.asker.address)
             await self._alias.listen_for(reply.uris())
@@ -109,5 +109,5 @@ class PublishedMaster:
         """The master's reply to a call. Raises XmlRpcError, Unreachable."""
         asker = Asker(call.source, call.local.host, master=self._address)
         request = master_api.read_request(call.body, asker)
-        reply = await self._context.upstream.master(call.body)
+        reply = await self._context.upstream.post_to_master(call.body)
         return master_api.rename_master(request, reply, self._address)

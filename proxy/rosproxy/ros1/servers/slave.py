@@ -131,7 +131,7 @@ class SlaveApi:
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         try:
-            reply = await self._context.upstream.node(endpoint.slave, body)
+            reply = await self._context.upstream.post_to_node(endpoint.slave, body)
         except Unreachable as error:
             await self._suspect(endpoint, error)
             raise
