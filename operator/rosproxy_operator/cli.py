@@ -10,20 +10,20 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.main import Commands as ProxyCommands
-from rosproxy.cli.main import log_options
+from rosproxy.cli.options import Commands, log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
 
-class Commands(ProxyCommands):
+class OperatorCommands(Commands):
     """Commands whose usage errors begin with this program's name."""
 
     program = "rosproxy-operator"
 
 
 @click.group(
-    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=OperatorCommands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 @main.group(
-    cls=Commands,
+    cls=OperatorCommands,
     invoke_without_command=True,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )

@@ -14,6 +14,7 @@ from rosproxy.admin.requests import read_master_address
 from rosproxy.admin.server import AdminServer
 from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
+from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import RANGE_OPTION, Leases, PortBank
 from rosproxy.net import limits, sockets
@@ -117,7 +118,9 @@ class App:
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return describe(self.context, self.master_monitor, self.tcpros, self.alias, self.plane)
+        return to_json(
+            describe(self.context, self.master_monitor, self.tcpros, self.alias, self.plane)
+        )
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
         containers = ContainerEvents(
@@ -152,7 +155,7 @@ class App:
         return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
-        return await probe_range(self.context, self.leases)
+        return to_json(await probe_range(self.context, self.leases))
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""

@@ -6,9 +6,10 @@ from typing import Any
 
 from rosproxy.app import App
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.settings import Settings, parse_settings
+from rosproxy.settings import Settings
 from tests.integration.net import HOST, PROXY, Where, free_ports, where
 from tests.integration.node import Node
+from tests.run_options import parse_settings
 
 PORTS = 8
 """How many ports a proxy of the tests has for nodes, unless told otherwise."""

@@ -7,7 +7,7 @@ import signal
 import time
 
 from rosproxy import __version__
-from rosproxy.cli.terminal import WATCH_INTERVAL, draw, size, write
+from rosproxy.cli.terminal import size, watch, write
 from rosproxy_operator.common.health import Health
 from rosproxy_operator.common.metrics import Metrics
 from rosproxy_operator.common.problem import Problem
@@ -50,17 +50,14 @@ def show_status(settings: PlanSettings, as_json: bool) -> None:
 
 def watch_status(settings: PlanSettings) -> None:
     """Draw the status again and again until interrupted, also while no engine answers."""
-    try:
-        while True:
-            columns, lines = size()
-            try:
-                text = _text(asyncio.run(survey(settings)), settings, False, columns, lines)
-            except EngineError as error:
-                text = f"{time.strftime('%H:%M:%S')} {error}"
-            draw(text)
-            time.sleep(WATCH_INTERVAL)
-    except KeyboardInterrupt:
-        write("")
+
+    def draw(columns: int, lines: int | None) -> str:
+        try:
+            return _text(asyncio.run(survey(settings)), settings, False, columns, lines)
+        except EngineError as error:
+            return f"{time.strftime('%H:%M:%S')} {error}"
+
+    watch(draw)
 
 
 def _text(

@@ -105,12 +105,16 @@ BAD = [
     ("/containers", "nonsense", "the body: must be JSON"),
     ("/containers", "[" * 100_000, "the body: must be JSON"),
     ("/containers", "1" * 10_000, "the body: must be JSON"),
-    ("/containers", "[]", "the body: must be a JSON object, not a list"),
+    ("/containers", "[]", "the body: Expected `object`, got `array`"),
     ("/containers", '{"gone": ["x"]}', "gone[0]: must be an IP address"),
     ("/containers", '{"moved": {"a": "b"}}', "moved: must be an IP address"),
-    ("/containers", '{"arrived": [{"names": []}]}', "arrived[0].address: must be an IP address"),
-    ("/containers", '{"gone": [], "left": []}', "the body: unknown field 'left'"),
-    ("/retire", '{"x": 1}', "the body: unknown field 'x'; known: none"),
+    (
+        "/containers",
+        '{"arrived": [{"names": []}]}',
+        "arrived[0]: Object missing",
+    ),
+    ("/containers", '{"gone": [], "left": []}', "the body: Object contains unknown field `left`"),
+    ("/retire", '{"x": 1}', "the body: Object contains unknown field `x`; known: none"),
 ]
 
 

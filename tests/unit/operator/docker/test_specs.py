@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import parse_settings
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
@@ -24,6 +23,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
 
 SANDBOX = SandboxSpec("s", KEY, PortRange(11400, 11401), "f1", "0-rosproxy")
@@ -96,24 +96,7 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
     """A second roscore is often at 11312, where the admin endpoint usually is."""
     key = Key(f"http://robot:{port}", HERE)
     body = container_config(replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
-    env = dict(pair.split("=", 1) for pair in body["Env"])
-    options = {
-        "master_uri": env["ROS_MASTER_URI"],
-        "advertise_host": env["ROSPROXY_ADVERTISE_HOST"],
-        "port_range": env["ROSPROXY_PORT_RANGE"],
-        "master_port": int(env["ROSPROXY_MASTER_PORT"]),
-        "admin_bind": env["ROSPROXY_ADMIN_BIND"],
-        "admin_token": env["ROSPROXY_ADMIN_TOKEN"],
-        "master_address": env["ROSPROXY_MASTER_ADDRESS"],
-        "bind": "0.0.0.0",
-        "slave_control": "any",
-        "probe_interval": 5.0,
-        "probe_timeout": 3.0,
-        "cleanup_after": 30.0,
-        "linger": 30.0,
-        "master_interval": 2.0,
-    }
-    settings = parse_settings(options)
+    settings = settings_of(dict(pair.split("=", 1) for pair in body["Env"]))
     assert settings.admin.port == admin_port(key)
     assert reserved_ports(key) == {port, settings.admin.port}
 
