@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner.model import Name, Node, Selector
+from rosproxy_operator.kubernetes.planner.model import ClusterNode, Name, Selector
 from rosproxy_operator.kubernetes.planner.names import own_labels
 from rosproxy_operator.kubernetes.planner.selection import (
     chosen,
@@ -123,8 +123,8 @@ def test_a_pod_is_taken_by_its_label(label, taken):
         {INJECT: "false"},
         {INJECT: ""},
         own_labels("arm"),
-        {"app.kubernetes.io/name": "rosproxy", "app.kubernetes.io/component": "controller"},
-        {"app.kubernetes.io/part-of": "rosproxy", "app.kubernetes.io/component": "controller"},
+        {"app.kubernetes.io/name": "rosproxy", "app.kubernetes.io/component": "operator"},
+        {"app.kubernetes.io/part-of": "rosproxy", "app.kubernetes.io/component": "operator"},
     ],
 )
 def test_pods_that_no_selector_takes(labels):
@@ -200,4 +200,4 @@ def test_nodes_that_may_have_a_proxy(wanted, fits):
     one = rosproxy()
     picky = replace(one, spec=replace(one.spec, node_selector=wanted))
 
-    assert on_node(picky, Node("node1", {"disk": "ssd"})) is fits
+    assert on_node(picky, ClusterNode("node1", {"disk": "ssd"})) is fits

@@ -12,7 +12,7 @@ from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.upkeep.adoption import policy
 from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
 from rosproxy.ros1.upkeep.registration.policy import known_as
-from tests.unit.builders import add_node, add_registration, make_addressing
+from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
 C1 = Arrival("10.0.0.5", frozenset({"c1", "3f2a91c0b7de"}))
