@@ -14,7 +14,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.upkeep.resubscription.policy import Connection
+from rosproxy.ros1.upkeep.resubscription.policy import TopicConnection
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class TcprosServer:
         """The open connections."""
         return list(self._relays)
 
-    def topic_connections(self) -> set[Connection]:
+    def topic_connections(self) -> set[TopicConnection]:
         """The open connections of topics: port, topic and the subscriber's name."""
         return {(r.port, r.name, r.caller_id) for r in self._relays if r.kind == "topic"}
 

@@ -32,7 +32,7 @@ from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpda
 from rosproxy.ros1.upkeep.registration.policy import one_publisher_per_topic
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, Connection, Subscription
+from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicConnection, TopicSubscription
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ RESUBSCRIBE_TICK = 1.0
 class RelayedTopics(Protocol):
     """What relays TCPROS for the endpoints."""
 
-    def topic_connections(self) -> set[Connection]:
+    def topic_connections(self) -> set[TopicConnection]:
         """The subscribers' connections that are relayed now."""
 
 
@@ -144,7 +144,7 @@ class Resubscriber:
         return await self._send_without(graph, policy.unconnected(left, bus, addresses))
 
     async def _locate(
-        self, held: Mapping[str, list[Registration]], left: Sequence[Subscription]
+        self, held: Mapping[str, list[Registration]], left: Sequence[TopicSubscription]
     ) -> Graph:
         """What is registered, with the URIs of those whom it is about."""
         topics = {one.topic for one in left}
@@ -156,14 +156,16 @@ class Resubscriber:
         names = publishers | {one.caller_id for one in left}
         return await locate(self._context.upstream, held, names)
 
-    def _through_proxy(self, graph: Graph, left: Iterable[Subscription]) -> list[Subscription]:
+    def _through_proxy(
+        self, graph: Graph, left: Iterable[TopicSubscription]
+    ) -> list[TopicSubscription]:
         """Those whose subscribers reach the publisher through the proxy."""
         addressing, subscribers = self._context.addressing, {one.caller_id for one in left}
         uris = {node: graph.uris[node] for node in subscribers if node in graph.uris}
         inside = {node: addressing.stands_for(uri) for node, uri in uris.items()}
         askers = {e: self._context.node_asker(e) for e in inside.values() if e}
 
-        def is_relayed(one: Subscription) -> bool:
+        def is_relayed(one: TopicSubscription) -> bool:
             subscriber = inside.get(one.caller_id)
             if subscriber is None:
                 return one.caller_id in inside
@@ -172,7 +174,7 @@ class Resubscriber:
 
         return [one for one in left if is_relayed(one)]
 
-    async def _read_buses(self, left: Iterable[Subscription]) -> dict[Endpoint, list[BusRow]]:
+    async def _read_buses(self, left: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
         """What the publishers themselves say of their connections."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
@@ -190,7 +192,7 @@ class Resubscriber:
         return dict(zip(endpoints, found, strict=True))
 
     async def _resolve_hosts(
-        self, graph: Graph, left: Iterable[Subscription]
+        self, graph: Graph, left: Iterable[TopicSubscription]
     ) -> dict[str, list[str]]:
         """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
 
@@ -203,7 +205,7 @@ class Resubscriber:
         found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, found, strict=True))
 
-    async def _send_without(self, graph: Graph, found: Iterable[Subscription]) -> set[str]:
+    async def _send_without(self, graph: Graph, found: Iterable[TopicSubscription]) -> set[str]:
         """Send each subscriber its publishers without those that it misses; the topics."""
         missed: dict[tuple[str, str], set[Endpoint]] = {}
         for one in found:
