@@ -9,6 +9,7 @@ from rosproxy.admin.range_probe import probe_range
 from rosproxy.admin.requests import read_master_address
 from rosproxy.admin.server import AdminServer
 from rosproxy.admin.status import describe
+from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net import limits, listeners
 from rosproxy.net.acceptor import Acceptor, first_bytes
@@ -117,7 +118,9 @@ class App:
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return describe(self.context, self.master_monitor, self._tcpros, self.alias, self._plane)
+        return to_json(
+            describe(self.context, self.master_monitor, self._tcpros, self.alias, self._plane)
+        )
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
         containers = ContainerEvents(
@@ -152,7 +155,7 @@ class App:
         return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
-        return await probe_range(self.context, self._leases)
+        return to_json(await probe_range(self.context, self._leases))
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""

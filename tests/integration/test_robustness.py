@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import Where
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
-from tests.integration.net import HOST, NODE, Where, connect, exchange, post, rpc, xml
+from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
