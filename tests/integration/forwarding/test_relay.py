@@ -384,7 +384,7 @@ def buffers(proxy: Any) -> set[tuple[int, int]]:
             one.inside.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF),
             one.outside.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF),
         )
-        for one in proxy.app._tcpros.relays
+        for one in proxy.app.tcpros.relays
     }
 
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from rosproxy.admin import requests
 from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.node import NodeClient
@@ -20,7 +21,6 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import policy
 from rosproxy.ros1.upkeep.recovery.recovery import Recovery
@@ -50,7 +50,7 @@ class ContainerEvents:
     """Acts on what an operator knows of containers before any time-out can tell."""
 
     context: Context
-    leases: Leases
+    leases: Leases[Endpoint]
     nodes: NodeClient
     registrar: Registrar
     adopter: Adopter

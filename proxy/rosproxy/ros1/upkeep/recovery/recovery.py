@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
@@ -26,7 +27,6 @@ from rosproxy.ros1.clients.master_graph import read_graph
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.recovery import policy
 from rosproxy.ros1.upkeep.recovery.policy import Claim
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
@@ -46,7 +46,7 @@ class Recovery:
     def __init__(
         self,
         context: Context,
-        leases: Leases,
+        leases: Leases[Endpoint],
         nodes: NodeClient,
         registrar: Registrar,
         resubscriber: Resubscriber,
