@@ -17,7 +17,6 @@ in the meantime takes up to three minutes.
 import asyncio
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import resolve
@@ -28,11 +27,12 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
 from rosproxy.ros1.upkeep.registration.policy import one_publisher_per_topic
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicConnection, TopicSubscription
+from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +47,6 @@ RESUBSCRIBE_TICK = 1.0
 """Seconds between checks whether it is time to look at any."""
 
 
-class RelayedTopics(Protocol):
-    """What relays TCPROS for the endpoints."""
-
-    def topic_connections(self) -> set[TopicConnection]:
-        """The subscribers' connections that are relayed now."""
-
-
 class Resubscriber:
     """Looks after the subscribers of publishers that were out of reach for a time."""
 
@@ -62,11 +55,11 @@ class Resubscriber:
         context: Context,
         registrar: Registrar,
         updates: PublisherUpdates,
-        relayed: RelayedTopics,
+        tcpros: TcprosServer,
         plane: KernelPlane,
     ) -> None:
         self._context, self._registrar, self._updates = context, registrar, updates
-        self._relayed, self._plane = relayed, plane
+        self._tcpros, self._plane = tcpros, plane
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
 
@@ -131,7 +124,7 @@ class Resubscriber:
         """
         held = await read_registrations(self._context.upstream)
         wanted = policy.subscriptions(held, endpoints, self._context.addressing)
-        left = policy.without_relay(wanted, self._relayed.topic_connections())
+        left = policy.without_relay(wanted, self._tcpros.topic_connections())
         if not left:
             return set()
         graph = await self._locate(held, left)
@@ -140,7 +133,7 @@ class Resubscriber:
         if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, left)
-        left = policy.without_relay(left, self._relayed.topic_connections())
+        left = policy.without_relay(left, self._tcpros.topic_connections())
         return await self._send_without(graph, policy.unconnected(left, bus, addresses))
 
     async def _locate(
