@@ -16,6 +16,7 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.masters import master_service
+from rosproxy_operator.kubernetes.planner.fields import InvalidField
 from rosproxy_operator.kubernetes.planner.model import (
     ClusterSnapshot,
     InvalidRosProxy,
@@ -31,7 +32,7 @@ from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_prox
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.planner.spec import InvalidField, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import invalid, rosproxy
 
 T = TypeVar("T")
 AT_ONCE = 8
