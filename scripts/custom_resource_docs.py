@@ -1,9 +1,9 @@
-"""Write the tables of the RosProxy's fields, from the custom resource definition.
+"""Write the tables of the RosProxy's fields in docs/reference/custom-resource.md.
 
     python scripts/custom_resource_docs.py [--check]
 
 They stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->`` (and
-the same for the status) in one page of docs/, and are made from manifests/install.yaml. The chart's
+the same for the status), and are made from manifests/install.yaml. The chart's
 values are in its README, by helm-docs. With ``--check`` nothing is written; the exit code tells
 whether the page is as it should be.
 """
@@ -17,12 +17,8 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs/reference/custom-resource.md"
 INSTALL = ROOT / "manifests/install.yaml"
-PAGE = next(
-    path
-    for path in (ROOT / "docs").rglob("*.md")
-    if "<!-- fields of the spec -->" in path.read_text()
-)
 
 
 def custom_resource() -> Mapping[str, Any]:

@@ -10,20 +10,20 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.main import Commands as ProxyCommands
-from rosproxy.cli.main import log_options
+from rosproxy.cli.options import Commands, log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
 
-class Commands(ProxyCommands):
+class OperatorCommands(Commands):
     """Commands whose usage errors begin with this program's name."""
 
     program = "rosproxy-operator"
 
 
 @click.group(
-    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=OperatorCommands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 @main.group(
-    cls=Commands,
+    cls=OperatorCommands,
     invoke_without_command=True,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )
@@ -117,7 +117,7 @@ def docker(
     """
     from rosproxy.settings import SettingError
     from rosproxy.telemetry import logs
-    from rosproxy_operator.settings import parse_docker_settings
+    from rosproxy_operator.docker.settings import parse_docker_settings
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
@@ -267,7 +267,7 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
     """
     from rosproxy.settings import SettingError
-    from rosproxy_operator.settings import parse_kubernetes_settings
+    from rosproxy_operator.kubernetes.settings import parse_kubernetes_settings
 
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")
@@ -305,7 +305,7 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        reason = str(error) if "HTTP" in str(error) else f"no controller answers at {url}"
+        reason = str(error) if "HTTP" in str(error) else f"no operator answers at {url}"
         click.echo(f"rosproxy-operator: {reason}", err=True)
         sys.exit(1)
 

@@ -6,25 +6,20 @@ import time
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import DockerMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
-from rosproxy_operator.docker.apply import Applier
+from rosproxy_operator.docker.apply import DockerApplier
 from rosproxy_operator.docker.client import DockerClient
-from rosproxy_operator.docker.details import Inspector
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.events import Events
 from rosproxy_operator.docker.executor import Executor
-from rosproxy_operator.docker.planner.actions import Create
-from rosproxy_operator.docker.planner.model import Proxy, Sandbox
-from rosproxy_operator.docker.planner.plan import Group, Plan, plan
-from rosproxy_operator.docker.planner.specs import master, proxy_name
-from rosproxy_operator.docker.planner.state import Memory
-from rosproxy_operator.docker.proxy_sync import ProxySync
-from rosproxy_operator.docker.sense import sense, unresolved
-from rosproxy_operator.docker.snapshot import Look, Observer
-from rosproxy_operator.settings import DockerSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan, plan
+from rosproxy_operator.docker.planner.specs import proxy_name
+from rosproxy_operator.docker.planner.state import DockerMemory
+from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.settings import DockerSettings
+from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 log = logging.getLogger(__name__)
 
@@ -50,17 +45,16 @@ class DockerController:
         engine = DockerClient()
         self._proxies = ProxyClient()
         self._masters = MasterResolver(loop.wake)
-        self._inspector = Inspector(engine, loop.wake)
-        self._observer = Observer(engine, settings.plan, self._inspector)
-        self._applier = Applier(engine, settings.plan, self._proxies, self._masters)
-        self._work = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
+        self._observer = DockerObserver(engine, settings.plan, self._masters, loop.wake)
+        self._applier = DockerApplier(engine, settings.plan, self._proxies)
+        self._executor = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
         uplink = settings.plan.uplink
-        self._teller = ProxySync(self._tasks, self._proxies, self._masters, uplink, loop.wake)
-        self._events = Events(engine, self._connected, self._happened)
-        self._memory = Memory()
+        self._proxy_sync = DockerProxySync(self._tasks, self._proxies, uplink, loop.wake)
+        self._events = Events(engine, self._connected, self._changed)
+        self._memory = DockerMemory()
         self._shown: list[Problem] = []
         self._log = ProblemLog()
-        self._last: tuple[Look, Plan] | None = None
+        self._last: tuple[DockerSnapshot, DockerPlan] | None = None
 
     async def run(self) -> None:
         """Look after the engine until cancelled. Proxies go on without an operator."""
@@ -87,67 +81,51 @@ class DockerController:
         """One look and what follows from it; when to look again. Raises LookFailed."""
         started = time.monotonic()
         try:
-            look = await sense(self._observer, self._masters, self._settings.plan)
+            look = await self._observer.look()
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
-        planned = plan(look.observed, self._settings.plan, self._memory, time.monotonic())
+        planned = plan(look.state, look.labels, self._settings.plan, self._memory, time.monotonic())
         self._metrics.look_time.observe(time.monotonic() - started)
         self._memory = planned.memory
         self._act(look, planned, started)
         self._looked(look, planned)
-        times = [each for each in (planned.again_in, self._work.again_in) if each is not None]
+        times = [each for each in (planned.again_in, self._executor.again_in) if each is not None]
         return min(times, default=None)
 
-    def _act(self, look: Look, planned: Plan, seen: float) -> None:
+    def _act(self, look: DockerSnapshot, planned: DockerPlan, seen: float) -> None:
         """Begin what is to be done and told."""
-        groups = [group for group in planned.groups if self._possible(group, look)]
         log.debug(
-            "looked in %.3f s: %d actions, %d of them possible now, again in %s s",
+            "looked in %.3f s: %d actions, again in %s s",
             time.monotonic() - seen,
             len(planned.actions),
-            sum(len(group.actions) for group in groups),
             planned.again_in,
         )
-        if look.unsure and not self._inspector.waiting:
+        if look.state.busy and not self._observer.waiting:
             self._loop.wake_in(SETTLED)  # nobody is going to tell when the list is right
-        self._work.start(groups, lambda action: self._applier.carry_out(action, look), seen)
-        self._teller.tell(look, planned.wishes)
+        groups = planned.groups
+        self._executor.start(groups, lambda action: self._applier.carry_out(action, look), seen)
+        self._proxy_sync.update(look, planned.members)
 
-    def _possible(self, group: Group, look: Look) -> bool:
-        """Whether a group can be carried out already.
-
-        Not without the address of a master that has a name: the proxy would find itself by it. Not
-        on a container of which not everything is known.
-        """
-        if group.key is None:
-            return True
-        needs = any(isinstance(action, Create) for action in group.actions)
-        if needs and not self._masters.address(master(group.key).host):
-            return False
-        own: list[Sandbox | Proxy] = [*look.observed.sandboxes, *look.observed.proxies]
-        return not any(o.key == group.key and o.container.name in look.unsure for o in own)
-
-    def _looked(self, look: Look, planned: Plan) -> None:
+    def _looked(self, look: DockerSnapshot, planned: DockerPlan) -> None:
         self._last = look, planned
         problems = self._current(look, planned)
         self._log.update(problems)
         metrics = self._metrics
-        metrics.containers.set(sum(wish.alive for wish in planned.wishes))
+        metrics.containers.set(sum(member.alive for member in planned.members))
         metrics.problems.set(len(problems))
-        metrics.show_proxies(proxy.container.state for proxy in look.observed.proxies)
+        metrics.show_proxies(proxy.container.state for proxy in look.state.proxies)
 
-    def _current(self, look: Look, planned: Plan) -> list[Problem]:
+    def _current(self, look: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
         """All problems; those of what is being worked on as they were before.
 
         What a look finds and plans in the midst of it is outdated a moment later.
         """
         found = [
             *planned.problems,
-            *unresolved(look, self._masters, self._settings.plan),
-            *self._work.problems,
-            *self._teller.problems(look),
+            *self._executor.problems,
+            *self._proxy_sync.problems(look),
         ]
-        busy = self._work.subjects
+        busy = self._executor.subjects
         self._shown = [
             *(problem for problem in found if problem.subject not in busy),
             *(problem for problem in self._shown if problem.subject in busy),
@@ -156,20 +134,19 @@ class DockerController:
 
     def _settled(self) -> bool:
         """Whether nothing is left to be done or waited for."""
-        if self._last is None or self._work.busy or self._loop.woken:
+        if self._last is None or self._executor.busy or self._loop.woken:
             return False
         look, planned = self._last
-        if self._work.problems or self._teller.problems(look):
+        if self._executor.problems or self._proxy_sync.problems(look):
             return True
-        if look.unsure or self._inspector.waiting:
+        if look.state.busy or self._observer.waiting:
             return False
-        doing = any(self._possible(group, look) for group in planned.groups)
-        return not doing and not self._silent(planned)
+        return not planned.groups and not self._silent(planned)
 
-    def _silent(self, planned: Plan) -> list[str]:
+    def _silent(self, planned: DockerPlan) -> list[str]:
         """The proxies that are wanted and do not answer."""
         names = (proxy_name(desired.key) for desired in planned.desired if desired.live)
-        return [name for name in names if not self._teller.answers(name)]
+        return [name for name in names if not self._proxy_sync.answers(name)]
 
     def _unsolved(self) -> list[Problem]:
         if self._last is None:
@@ -182,7 +159,8 @@ class DockerController:
             for name in self._silent(planned)
             if f"proxy {name}" not in told
         ]
-        if planned.groups and not problems:
+        left = planned.groups or planned.deferred or look.state.busy
+        if left and not problems:
             problems.append(Problem("operator", "there was not enough time for all actions"))
         return problems
 
@@ -194,7 +172,7 @@ class DockerController:
         self._loop.retry()
         self._loop.wake_in(SETTLED)
 
-    def _happened(self) -> None:
+    def _changed(self) -> None:
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

@@ -15,8 +15,7 @@ from dataclasses import replace
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier
@@ -27,8 +26,8 @@ from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 

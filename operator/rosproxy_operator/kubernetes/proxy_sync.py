@@ -16,7 +16,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.kubernetes.planner.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT
-from rosproxy_operator.kubernetes.planner.proxy_status import answer, no_answer
+from rosproxy_operator.kubernetes.planner.proxy_status import no_answer, report
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class ProxyPoller:
 
     async def _ask(self) -> None:
         try:
-            found = answer(await self._proxies.status(self.where))
+            found = report(await self._proxies.status(self.where))
             self._failures = 0
         except ProxyError as error:
             self._failures += 1

@@ -17,9 +17,9 @@ import kopf
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.handlers import Wakeable, registry
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ from rosproxy.leases import fast_ports
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.context import Context, make_context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
-from rosproxy.settings import parse_settings
 from tests.integration.kernel_fake import FakeTools
+from tests.run_options import parse_settings
 
 NODE = "192.0.2.5"
 FLOW = (

@@ -5,8 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from rosproxy.telemetry.text import plural
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.kubernetes.planner.findings import CONFLICT, EXHAUSTED, NO_MASTER
 from rosproxy_operator.kubernetes.planner.model import (
     ClusterFinding,

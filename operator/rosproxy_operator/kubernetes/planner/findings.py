@@ -6,7 +6,7 @@ The texts stay the same as long as the trouble does: an Event is made of each ne
 from collections.abc import Iterable, Iterator
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.planner.model import (
     ClusterFinding,
     Failure,

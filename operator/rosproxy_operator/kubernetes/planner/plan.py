@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from rosproxy_operator.common.moves import RETRY_FOR
+from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner import departures, events
 from rosproxy_operator.kubernetes.planner import status as statuses

@@ -10,8 +10,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import overlap, within
-from rosproxy_operator.common.moves import MOVED_FOR, RETRY_FOR, TAKEN_FOR, Move
+from rosproxy_operator.common.allocation import (
+    MOVED_FOR,
+    RETRY_FOR,
+    TAKEN_FOR,
+    Move,
+    overlap,
+    within,
+)
 from rosproxy_operator.kubernetes.planner.model import (
     ClusterFinding,
     Pod,

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import TypeGuard
 
 from rosproxy.telemetry.text import clean, shorten
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.kubernetes.planner.conditions import (
     DEGRADED,
     READY,

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Protocol
 
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
-from rosproxy_operator.settings import WebhookSettings
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
-from rosproxy_operator.settings import KubernetesSettings
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
 
@@ -188,7 +188,7 @@ async def test_a_proxy_is_asked_and_told(
     told: list[Any] = []
 
     async def status(_: web.Request) -> web.Response:
-        return web.json_response({"master": {"up": True}, "nodes": []})
+        return web.json_response({"settings": {}, "master": {"up": True}, "nodes": []})
 
     async def containers(request: web.Request) -> web.Response:
         told.append((request.headers["Authorization"], await request.json()))

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
@@ -31,12 +32,12 @@ class Told(ProxyClient):
         self.asked = self.failing = 0
         self.told: list[Any] = []
 
-    async def status(self, where: HostPort) -> dict[str, Any]:
+    async def status(self, where: HostPort) -> ProxyStatus:
         self.asked += 1
         self.failing -= 1
         if self.says is None or self.failing >= 0:
             raise ProxyError(f"{where} refuses connections")
-        return self.says
+        return read_status(self.says)
 
     async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)

@@ -23,12 +23,12 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import kopf_log, watch
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.event_filter import EventFilter
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
     NAMESPACE,
