@@ -79,8 +79,7 @@ async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
             assert await other.exactly(100_000) == b"x" * 100_000
         elif after == "a half close":
             await other.half_close()
-            await one.exactly(0)
-            await asyncio.sleep(0.05)
+            await until(one.reader.at_eof, "the half close arrives")
         one.reset()
         assert await other.end() == "reset"
     await proxy.quiet()
@@ -92,8 +91,7 @@ async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, w
         one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
         one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         flood = asyncio.create_task(one.send(b"x" * 50_000_000))
-        await asyncio.sleep(0.3)
-        assert not flood.done()
+        await one.stalls()
         one.reset()
         await asyncio.gather(flood, return_exceptions=True)
         with pytest.raises(ConnectionResetError):
@@ -107,7 +105,7 @@ async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, leas
         reader = getattr(ends, stalled)
         writer = ends.inside if stalled == "outside" else ends.outside
         flood = asyncio.create_task(writer.send(b"x" * 50_000_000))
-        await asyncio.sleep(0.2)
+        await writer.stalls()
         reader.reset()
         with pytest.raises(ConnectionError):
             await flood
@@ -228,8 +226,7 @@ async def test_connections_leave_neither_descriptors_nor_threads(proxy, node, le
         for _ in range(4):
             await asyncio.gather(*(once(i) for i in range(30 * (1 + round_))))
         await proxy.quiet()
-    await asyncio.sleep(0.1)
-    assert len(os.listdir("/proc/self/fd")) <= before[0] + 2
+    await until(lambda: len(os.listdir("/proc/self/fd")) <= before[0] + 2, "all are closed")
     assert threading.active_count() <= before[1]
     assert proxy.endpoint(node).connections == 0
 
@@ -371,7 +368,7 @@ FLOOD = 100_000_000
 async def flood(ends: Ends) -> int:
     """Many bytes from inside; how many arrive outside, where nobody hurries."""
     sending = asyncio.create_task(ends.inside.send(bytes(FLOOD)))
-    await asyncio.sleep(1)
+    await ends.inside.stalls()
     size = len(await ends.outside.exactly(FLOOD))
     await sending
     return size
