@@ -8,7 +8,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 IMAGE ?= rosproxy:latest
 OPERATOR_IMAGE ?= rosproxy-operator:latest
-# Which layers `make test` runs, for example: make test LAYERS="unit ros"
+# Which layers `make test-all` runs, for example: make test-all LAYERS="unit ros"
 LAYERS ?=
 # Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
 BENCH ?=
@@ -28,14 +28,18 @@ $(VENV)/.bench: $(VENV)/.dev
 
 .PHONY: help
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
 	@$(BIN)/python -m rosproxy.demo
 
 .PHONY: test
-test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS, Docker and a Kubernetes cluster's programs on Debian and Ubuntu as root
+test: $(VENV)/.dev ## unit and integration tests; and a smoke test with real ROS and Docker, which it installs, as root on Debian or Ubuntu
+	@$(BIN)/python scripts/test_layers.py --smoke
+
+.PHONY: test-all
+test-all: $(VENV)/.dev ## every test of every layer that this machine can run; builds a Kubernetes cluster's programs, too
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
 .PHONY: bench
@@ -49,7 +53,7 @@ check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pytest -q tests/unit
+	$(BIN)/pytest -q -n 2 tests/unit
 
 .PHONY: format
 format: $(VENV)/.dev ## rewrite the sources in the house format

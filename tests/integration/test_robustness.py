@@ -366,6 +366,8 @@ async def test_a_name_server_that_hangs_does_not_hold_up_a_call_to_a_node(proxy,
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_more: answer.wait(20) and [])
     try:
         with pytest.raises(Unreachable, match="can't be resolved"):
-            await proxy.app.context.upstream.node(HostPort("nowhere.invalid", 1), b"", within=10)
+            await proxy.app.context.upstream.post_to_node(
+                HostPort("nowhere.invalid", 1), b"", within=10
+            )
     finally:
         answer.set()

@@ -79,12 +79,12 @@ def test_scripts_can_be_run() -> None:
 
 def test_docker_page_names_every_option_label_and_metric() -> None:
     from rosproxy_operator.cli import main
-    from rosproxy_operator.common.metrics import Metrics
+    from rosproxy_operator.common.metrics import DockerMetrics
     from rosproxy_operator.docker.planner.label_values import LABELS
 
     text = (ROOT / "docs/docker.md").read_text()
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
-    metrics = [family.name for family in Metrics().registry.collect()]
+    metrics = [family.name for family in DockerMetrics().registry.collect()]
     wanted = [*options, *LABELS, *(name for name in metrics if not name.startswith("process_"))]
     assert not [word for word in wanted if word not in text]
 

@@ -1,4 +1,4 @@
-"""A controller's own endpoint: /healthz, /readyz, /metrics."""
+"""The operator's own endpoint: /healthz, /readyz, /metrics."""
 
 from collections.abc import Callable
 

@@ -151,7 +151,7 @@ class Executor:
             problems = [await self._group(group, carry_out) for group in groups]
         except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
             log.exception("work for %s failed", key)
-            return Problem(_subject(key), f"the controller failed: {error!r}")
+            return Problem(_subject(key), f"the operator failed: {error!r}")
         return next((problem for problem in problems if problem), None)
 
     def _failed(self, key: Key | None, actions: tuple[Action, ...], problem: Problem) -> None:

@@ -13,8 +13,8 @@ import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
+from rosproxy.admin.requests import PortProbe, RangeProbe
 from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
@@ -64,38 +64,32 @@ class _Trial:
         return self.masters.encode() in seen or self.mine.encode() in seen
 
 
-async def probe_range(context: Context, leases: Leases) -> dict[str, Any]:
+async def probe_range(context: Context, leases: Leases) -> RangeProbe:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
-
-    ``probes`` holds for each its ``port``, the ``advertised`` address and two outcomes.
-    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
-    on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
-    master's call did not arrive) or unknown (the master could not be asked).
 
     The second port is left out where the master misses the first: rosmaster calls back from three
     threads, and each call into a void holds one for as long as TCP tries, two minutes.
     """
     pool, ports = context.registry.pool, context.settings.ports.listen.ports()
-    probes: list[dict[str, Any]] = []
+    probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
         async with leases.lent(order) as port:
             if port is None:
                 break
             probes.append(await _try(context, _Trial(port, context.addressing.outside(port))))
-        if probes[0]["from_master"] == "missed" or pool.free == 1:
+        if probes[0].from_master == "missed" or pool.free == 1:
             break
-    return {"probes": probes}
+    return RangeProbe(tuple(probes))
 
 
-async def _try(context: Context, trial: _Trial) -> dict[str, Any]:
-    result = {"port": trial.port, "advertised": str(trial.where)}
+async def _try(context: Context, trial: _Trial) -> PortProbe:
     acceptor = Acceptor(context.tasks, context.bank.open(trial.port), trial.greet)
     try:
         mine, masters = await asyncio.gather(_dial(context, trial), _ask_master(context, trial))
     finally:
         acceptor.stop()
         context.bank.close(trial.port, acceptor.sock)
-    return {**result, "from_proxy": mine, "from_master": masters}
+    return PortProbe(trial.port, str(trial.where), mine, masters)
 
 
 async def _dial(context: Context, trial: _Trial) -> str:
@@ -153,16 +147,18 @@ async def _ask_master(context: Context, trial: _Trial) -> str:
 async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
     name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(trial.where)
-    batch = context.upstream.batch
+    multicall = context.upstream.multicall
     try:
-        done = await batch(
+        done = await multicall(
             [("subscribeParam", [name, uri, name]), ("setParam", [CALLER_ID, name, True])]
         )
         if None in done:
             raise Unreachable("the master refused a call")
         yield
     finally:
-        await batch([("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])])
+        await multicall(
+            [("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])]
+        )
 
 
 def _reply(secret: str) -> bytes:

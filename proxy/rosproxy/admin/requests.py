@@ -1,112 +1,138 @@
-"""The bodies of the admin endpoint's POST calls, read and checked."""
+"""The bodies of the admin endpoint's POST calls, and of their answers.
+
+Each body is a type; it is made from decoded JSON, or a BodyError says in one line which field is
+wrong and what it must be. Addresses come out in their plain form and host names in lower case.
+"""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
+
+import msgspec
 
 from rosproxy.net.addresses import parse_address
+from rosproxy.telemetry.text import clean, shorten
 
+Body = TypeVar("Body", bound=msgspec.Struct)
 _NAME = re.compile(r"[\w.-]{1,253}")
+_LONGEST = 150
+"""Characters of a message: it repeats what was sent."""
 
 
 class BodyError(ValueError):
     """A body that can't be used; the message names the field and says what it must be."""
 
-    def __init__(self, field: str, problem: str) -> None:
-        super().__init__(f"{field}: {problem}")
+
+class Nothing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The body of ``POST /probe`` and ``POST /retire``: none, or an empty object."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
+class MasterAddress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The body of ``POST /master-address``: where the master is looked for from now on."""
+
+    address: str
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "address", _address("address", self.address))
+
+
+class Arrival(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A container on an inside network: its IP address there, and the host names it goes by."""
 
     address: str
     names: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            if not _NAME.fullmatch(name):
+                raise ValueError(f"names: must be host names, not {name[:40]!r}")
+        msgspec.structs.force_setattr(self, "address", _address("address", self.address))
+        msgspec.structs.force_setattr(self, "names", frozenset(map(str.lower, self.names)))
 
     def is_called(self, host: str) -> bool:
         """Whether a host name or address in a URI may mean this container."""
         return host == self.address or host.lower() in self.names
 
 
-@dataclass(frozen=True, slots=True)
-class ContainerNews:
-    """What has become of containers.
+class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The body of ``POST /containers``: what has become of containers.
 
     ``gone``: addresses that no container has any more. ``moved``: old address to new address.
     ``arrived``: containers that may have nodes which registered before the proxy was there.
     """
 
     gone: tuple[str, ...] = ()
-    moved: Mapping[str, str] = field(default_factory=dict)
+    moved: dict[str, str] = {}
     arrived: tuple[Arrival, ...] = ()
 
+    def __post_init__(self) -> None:
+        gone = tuple(_address(f"gone[{i}]", each) for i, each in enumerate(self.gone))
+        moved = {
+            _address("moved", old): _address(f"moved[{old[:40]!r}]", new)
+            for old, new in self.moved.items()
+        }
+        msgspec.structs.force_setattr(self, "gone", gone)
+        msgspec.structs.force_setattr(self, "moved", moved)
 
-def read_news(body: Any) -> ContainerNews:
+
+class PortProbe(msgspec.Struct, frozen=True):
+    """How a port of the range was reached, by the proxy itself and by the master.
+
+    ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
+    on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
+    master's call did not arrive) or unknown (the master could not be asked).
+    """
+
+    port: int = 0
+    advertised: str = ""
+    from_proxy: str = ""
+    from_master: str = ""
+
+
+class RangeProbe(msgspec.Struct, frozen=True):
+    """The answer to ``POST /probe``."""
+
+    probes: tuple[PortProbe, ...] = ()
+
+
+def read_news(body: object) -> ContainerNews:
     """The body of ``POST /containers``. Raises BodyError."""
-    fields = _object("the body", body, ("gone", "moved", "arrived"))
-    moved = _object("moved", fields.get("moved", {}))
-    return ContainerNews(
-        gone=tuple(_address(f"gone[{i}]", a) for i, a in _listed("gone", fields)),
-        moved=dict(_move(old, new) for old, new in moved.items()),
-        arrived=tuple(_arrival(f"arrived[{i}]", a) for i, a in _listed("arrived", fields)),
-    )
+    return _read(body, ContainerNews)
 
 
-def read_master_address(body: Any) -> str:
+def read_master_address(body: object) -> str:
     """The body of ``POST /master-address``: the address. Raises BodyError."""
-    return _address("address", _object("the body", body, ("address",)).get("address"))
+    return _read(body, MasterAddress).address
 
 
-def read_nothing(body: Any) -> None:
-    """The body of a call that takes none: nothing, or an empty object. Raises BodyError."""
-    _object("the body", body, ("",))
+def read_nothing(body: object) -> None:
+    """The body of a call that takes none. Raises BodyError."""
+    _read(body, Nothing)
 
 
-def _move(old: str, new: Any) -> tuple[str, str]:
-    return _address("moved", old), _address(f"moved[{old[:40]!r}]", new)
+def read_probe(answer: object) -> RangeProbe:
+    """The answer to ``POST /probe``; an empty one if it is of no use."""
+    try:
+        return msgspec.convert(answer, RangeProbe)
+    except msgspec.ValidationError:
+        return RangeProbe()
 
 
-def _arrival(field: str, body: Any) -> Arrival:
-    fields = _object(field, body, ("address", "names"))
-    names = [_name(f"{field}.names[{i}]", n) for i, n in _listed("names", fields, field)]
-    return Arrival(_address(f"{field}.address", fields.get("address")), frozenset(names))
+def _read(body: object, kind: type[Body]) -> Body:
+    try:
+        return msgspec.convert(body, kind)
+    except msgspec.ValidationError as error:
+        wrong, _, path = str(error).partition(" - at `$")
+        where = path.removeprefix(".").removesuffix("`")
+        if error.__cause__ is None:  # msgspec's own, which does not begin with a field
+            known = "" if where else f"; known: {', '.join(kind.__struct_fields__) or 'none'}"
+            text = f"{where or 'the body'}: {wrong}" + (known if "unknown field" in wrong else "")
+        else:
+            text = f"{where}.{wrong}" if where else wrong
+        raise BodyError(shorten(clean(text), _LONGEST)) from None
 
 
-def _object(field: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A JSON object; only with ``known`` fields, unless that is empty."""
-    if not isinstance(value, dict):
-        raise BodyError(field, f"must be a JSON object, not {_kind(value)}")
-    unknown = [name for name in value if known and name not in known]
-    if unknown:
-        allowed = ", ".join(filter(None, known)) or "none"
-        raise BodyError(field, f"unknown field {unknown[0][:40]!r}; known: {allowed}")
-    return value
-
-
-def _listed(name: str, fields: Mapping[str, Any], where: str = "") -> list[tuple[int, Any]]:
-    value = fields.get(name, [])
-    if not isinstance(value, list):
-        raise BodyError(f"{where}.{name}".lstrip("."), f"must be a list, not {_kind(value)}")
-    return list(enumerate(value))
-
-
-def _address(field: str, value: Any) -> str:
-    address = parse_address(value) if isinstance(value, str) else None
+def _address(field: str, text: str) -> str:
+    address = parse_address(text)
     if address is None:
-        raise BodyError(field, f"must be an IP address such as 172.18.0.5, not {_kind(value)}")
+        raise ValueError(f"{field}: must be an IP address such as 172.18.0.5, not {text[:40]!r}")
     return address
-
-
-def _name(field: str, value: Any) -> str:
-    if not isinstance(value, str) or not _NAME.fullmatch(value):
-        raise BodyError(field, f"must be a host name, not {_kind(value)}")
-    return value.lower()
-
-
-def _kind(value: Any) -> str:
-    """How a message names a value: text is quoted, the rest is told by its type."""
-    if isinstance(value, str):
-        return repr(value[:40])
-    kinds = {dict: "an object", list: "a list", bool: "true or false", type(None): "null"}
-    return kinds.get(type(value), "a number")

@@ -1,6 +1,8 @@
-"""The admin endpoint: health, readiness, metrics, status, and what a controller tells.
+"""The admin endpoint: health, readiness, metrics, status, and what an operator tells the proxy.
 
-It is on loopback by default. GET is open to whoever reaches it; POST changes things.
+GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default. POST
+changes things: it is for callers on loopback that are no web page, and for those that know the
+token. What a POST does is given as an action by its path; calls of one path wait for each other.
 """
 
 import asyncio
@@ -21,7 +23,7 @@ from rosproxy.ros1.clients.master import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
-GREETING = "rosproxy: /healthz /readyz /metrics /status\n"
+INDEX = "rosproxy: /healthz /readyz /metrics /status\n"
 MAX_BODY = 1024 * 1024
 """Longest body in bytes of a POST."""
 FORBIDDEN = (
@@ -34,10 +36,10 @@ Action = Callable[[Any], Awaitable[dict[str, Any]]]
 
 
 class AdminServer:
-    """Serves what operators, orchestrators and controllers ask.
+    """Serves what people, orchestrators and the operator ask.
 
-    ``ready`` gives None or the reason why not; ``actions`` are what paths do when something is
-    posted there, each one call at a time; ``token`` lets callers from elsewhere than loopback
+    ``unready`` gives the reason why the proxy is not ready, None if it is; ``actions`` are what
+    paths do when something is posted there; ``token`` lets callers from elsewhere than loopback
     post.
     """
 
@@ -45,25 +47,28 @@ class AdminServer:
         self,
         metrics: CollectorRegistry,
         status: Callable[[], dict[str, Any]],
-        ready: Callable[[], str | None],
+        unready: Callable[[], str | None],
         actions: Mapping[str, Action],
         token: str | None = None,
     ) -> None:
-        self._metrics, self._status, self._ready = metrics, status, ready
+        self._metrics, self._status, self._unready = metrics, status, unready
         self._actions, self._token = actions, token
         self._runner: web.AppRunner | None = None
-        self._turn: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
         app = web.Application(client_max_size=MAX_BODY)
-        app.router.add_get("/", self._greet)
-        app.router.add_get("/healthz", self._healthz)
-        app.router.add_get("/readyz", self._readyz)
-        app.router.add_get("/metrics", self._get_metrics)
-        app.router.add_get("/status", self._get_status)
-        for path in self._actions:
-            app.router.add_post(path, self._post)
+        app.add_routes(
+            [
+                web.get("/", self._get_index),
+                web.get("/healthz", self._get_health),
+                web.get("/readyz", self._get_readiness),
+                web.get("/metrics", self._get_metrics),
+                web.get("/status", self._get_status),
+                *(web.post(path, self._post) for path in self._actions),
+            ]
+        )
         self._runner = web.AppRunner(app, access_log=None)
         await self._runner.setup()
         await web.TCPSite(self._runner, where.host, where.port).start()
@@ -73,14 +78,14 @@ class AdminServer:
         if self._runner is not None:
             await self._runner.cleanup()
 
-    async def _greet(self, request: web.Request) -> web.Response:
-        return web.Response(text=GREETING)
+    async def _get_index(self, request: web.Request) -> web.Response:
+        return web.Response(text=INDEX)
 
-    async def _healthz(self, request: web.Request) -> web.Response:
+    async def _get_health(self, request: web.Request) -> web.Response:
         return web.Response(text="ok\n")
 
-    async def _readyz(self, request: web.Request) -> web.Response:
-        reason = self._ready()
+    async def _get_readiness(self, request: web.Request) -> web.Response:
+        reason = self._unready()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
     async def _get_metrics(self, request: web.Request) -> web.Response:
@@ -91,12 +96,12 @@ class AdminServer:
         return web.json_response(self._status())
 
     async def _post(self, request: web.Request) -> web.Response:
-        if not self._may(request):
+        if not self._may_post(request):
             hint = "" if self._token else "; this proxy has none"
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
-            body = _parsed(await request.read())
-            async with self._turn[request.path]:
+            body = _parse_json(await request.read())
+            async with self._locks[request.path]:
                 return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
             return web.Response(status=400, text=f"rosproxy: {error}\n")
@@ -104,7 +109,7 @@ class AdminServer:
             log.warning("POST %s could not be carried out: %s", request.path, error)
             return web.Response(status=503, text=f"rosproxy: {error}; try again\n")
 
-    def _may(self, request: web.Request) -> bool:
+    def _may_post(self, request: web.Request) -> bool:
         """Whether a caller may post.
 
         A browser on this host is on loopback too; it says on behalf of which page it calls.
@@ -116,9 +121,9 @@ class AdminServer:
         return is_loopback(request.remote or "") and "Origin" not in request.headers
 
 
-def _parsed(body: bytes) -> Any:
+def _parse_json(body: bytes) -> Any:
     """A body as JSON; an empty object if there is none. Raises BodyError."""
     try:
         return json.loads(body) if body.strip() else {}
     except (ValueError, RecursionError) as error:
-        raise BodyError("the body", f"must be JSON: {error}") from None
+        raise BodyError(f"the body: must be JSON: {error}") from None

@@ -7,9 +7,13 @@ no say in how a container asks itself.
 import http.client
 import json
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rosproxy.net.addresses import HostPort, parse_host_port
+
+if TYPE_CHECKING:
+    from rosproxy.admin.requests import RangeProbe
+    from rosproxy.admin.status_document import ProxyStatus
 
 DEFAULT_URL = "http://127.0.0.1:11312"
 MAX_REPLY = 64 * 1024 * 1024
@@ -39,13 +43,21 @@ class AdminClient:
         """The text at a path; ``within`` bounds each wait in seconds. Raises AdminError."""
         return self._ask("GET", path, within)
 
-    def status(self) -> dict[str, Any]:
-        """What ``/status`` says. Raises AdminError."""
-        return self._json(self._ask("GET", "/status", 5.0), "settings")
+    def status_json(self) -> dict[str, Any]:
+        """What ``/status`` says, as it says it. Raises AdminError."""
+        return self._json(self.get("/status"), "settings")
 
-    def probe(self) -> dict[str, Any]:
+    def status(self) -> "ProxyStatus":
+        """What ``/status`` says. Raises AdminError."""
+        from rosproxy.admin.status_document import read_status  # noqa: PLC0415 - health starts fast
+
+        return read_status(self.status_json())
+
+    def probe(self) -> "RangeProbe":
         """Let the proxy find out whether its range can be reached. Raises AdminError."""
-        return self._json(self._ask("POST", "/probe", 20.0), "probes")
+        from rosproxy.admin.requests import read_probe  # noqa: PLC0415
+
+        return read_probe(self._json(self._ask("POST", "/probe", 20.0), "probes"))
 
     def _ask(self, method: str, path: str, within: float) -> str:
         connection = http.client.HTTPConnection(self.where.host, self.where.port, timeout=within)
@@ -64,7 +76,7 @@ class AdminClient:
     def _json(self, text: str, key: str) -> dict[str, Any]:
         try:
             found = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict) or key not in found:
             raise AdminError(f"what answers at {self.url} is not the admin endpoint of a rosproxy")

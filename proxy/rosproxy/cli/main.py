@@ -293,7 +293,7 @@ def doctor(
     something is.
     """
     from rosproxy.cli.doctor import examine
-    from rosproxy.doctor.collect import Patient
+    from rosproxy.doctor.collect import DoctorOptions
     from rosproxy.net.addresses import parse_address
     from rosproxy.ros1.protocol.uris import parse_slave_uri
 
@@ -304,10 +304,10 @@ def doctor(
     absolute = tuple(f"/{name.strip('/')}" for name in names)
     if master_address and parse_address(master_address) is None:
         raise click.UsageError(f"--master-address: {master_address!r} is not an IP address")
-    patient = Patient(
+    options = DoctorOptions(
         None if outside else admin, master_uri, advertise_host, absolute, master_address or None
     )
-    sys.exit(examine(patient, as_json))
+    sys.exit(examine(options, as_json))
 
 
 def _or_exit(ask: Callable[[], object]) -> None:

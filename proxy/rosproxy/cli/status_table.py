@@ -1,8 +1,21 @@
-"""``/status`` as text for people."""
+"""``/status`` as text for people: the proxy first, then a table of the nodes behind it.
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+Below each node's row stand its topics, services and connections. A narrow terminal gets the nodes'
+addresses in lines of their own; a short one (``--watch``) loses the details first. Everything that
+nodes say of themselves passes through `clean`.
+"""
 
+from collections.abc import Iterator, Sequence
+
+from rosproxy.admin.status_document import (
+    AliasPortStatus,
+    ConnectionStatus,
+    DataPlaneStatus,
+    MasterStatus,
+    NodePlaneStatus,
+    NodeStatus,
+    ProxyStatus,
+)
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import (
     GAP,
@@ -16,9 +29,6 @@ from rosproxy.telemetry.text import (
     wrap,
 )
 
-Status = Mapping[str, Any]
-"""What ``/status`` returns."""
-
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
 LEAST_NAME = 20
 """Columns for names; where the addresses leave less, they get a line of their own."""
@@ -26,11 +36,9 @@ MOST_LINES = 3
 """Lines that the topics, services or connections of one node may take, each."""
 MOST_CONNECTIONS = 8
 INDENT = "    "
-NO_PLANE = {"connections": 0, "sent_rate": 0.0, "received_rate": 0.0}
-"""What counts for a node of a proxy that tells nothing of the kernel."""
 
 
-def render(status: Status, columns: int, lines: int | None = None) -> str:
+def render(status: ProxyStatus, columns: int, lines: int | None = None) -> str:
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
@@ -43,57 +51,57 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     return "\n".join(short)
 
 
-def _head(status: Status) -> Iterator[str]:
-    settings = status["settings"]
-    up = f", up {duration(status['uptime'])}" if "uptime" in status else ""
-    yield f"rosproxy {clean(status['version'])}, pid {status['pid']}{up}"
-    yield f"master   {_master(status['master'])}"
+def _head(status: ProxyStatus) -> Iterator[str]:
+    settings = status.settings
+    up = duration(status.uptime)
+    yield f"rosproxy {clean(status.version)}, pid {status.pid}, up {up}"
+    yield f"master   {_master(status.master)}"
     yield f"ports    {_ports(status)}"
-    if plane := status.get("data_plane"):
+    if plane := status.data_plane:
         yield f"topics   {_plane(plane)}"
-    networks = listed(map(clean, settings["inside_networks"])) or "none"
+    networks = listed(map(clean, settings.inside_networks)) or "none"
     yield (
-        f"inside   ROS_MASTER_URI=http://<this host>:{settings['master_port']}, networks {networks}"
+        f"inside   ROS_MASTER_URI=http://<this host>:{settings.master_port}, networks {networks}"
     )
-    if mirrored := status.get("mirrored"):
+    if mirrored := status.mirrored:
         yield f"mirrored {_mirrored(mirrored)}"
-    if settings["publish_master"]:
-        host = clean(settings["advertise_host"])
-        yield f"outside  ROS_MASTER_URI=http://{host}:{settings['publish_master']}"
+    if settings.publish_master:
+        host = clean(settings.advertise_host)
+        yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
 
 
-def _master(master: Status) -> str:
-    uri, since = clean(master["uri"]), duration(master["since"])
-    if master["up"]:
-        trip = f", round trip {master['round_trip'] * 1000:.1f} ms" if master["round_trip"] else ""
-        return f"{uri} up for {since}{trip} (pid {master['pid']})"
-    if not master["error"]:
+def _master(master: MasterStatus) -> str:
+    uri, since = clean(master.uri), duration(master.since)
+    if master.up:
+        trip = f", round trip {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
+        return f"{uri} up for {since}{trip} (pid {master.pid})"
+    if not master.error:
         return f"{uri} not asked yet"
-    return f"{uri} DOWN for {since}: {clean(master['error']).removeprefix(f'master {uri}: ')}"
+    return f"{uri} DOWN for {since}: {clean(master.error).removeprefix(f'master {uri}: ')}"
 
 
-def _ports(status: Status) -> str:
-    ports, host = status["ports"], clean(status["settings"]["advertise_host"])
-    outside = f"{host}:{ports['advertise']}"
-    mapped = "" if ports["advertise"] == ports["listen"] else f", here {ports['listen']}"
-    blocked = f", {ports['blocked']} held by other programs" if ports["blocked"] else ""
-    return f"{outside}{mapped}: {ports['used']} used, {ports['free']} free{blocked}"
+def _ports(status: ProxyStatus) -> str:
+    ports, host = status.ports, clean(status.settings.advertise_host)
+    listen, advertise = clean(ports.listen), clean(ports.advertise)
+    mapped = "" if advertise == listen else f", here {listen}"
+    blocked = f", {ports.blocked} held by other programs" if ports.blocked else ""
+    return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
 
 
-def _plane(plane: Status) -> str:
-    if plane["plane"] == "kernel":
-        return f"forwarded by the kernel (--data-plane {clean(plane['mode'])})"
-    return f"relayed by the proxy ({clean(plane['plane'])}): {clean(plane['reason'])}"
+def _plane(plane: DataPlaneStatus) -> str:
+    if plane.plane == "kernel":
+        return f"forwarded by the kernel (--data-plane {clean(plane.mode)})"
+    return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _mirrored(ports: Sequence[Status]) -> str:
-    open_ones = plural(sum(port["connections"] for port in ports), "connection")
-    numbers = listed(str(port["port"]) for port in ports)
+def _mirrored(ports: Sequence[AliasPortStatus]) -> str:
+    open_ones = plural(sum(port.connections for port in ports), "connection")
+    numbers = listed(str(port.port) for port in ports)
     return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
 
 
-def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:
-    nodes = status["nodes"]
+def _nodes(status: ProxyStatus, columns: int, details: bool) -> Iterator[str]:
+    nodes = status.nodes
     if not nodes:
         yield "No node has registered through the proxy yet."
         return
@@ -107,63 +115,63 @@ def _nodes(status: Status, columns: int, details: bool) -> Iterator[str]:
     for node, line in zip(nodes, lines, strict=True):
         yield line
         if narrow:
-            yield from _detail("at", f"{clean(node['address'])}, outside {_outside(node)}", columns)
+            yield from _detail("at", f"{clean(node.address)}, outside {_outside(node)}", columns)
         if details:
             yield from _details(node, columns)
-            yield from _detail("kernel", _kernel(node, status.get("data_plane")), columns)
+            yield from _detail("kernel", _kernel(node, status.data_plane), columns)
 
 
-def _row(node: Status) -> tuple[str, ...]:
-    names = [clean(name) for name in node["nodes"]] or ["(unnamed)"]
-    plane = node.get("data_plane") or NO_PLANE
-    connections = [*node["connections"], plane]
-    count = len(node["connections"]) + plane["connections"]
+def _row(node: NodeStatus) -> tuple[str, ...]:
+    names = [clean(name) for name in node.nodes] or ["(unnamed)"]
+    plane = node.data_plane or NodePlaneStatus()
+    connections = [*node.connections, plane]
+    count = len(node.connections) + plane.connections
     out, into = (
-        f"{size(sum(c[key] for c in connections))}/s" if count else "-"
+        f"{size(sum(getattr(c, key) for c in connections))}/s" if count else "-"
         for key in ("sent_rate", "received_rate")
     )
     return (
         names[0] + (f" +{len(names) - 1}" if len(names) > 1 else ""),
-        clean(node["address"]),
+        clean(node.address),
         _outside(node),
-        clean(node["state"]),
-        *(str(len(node[key])) for key in ("publishes", "subscribes", "services")),
+        clean(node.state),
+        *(str(len(each)) for each in (node.publishes, node.subscribes, node.services)),
         str(count),
         out,
         into,
     )
 
 
-def _outside(node: Status) -> str:
-    return clean(parse_slave_uri(node["advertised_uri"]) or node["advertised_uri"])
+def _outside(node: NodeStatus) -> str:
+    return clean(parse_slave_uri(node.advertised_uri) or node.advertised_uri)
 
 
-def _details(node: Status, columns: int) -> Iterator[str]:
+def _details(node: NodeStatus, columns: int) -> Iterator[str]:
     for word, names in (
-        ("also", node["nodes"][1:]),
-        ("publishes", node["publishes"]),
-        ("subscribes", node["subscribes"]),
-        ("services", node["services"]),
-        ("parameters", node["parameters"]),
+        ("also", node.nodes[1:]),
+        ("publishes", node.publishes),
+        ("subscribes", node.subscribes),
+        ("services", node.services),
+        ("parameters", node.parameters),
     ):
         yield from _detail(word, GAP.join(map(clean, names)), columns)
-    connections = node["connections"]
+    connections = node.connections
     for connection in connections[:MOST_CONNECTIONS]:
         yield from _detail("connected", _connection(connection), columns)
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
 
 
-def _kernel(node: Status, whole: Status | None) -> str:
+def _kernel(node: NodeStatus, whole: DataPlaneStatus | None) -> str:
     """What the kernel forwards for a node; why nothing, where it does for others."""
-    plane = node.get("data_plane")
-    if plane is None or whole is None or whole["plane"] != "kernel":
+    plane = node.data_plane
+    if plane is None or whole is None or whole.plane != "kernel":
         return ""
-    used = f"{plural(plane['connections'], 'connection')} through port {plane['port']}"
-    moved = f"{size(plane['sent'])} out, {size(plane['received'])} in as IP packets"
-    if plane["plane"] == "kernel":
+    used = f"{plural(plane.connections, 'connection')} through port {plane.port}"
+    moved = f"{size(plane.sent)} out, {size(plane.received)} in as IP packets"
+    if plane.plane == "kernel":
         return f"{used}: {moved}"
-    return f"not used: {clean(plane['reason'])}"
+    return f"not used: {clean(plane.reason)}"
 
 
 def _detail(word: str, text: str, columns: int) -> list[str]:
@@ -171,17 +179,17 @@ def _detail(word: str, text: str, columns: int) -> list[str]:
     return wrap(text, columns, " " * len(lead), lead, MOST_LINES)
 
 
-def _connection(connection: Status) -> str:
-    what = f"{clean(connection['kind'])} {clean(connection['name'])}"
-    who = f"{clean(connection['caller_id']) or '?'} at {clean(connection['peer'])}"
-    return f"{what} with {who}: {size(connection['sent'])} out, {size(connection['received'])} in"
+def _connection(connection: ConnectionStatus) -> str:
+    what = f"{clean(connection.kind)} {clean(connection.name)}"
+    who = f"{clean(connection.caller_id) or '?'} at {clean(connection.peer)}"
+    return f"{what} with {who}: {size(connection.sent)} out, {size(connection.received)} in"
 
 
-def _problems(status: Status, columns: int) -> Iterator[str]:
+def _problems(status: ProxyStatus, columns: int) -> Iterator[str]:
     """All problems but the master's, which its own line tells."""
-    problems = [problem for problem in status["problems"] if problem["subject"] != "master"]
+    problems = [problem for problem in status.problems if problem.subject != "master"]
     if problems:
         yield from ("", "problems (rosproxy doctor looks into them):")
     for problem in problems:
-        text = f"{clean(problem['subject'])}: {clean(problem['text'])}"
-        yield from wrap(f"{duration(problem['age'])} ago  {text}", columns, INDENT, "  ")
+        text = f"{clean(problem.subject)}: {clean(problem.text)}"
+        yield from wrap(f"{duration(problem.age)} ago  {text}", columns, INDENT, "  ")

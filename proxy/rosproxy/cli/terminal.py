@@ -1,9 +1,23 @@
-"""Showing things on the terminal: the status, once or again and again."""
+"""The terminal: a text printed once, or drawn again and again (``--watch``).
 
+rich finds out what standard output is: a terminal gets colours for the words that matter, unless
+NO_COLOR is set, and ``--watch`` its own screen there; a pipe or a file gets the bare text. What the
+encoding lacks is escaped. Nothing in a text is markup.
+"""
+
+import io
 import json
 import shutil
 import sys
 import time
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+
+from rich.console import Console
+from rich.highlighter import RegexHighlighter
+from rich.live import Live
+from rich.text import Text
+from rich.theme import Theme
 
 from rosproxy.cli.admin_client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
@@ -11,47 +25,80 @@ from rosproxy.cli.status_table import render
 WATCH_INTERVAL = 2.0
 """Seconds between two drawings; the proxy measures rates as often."""
 WIDTH_WITHOUT_TERMINAL = 120
-_HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
+
+
+class _Words(RegexHighlighter):
+    """The words of our own that say how things are."""
+
+    base_style = "rosproxy."
+    highlights = (
+        r"(?m)^(?P<heading>(NODE|PROXY|CONTAINER) .*)$",
+        r"(?m)^(?P<good>ok)   ",
+        r"(?m)(?P<bad>^ERROR\b|\bDOWN\b|^problems\b.*$)",
+        r"(?m)^(?P<warning>WARNING)\b",
+    )
+
+
+_THEME = Theme(
+    {
+        "rosproxy.heading": "bold",
+        "rosproxy.good": "green",
+        "rosproxy.bad": "bold red",
+        "rosproxy.warning": "yellow",
+    }
+)
 
 
 def show_status(admin: AdminClient, as_json: bool) -> None:
     """Print the status once. Raises AdminError."""
-    status = admin.status()
-    columns, _ = size()
-    write(json.dumps(status, indent=2) if as_json else render(status, columns))
+    if as_json:
+        write(json.dumps(admin.status_json(), indent=2))
+    else:
+        write(render(admin.status(), size()[0]))
 
 
 def watch_status(admin: AdminClient) -> None:
     """Draw the status again and again until interrupted, also while no proxy answers."""
-    try:
+
+    def draw(columns: int, lines: int | None) -> str:
+        try:
+            return render(admin.status(), columns, lines)
+        except AdminError as error:
+            return f"{time.strftime('%H:%M:%S')} {error}"
+
+    watch(draw)
+
+
+def watch(draw: Callable[[int, int | None], str]) -> None:
+    """Show what ``draw`` returns for so many columns and lines, anew each time, until Ctrl-C."""
+    console = _console()
+    live = Live(console=console, screen=True, auto_refresh=False)
+    with suppress(KeyboardInterrupt), live if console.is_terminal else nullcontext():
         while True:
-            columns, lines = size()
-            try:
-                text = render(admin.status(), columns, lines)
-            except AdminError as error:
-                text = f"{time.strftime('%H:%M:%S')} {error}"
-            draw(text)
+            text = _coloured(draw(*size()))
+            if console.is_terminal:
+                live.update(text, refresh=True)
+            else:
+                console.print(text, "", sep="\n", soft_wrap=True)
             time.sleep(WATCH_INTERVAL)
-    except KeyboardInterrupt:
-        write("")
 
 
 def write(text: str) -> None:
-    """Print a line; what the terminal's encoding lacks is escaped."""
-    encoding = sys.stdout.encoding or "utf-8"
-    sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
-    sys.stdout.flush()
-
-
-def draw(text: str) -> None:
-    """Draw over the last drawing where that is possible, without flicker."""
-    if not sys.stdout.isatty():
-        write(text + "\n")
-        return
-    write(_HOME + text.replace("\n", f"{_CLEAR_LINE}\n") + _CLEAR_LINE + _CLEAR_BELOW)
+    """Print a text; lines that are too long stay whole."""
+    _console().print(_coloured(text), soft_wrap=True)
 
 
 def size() -> tuple[int, int | None]:
     """Columns and lines to use; as many lines as needed where there is no terminal."""
     columns, lines = shutil.get_terminal_size((WIDTH_WITHOUT_TERMINAL, 0))
-    return columns, lines - 1 if sys.stdout.isatty() and lines > 5 else None
+    return columns, lines if sys.stdout.isatty() and lines > 5 else None
+
+
+def _coloured(text: str) -> Text:
+    return _Words()(Text(text))
+
+
+def _console() -> Console:
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    return Console(theme=_THEME, markup=False, highlight=False, emoji=False)

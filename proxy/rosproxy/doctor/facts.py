@@ -1,11 +1,17 @@
-"""What the doctor has gathered, before any judgement."""
+"""What the doctor has gathered, before any judgement.
+
+`rosproxy.doctor.collect` fills in a `DoctorFacts`, and the rules read it. What could not be found
+out is None, empty or ``UNTRIED``: rules say nothing about it. `scope` finds out which nodes and
+which pairs of publisher and subscriber the names mean that the user asked for.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
-from typing import Any
 
+from rosproxy.admin.requests import RangeProbe
+from rosproxy.admin.status_document import NodeStatus, ProxyStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -36,7 +42,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Master:
+class MasterFacts:
     """The master as the doctor found it.
 
     ``at_root``: it does answer at the path ``/``. ``looped``: what answers is this very proxy.
@@ -51,7 +57,7 @@ class Master:
 
 
 @dataclass(frozen=True, slots=True)
-class Words:
+class SlaveReport:
     """What a node says of itself: topics with types, and its connections.
 
     ``peers`` are (direction, topic, peer) of open connections, the direction ``i`` or ``o``; the
@@ -64,10 +70,10 @@ class Words:
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class NodeFacts:
     """A node that the master knows.
 
-    ``uri`` is what the master says, empty if it says nothing. ``words`` are only there for nodes
+    ``uri`` is what the master says, empty if it says nothing. A ``report`` is only there for nodes
     that were asked for and could be asked.
     """
 
@@ -75,7 +81,7 @@ class Node:
     uri: str = ""
     addresses: tuple[str, ...] = ()
     attempt: Attempt = Attempt()
-    words: Words | None = None
+    report: SlaveReport | None = None
 
     @property
     def where(self) -> HostPort | None:
@@ -84,7 +90,7 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
-class Graph:
+class SystemState:
     """The master's state: who publishes, subscribes to and provides what."""
 
     publishers: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -126,7 +132,7 @@ class Scope:
     nodes: frozenset[str] = frozenset()
 
 
-def scope(graph: Graph, names: Sequence[str]) -> Scope:
+def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     """Resolve names of nodes, topics and services.
 
     One node means all of its topics (without ``/rosout``, which every node has), several nodes
@@ -160,7 +166,7 @@ def _asked_for(pair: set[str], nodes: set[str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Facts:
+class DoctorFacts:
     """Everything gathered.
 
     ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status``
@@ -173,15 +179,15 @@ class Facts:
 
     admin: str = ""
     admin_error: str = ""
-    status: Mapping[str, Any] | None = None
-    probe: Mapping[str, Any] | None = None
+    status: ProxyStatus | None = None
+    probe: RangeProbe | None = None
     probe_error: str = ""
-    master: Master | None = None
+    master: MasterFacts | None = None
     advertise_host: str = ""
     advertised_addresses: tuple[str, ...] = ()
     published_master: Attempt = Attempt()
-    graph: Graph | None = None
-    nodes: Mapping[str, Node] = field(default_factory=dict)
+    graph: SystemState | None = None
+    nodes: Mapping[str, NodeFacts] = field(default_factory=dict)
     service_uris: Mapping[str, str] = field(default_factory=dict)
     services: Mapping[str, Attempt] = field(default_factory=dict)
     clock: bool = False
@@ -191,14 +197,14 @@ class Facts:
     @cached_property
     def scope(self) -> Scope:
         """What the names asked for lead to."""
-        return scope(self.graph or Graph(), self.names)
+        return scope(self.graph or SystemState(), self.names)
 
     @cached_property
-    def leases(self) -> dict[int, Mapping[str, Any]]:
+    def leases(self) -> dict[int, NodeStatus]:
         """The nodes of ``status`` by the port that outside sees."""
         if self.status is None:
             return {}
-        found = ((parse_slave_uri(n["advertised_uri"]), n) for n in self.status["nodes"])
+        found = ((parse_slave_uri(n.advertised_uri), n) for n in self.status.nodes)
         return {where.port: node for where, node in found if where}
 
     @cached_property
@@ -206,8 +212,8 @@ class Facts:
         """The range of ports that outside sees, if the proxy could be asked."""
         if self.status is None:
             return None
-        first, _, last = self.status["ports"]["advertise"].partition("-")
-        return PortRange(int(first), int(last))
+        first, _, last = self.status.ports.advertise.partition("-")
+        return PortRange(int(first), int(last)) if first.isdecimal() and last.isdecimal() else None
 
     def ours(self, where: HostPort | None) -> bool:
         """Whether an address from the master is one that this proxy gives to inside nodes."""

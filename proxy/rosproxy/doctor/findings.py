@@ -22,7 +22,7 @@ class Severity(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class DoctorFinding:
     """One result: of which ``check``, about which ``subject``, what, and what mends it."""
 
     severity: Severity
@@ -32,18 +32,18 @@ class Finding:
     fix: str = ""
 
 
-def failed(findings: Sequence[Finding]) -> bool:
+def failed(findings: Sequence[DoctorFinding]) -> bool:
     """Whether anything is wrong."""
     return any(finding.severity is Severity.ERROR for finding in findings)
 
 
-def as_json(findings: Sequence[Finding]) -> dict[str, Any]:
+def as_json(findings: Sequence[DoctorFinding]) -> dict[str, Any]:
     """The findings as plain data."""
     rows = [{**asdict(f), "severity": f.severity.name.lower()} for f in findings]
     return {"ok": not failed(findings), "findings": rows}
 
 
-def render(findings: Sequence[Finding], columns: int) -> str:
+def render(findings: Sequence[DoctorFinding], columns: int) -> str:
     """The findings as text, the worst last, where the eye is when the command has ended."""
     lines: list[str] = []
     for severity in Severity:
@@ -51,9 +51,9 @@ def render(findings: Sequence[Finding], columns: int) -> str:
     return "\n".join([*lines, "", _summary(findings)])
 
 
-def _grouped(findings: Sequence[Finding], columns: int) -> Iterator[str]:
+def _grouped(findings: Sequence[DoctorFinding], columns: int) -> Iterator[str]:
     """Findings of one kind that are mended alike stand together, and what mends them once."""
-    alike: dict[tuple[str, str], list[Finding]] = {}
+    alike: dict[tuple[str, str], list[DoctorFinding]] = {}
     for finding in findings:
         alike.setdefault((finding.check, finding.fix), []).append(finding)
     for (check, fix), group in alike.items():
@@ -64,7 +64,7 @@ def _grouped(findings: Sequence[Finding], columns: int) -> Iterator[str]:
         yield from wrap(clean(fix), columns, f"{INDENT}  ", f"{INDENT}> ")
 
 
-def _block(finding: Finding, columns: int) -> list[str]:
+def _block(finding: DoctorFinding, columns: int) -> list[str]:
     subject = f"{clean(finding.subject)}: " if finding.subject else ""
     first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
     return wrap(subject + clean(finding.text), columns, INDENT, first)
@@ -78,7 +78,7 @@ _WORDS = {
 }
 
 
-def _summary(findings: Sequence[Finding]) -> str:
+def _summary(findings: Sequence[DoctorFinding]) -> str:
     errors, warnings = (
         sum(f.severity is severity for f in findings)
         for severity in (Severity.ERROR, Severity.WARNING)

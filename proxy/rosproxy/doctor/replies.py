@@ -3,26 +3,26 @@
 from collections.abc import Iterator
 from typing import Any
 
-from rosproxy.doctor.facts import Graph, Words
+from rosproxy.doctor.facts import SlaveReport, SystemState
 from rosproxy.net.addresses import HostPort
 
 
-def graph(state: Any) -> Graph:
+def system_state(state: Any) -> SystemState:
     """The reply to ``getSystemState``: publishers, subscribers, services."""
     tables = [
         {name: [str(node) for node in nodes] for name, nodes in _pairs(rows, list)}
         for rows in _items(state)[:3]
     ]
-    return Graph(*tables)
+    return SystemState(*tables)
 
 
-def words(publications: Any, subscriptions: Any, bus: Any) -> Words:
+def slave_report(publications: Any, subscriptions: Any, bus: Any) -> SlaveReport:
     """The replies to ``getPublications``, ``getSubscriptions`` and ``getBusInfo``.
 
     A row of the last is ``[id, peer, direction, transport, topic, connected, ...]``.
     """
     rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5 and row[5]]
-    return Words(
+    return SlaveReport(
         dict(_pairs(publications, str)),
         dict(_pairs(subscriptions, str)),
         frozenset((str(row[2]), str(row[4]), str(row[1])) for row in rows),

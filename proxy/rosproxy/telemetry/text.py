@@ -1,13 +1,26 @@
-"""Text for a terminal: harmless whatever it holds, and as wide as it looks."""
+"""Text for a terminal: harmless whatever it holds, and as wide as it looks.
 
+Pure functions from values to text and to lines; `rosproxy.cli.terminal` prints them. Names of nodes
+and topics are whatever a node says they are, so that `clean` comes before everything else. rich
+knows how wide characters are and lays tables out; texts are given to it as ``Text``, in which
+nothing is markup.
+"""
+
+import io
 import textwrap
-import unicodedata
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+
+from rich.cells import cell_len
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 GAP = "  "
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _UNITS = ("B", "kB", "MB", "GB", "TB")
+_CONSOLE = Console(file=io.StringIO(), color_system=None, width=80, height=25, legacy_windows=False)
+"""Lays out and prints nothing."""
 
 
 def clean(text: object) -> str:
@@ -20,9 +33,7 @@ def clean(text: object) -> str:
 
 def width(text: str) -> int:
     """How many columns a clean text takes: East Asian characters two, combining marks none."""
-    if text.isascii():
-        return len(text)
-    return sum(_columns(c) for c in text)
+    return cell_len(text)
 
 
 def shorten(text: str, most: int) -> str:
@@ -32,12 +43,6 @@ def shorten(text: str, most: int) -> str:
     room = max(most - 1, 0)
     tail = _head(text[::-1], room // 2)[::-1]
     return f"{_head(text, room - width(tail))}…{tail}"
-
-
-def pad(text: str, columns: int, right: bool = False) -> str:
-    """The text filled up with spaces, on its left if it is to stand ``right``."""
-    space = " " * (columns - width(text))
-    return space + text if right else text + space
 
 
 def wrap(
@@ -66,9 +71,14 @@ def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
     The first ``left`` cells stand left, the others right. The first cell gets ``room`` columns at
     most and is shortened where it has more.
     """
-    widths = [max(map(width, cells)) for cells in zip(*rows, strict=True)]
-    widths[0] = min(widths[0], room)
-    return [_line(row, widths, left) for row in rows]
+    grid = Table.grid(padding=(0, len(GAP), 0, 0))
+    for index in range(len(rows[0])):
+        grid.add_column(justify="left" if index < left else "right", no_wrap=True)
+    for name, *cells in rows:
+        grid.add_row(Text(shorten(name, room)), *map(Text, cells))
+    wide = _CONSOLE.options.update_width(room + besides_first(rows))
+    lines = _CONSOLE.render_lines(grid, wide)
+    return ["".join(segment.text for segment in line).rstrip() for line in lines]
 
 
 def besides_first(rows: Sequence[Sequence[str]]) -> int:
@@ -108,28 +118,15 @@ def listed(items: Iterable[str], most: int = 5) -> str:
     return ", ".join(every[:most]) + (f" and {more} more" if more > 0 else "")
 
 
-def _columns(character: str) -> int:
-    if unicodedata.combining(character):
-        return 0
-    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
-
-
 def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
 def _head(text: str, room: int) -> str:
+    """As much of a text as fits."""
     end = 0
     for end, character in enumerate(text):
-        room -= _columns(character)
+        room -= width(character)
         if room < 0:
             return text[:end]
     return text
-
-
-def _line(row: Sequence[str], widths: Sequence[int], left: int) -> str:
-    cells = [
-        pad(shorten(cell, columns), columns, right=index >= left)
-        for index, (cell, columns) in enumerate(zip(row, widths, strict=True))
-    ]
-    return GAP.join(cells).rstrip()

@@ -62,16 +62,16 @@ async def test_health_and_readiness_follow_the_master(
 ) -> None:
     await master.stop()
     proxy = await make_proxy()
-    await until(lambda: proxy.app._watch.error, "the master was missed")
+    await until(lambda: proxy.app.master_monitor.error, "the master was missed")
     code, text = await ask(proxy, "/readyz")
     assert code == 503
     assert text.startswith(f"master {master.uri}: ")
     assert await ask(proxy, "/healthz") == (200, "ok\n")
     await master.start()
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     assert await ask(proxy, "/readyz") == (200, "ok\n")
     await master.stop()
-    await until(lambda: not proxy.app._watch.up, "the master was missed again")
+    await until(lambda: not proxy.app.master_monitor.up, "the master was missed again")
     assert (await ask(proxy, "/readyz"))[0] == 503
     assert await ask(proxy, "/healthz") == (200, "ok\n")
 

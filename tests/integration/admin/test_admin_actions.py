@@ -108,12 +108,16 @@ BAD = [
     ("/containers", "nonsense", "the body: must be JSON"),
     ("/containers", "[" * 100_000, "the body: must be JSON"),
     ("/containers", "1" * 10_000, "the body: must be JSON"),
-    ("/containers", "[]", "the body: must be a JSON object, not a list"),
+    ("/containers", "[]", "the body: Expected `object`, got `array`"),
     ("/containers", '{"gone": ["x"]}', "gone[0]: must be an IP address"),
     ("/containers", '{"moved": {"a": "b"}}', "moved: must be an IP address"),
-    ("/containers", '{"arrived": [{"names": []}]}', "arrived[0].address: must be an IP address"),
-    ("/containers", '{"gone": [], "left": []}', "the body: unknown field 'left'"),
-    ("/retire", '{"x": 1}', "the body: unknown field 'x'; known: none"),
+    (
+        "/containers",
+        '{"arrived": [{"names": []}]}',
+        "arrived[0]: Object missing",
+    ),
+    ("/containers", '{"gone": [], "left": []}', "the body: Object contains unknown field `left`"),
+    ("/retire", '{"x": 1}', "the body: Object contains unknown field `x`; known: none"),
 ]
 
 
@@ -390,9 +394,9 @@ async def test_retiring(
         assert triple[0] == -1
         assert "retired" in triple[1]
     assert await tell(proxy, "/retire") == {"unregistered": 0}
-    await proxy.app._watch.look()
-    await proxy.app._watch._restore_lost()
-    await proxy.app._keeper.look()
+    await proxy.app.master_monitor.look()
+    await proxy.app.registrar.register_lost()
+    await proxy.app.prober.look()
     assert not everything(master)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)
     ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
@@ -405,7 +409,7 @@ async def test_retiring_waits_for_registrations_under_way(
     import asyncio
 
     proxy = await make_proxy(**PATIENT)
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     master.delay = 0.3
     registering = asyncio.create_task(node.publish(proxy.master))
     await until(lambda: len(proxy.app.context.registry), "it is admitted")

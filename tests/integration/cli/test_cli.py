@@ -230,7 +230,8 @@ async def test_watch_draws_until_interrupted(proxy: Proxy, node: FakeNode) -> No
         await proxy.stop()
         await until(lambda: "no rosproxy answers" in screen.read(), "the proxy was missed")
         assert await screen.interrupt() == 0
-    assert screen.text.startswith("\x1b[H")
+    assert "\x1b[?1049h" in screen.text  # a screen of its own, which is left again
+    assert "\x1b[?1049l" in screen.text
     assert "Traceback" not in screen.text
 
 
@@ -263,7 +264,7 @@ async def test_health_starts_fast() -> None:
     """Docker runs it every few seconds: it must not load the proxy's own machinery."""
     code = (
         "import sys; sys.argv = ['rosproxy', 'health', '--admin', '127.0.0.1:1']\n"
-        "from rosproxy.cli import main\n"
+        "from rosproxy.cli.main import main\n"
         "try: main()\n"
         "except SystemExit: pass\n"
         "heavy = {'aiohttp', 'asyncio', 'prometheus_client', 'urllib.request'}\n"

@@ -277,7 +277,7 @@ async def test_it_ends_in_2_seconds_although_a_name_server_hangs(start_process, 
         "    if host.endswith('.invalid'): time.sleep(30)\n"
         "    return real(host, *a, **k)\n"
         "socket.getaddrinfo = hang\n"
-        "from rosproxy.cli import main; sys.argv = ['rosproxy', *sys.argv[4:]]; main()"
+        "from rosproxy.cli.main import main; sys.argv = ['rosproxy', *sys.argv[4:]]; main()"
     )
     process: Process = start_process(prefix=[sys.executable, "-c", slow])
     node = await make_node(host="nowhere.invalid")

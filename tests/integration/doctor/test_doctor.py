@@ -11,8 +11,8 @@ from rosproxy.cli.admin_client import AdminClient
 from rosproxy.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
 from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode, Header
-from rosproxy.doctor.collect import Patient, survey
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.collect import DoctorOptions, collect
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import diagnose
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.commands import admin_url, run
@@ -48,19 +48,19 @@ async def register(
     await rpc(master.uri, method, node.name, topic, "std_msgs/String", node.uri)
 
 
-async def examine(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[Finding]:
+async def examine(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[DoctorFinding]:
     """All findings."""
     admin = AdminClient(admin_url(proxy)) if proxy else None
-    return diagnose(await survey(Patient(admin, master_uri, "", names)))
+    return diagnose(await collect(DoctorOptions(admin, master_uri, "", names)))
 
 
-async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[Finding]:
+async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[DoctorFinding]:
     """The findings that are more than notes."""
     found = await examine(proxy, *names, master_uri=master_uri)
     return [f for f in found if f.severity >= Severity.WARNING]
 
 
-async def only(proxy: Proxy | None, *names: str, master_uri: str = "") -> Finding:
+async def only(proxy: Proxy | None, *names: str, master_uri: str = "") -> DoctorFinding:
     """The one fault."""
     (found,) = await faults(proxy, *names, master_uri=master_uri)
     return found
@@ -280,7 +280,7 @@ async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
     listener: FakeNode, master: FakeMaster
 ) -> None:
     found = diagnose(
-        await survey(Patient(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
+        await collect(DoctorOptions(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
     )
     errors = {f.check for f in found if f.severity is Severity.ERROR}
     assert errors == {"admin", "pair"}

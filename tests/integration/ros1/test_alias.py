@@ -370,13 +370,13 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
             taken.listen()
         await look_up(proxy, robot)
         await look_up_service(proxy)
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert set(problems(proxy)) == {robot.uri, robot.service_api}
         await robot.stop()
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert set(problems(proxy)) == {robot.service_api}
         monkeypatch.setattr("rosproxy.ros1.alias.alias.SERVICE_PROBLEM", 0.0)
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert problems(proxy) == {}
 
 
@@ -511,5 +511,5 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
         assert await caller.outcome() in _CLOSED
     assert await refuses(slave(robot), NODE)
     assert await refuses(service(robot), OTHER_NODE)
-    await proxy.app._mirror.hand_over([robot.uri])
+    await proxy.app.alias.listen_for([robot.uri])
     assert await refuses(slave(robot), NODE)

@@ -8,7 +8,7 @@ from rosproxy.cli.admin_client import AdminClient
 from rosproxy.demo.fake_http import where
 from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode
-from rosproxy.doctor.collect import Patient, survey
+from rosproxy.doctor.collect import DoctorOptions, collect
 from rosproxy.doctor.facts import Reach
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
@@ -44,7 +44,7 @@ async def test_the_name_is_not_resolved_but_told(
 
 
 async def test_without_it_the_status_tells_where_the_name_led(proxy: Proxy) -> None:
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     found = await master_status(proxy)
     assert (found["address"], found["pinned"]) == (MASTER, False)
 
@@ -54,7 +54,7 @@ async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: FakeMaste
     port = where(master.uri)[1]
     await master.start("127.0.0.1")
     proxy = await make_proxy(master_uri=f"http://localhost:{port}")
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     assert (await master_status(proxy))["address"] in ("127.0.0.1", "::1")
 
 
@@ -65,9 +65,9 @@ async def test_the_master_moves(
     await node.publish(proxy.master)
     await master.stop()
     await master.start(ELSEWHERE)
-    await until(lambda: not proxy.app._watch.up, "the master is missed")
+    await until(lambda: not proxy.app.master_monitor.up, "the master is missed")
     assert await tell(proxy, "/master-address", address=ELSEWHERE) == {"address": ELSEWHERE}
-    await until(lambda: proxy.app._watch.up, "the master is found again")
+    await until(lambda: proxy.app.master_monitor.up, "the master is found again")
     assert (await master_status(proxy))["address"] == ELSEWHERE
     late = await make_node("/late")
     assert (await late.publish(proxy.master))[0] == 1
@@ -131,7 +131,7 @@ async def test_the_doctor_asks_the_master_at_its_address(
     on_its_host = await make_node("/on_robot", MASTER, NAME)
     await on_its_host.publish(where(master.uri))
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
-    facts = await survey(Patient(AdminClient(admin_url(proxy))))
+    facts = await collect(DoctorOptions(AdminClient(admin_url(proxy))))
     assert facts.master is not None
     assert (facts.master.addresses, facts.master.attempt.reach) == ((MASTER,), Reach.ANSWERED)
     assert facts.nodes["/on_robot"].addresses == (MASTER,)
@@ -139,8 +139,8 @@ async def test_the_doctor_asks_the_master_at_its_address(
 
 
 async def test_the_doctor_without_a_proxy_is_told_the_address(master: FakeMaster) -> None:
-    patient = Patient(AdminClient("127.0.0.1:9"), uri_by_name(master), master_address=MASTER)
-    facts = await survey(patient)
+    options = DoctorOptions(AdminClient("127.0.0.1:9"), uri_by_name(master), master_address=MASTER)
+    facts = await collect(options)
     assert facts.admin_error
     assert facts.master is not None
     assert facts.master.attempt.reach is Reach.ANSWERED

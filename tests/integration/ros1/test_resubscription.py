@@ -37,7 +37,7 @@ AFTERWARDS = 11
 @pytest.fixture(autouse=True)
 def _early(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resubscriber, "LOOKS", LOOKS)
-    monkeypatch.setattr(app, "SILENT_TICK", 0.05)
+    monkeypatch.setattr(app, "RESUBSCRIBE_TICK", 0.05)
 
 
 @pytest.fixture

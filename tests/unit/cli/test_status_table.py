@@ -4,13 +4,18 @@ from typing import Any
 
 import pytest
 
+from rosproxy.admin.status_document import read_status
 from rosproxy.cli.status_table import render
 from rosproxy.telemetry.text import width
 from tests.unit.status_json import make_connection, make_node, make_status
 
 
+def shown(status: dict[str, Any], columns: int, lines: int | None = None) -> str:
+    return render(read_status(status), columns, lines)
+
+
 def lines_of(*nodes: dict[str, Any], columns: int = 120, **parts: Any) -> list[str]:
-    return render(make_status(*nodes, **parts), columns).split("\n")
+    return shown(make_status(*nodes, **parts), columns).split("\n")
 
 
 def test_head_of_a_proxy_without_nodes() -> None:
@@ -40,12 +45,12 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
 def test_head_names_mirrored_ports() -> None:
     status = make_status()
     status["mirrored"] = []
-    assert "mirrored" not in render(status, 120)
+    assert "mirrored" not in shown(status, 120)
     status["mirrored"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
     assert (
         "mirrored 7 ports of nodes on the master's host (14 connections): "
         "40001, 40002, 40003, 40004, 40005 and 2 more"
-    ) in render(status, 120).split("\n")
+    ) in shown(status, 120).split("\n")
 
 
 @pytest.mark.parametrize(
@@ -142,7 +147,7 @@ def test_names_cannot_reach_the_terminal() -> None:
         connections=[make_connection(caller_id=evil, name=evil, kind=evil, peer=evil)],
         address=evil,
     )
-    text = render(
+    text = shown(
         make_status(
             node,
             problems=[{"age": 1.0, "subject": evil, "text": evil}],
@@ -156,7 +161,7 @@ def test_names_cannot_reach_the_terminal() -> None:
 def test_a_short_screen_shows_problems_before_nodes() -> None:
     problem = {"age": 1.0, "subject": "/talker", "text": "gone"}
     nodes = [make_node(f"/node_{number}", 45000 + number) for number in range(20)]
-    text = render(make_status(*nodes, problems=[problem]), 120, lines=12)
+    text = shown(make_status(*nodes, problems=[problem]), 120, lines=12)
     lines = text.split("\n")
     assert len(lines) == 12
     assert "  1.0 s ago  /talker: gone" in lines
@@ -166,7 +171,7 @@ def test_a_short_screen_shows_problems_before_nodes() -> None:
 
 def test_a_screen_that_is_long_enough_shows_details() -> None:
     status = make_status(make_node())
-    assert render(status, 120, lines=50) == render(status, 120)
+    assert shown(status, 120, lines=50) == shown(status, 120)
 
 
 def a_plane(**changes: Any) -> dict[str, Any]:
@@ -186,7 +191,7 @@ def a_plane(**changes: Any) -> dict[str, Any]:
 def planes(*nodes: dict[str, Any], **whole: str) -> str:
     status = make_status(*nodes)
     status["data_plane"] = {"mode": "auto", "plane": "kernel", "reason": ""} | whole
-    return render(status, 120)
+    return shown(status, 120)
 
 
 def test_the_kernels_connections_count_as_the_proxys_own() -> None:

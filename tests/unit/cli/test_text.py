@@ -11,7 +11,6 @@ from rosproxy.telemetry.text import (
     clean,
     duration,
     listed,
-    pad,
     plural,
     shorten,
     size,
@@ -73,12 +72,6 @@ def test_shortened_text_fits(text: str, most: int) -> None:
     cleaned = clean(text)
     shown = shorten(cleaned, most)
     assert width(shown) <= most
-    assert width(pad(shown, most)) == most
-
-
-def test_pad_stands_left_or_right() -> None:
-    assert pad("節", 4) == "節  "
-    assert pad("節", 4, right=True) == "  節"
 
 
 def test_wrap_keeps_words_whole_and_bounds_lines() -> None:

@@ -3,8 +3,18 @@
 from collections.abc import Iterable
 from typing import Any
 
-from rosproxy.doctor.facts import Attempt, Facts, Graph, Master, Node, Reach, Words
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.admin.requests import read_probe
+from rosproxy.admin.status_document import read_status
+from rosproxy.doctor.facts import (
+    Attempt,
+    DoctorFacts,
+    MasterFacts,
+    NodeFacts,
+    Reach,
+    SlaveReport,
+    SystemState,
+)
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from tests.unit.status_json import HOST, make_node, make_status
 
 ANSWERED = Attempt(Reach.ANSWERED)
@@ -13,10 +23,10 @@ OUTSIDE_URI = "http://192.168.0.9:35001/"
 PROBE = {"port": 45001, "advertised": f"{HOST}:45001", "from_proxy": "ok", "from_master": "ok"}
 
 
-def make_master(reach: Reach = Reach.ANSWERED, reason: str = "", **changes: Any) -> Master:
+def make_master(reach: Reach = Reach.ANSWERED, reason: str = "", **changes: Any) -> MasterFacts:
     """The real master."""
     known = {"uri": "http://robot:11311", "addresses": ("192.168.0.1",), "round_trip": 0.002}
-    return Master(attempt=Attempt(reach, reason), **{**known, **changes})
+    return MasterFacts(attempt=Attempt(reach, reason), **{**known, **changes})
 
 
 def probes(*outcomes: tuple[str, str]) -> dict[str, Any]:
@@ -35,7 +45,7 @@ def probes(*outcomes: tuple[str, str]) -> dict[str, Any]:
     }
 
 
-def make_facts(**changes: Any) -> Facts:
+def make_facts(**changes: Any) -> DoctorFacts:
     """A talker inside and a listener outside, both sound."""
     known: dict[str, Any] = {
         "admin": "http://127.0.0.1:11312",
@@ -44,38 +54,45 @@ def make_facts(**changes: Any) -> Facts:
         "master": make_master(),
         "advertise_host": HOST,
         "advertised_addresses": ("192.168.0.2",),
-        "graph": Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener"]}, {}),
+        "graph": SystemState({"/chatter": ["/talker"]}, {"/chatter": ["/listener"]}, {}),
         "nodes": by_name(talker(), listener()),
     }
-    return Facts(**{**known, **changes})
+    given = {**known, **changes}
+    if given["status"] is not None:
+        given["status"] = read_status(given["status"])
+    if given["probe"] is not None:
+        given["probe"] = read_probe(given["probe"])
+    return DoctorFacts(**given)
 
 
-def without_proxy(**changes: Any) -> Facts:
+def without_proxy(**changes: Any) -> DoctorFacts:
     """The same where the admin endpoint can't be asked."""
     return make_facts(
         **{"status": None, "probe": None, "admin_error": "no rosproxy answers", **changes}
     )
 
 
-def by_name(*nodes: Node) -> dict[str, Node]:
+def by_name(*nodes: NodeFacts) -> dict[str, NodeFacts]:
     """Nodes by their names."""
     return {node.name: node for node in nodes}
 
 
-def talker(**changes: Any) -> Node:
+def talker(**changes: Any) -> NodeFacts:
     """The node behind the proxy."""
-    words = Words({"/chatter": "std_msgs/String"}, {}, frozenset({("o", "/chatter", "/listener")}))
-    return Node(**{"name": "/talker", "uri": INSIDE_URI, "words": words, **changes})
+    report = SlaveReport(
+        {"/chatter": "std_msgs/String"}, {}, frozenset({("o", "/chatter", "/listener")})
+    )
+    return NodeFacts(**{"name": "/talker", "uri": INSIDE_URI, "report": report, **changes})
 
 
-def listener(**changes: Any) -> Node:
+def listener(**changes: Any) -> NodeFacts:
     """The node outside."""
-    words = Words({}, {"/chatter": "std_msgs/String"})
+    report = SlaveReport({}, {"/chatter": "std_msgs/String"})
     known = {"name": "/listener", "uri": OUTSIDE_URI, "addresses": ("192.168.0.9",)}
-    return Node(**{**known, "attempt": ANSWERED, "words": words, **changes})
+    return NodeFacts(**{**known, "attempt": ANSWERED, "report": report, **changes})
 
 
-def only(findings: Iterable[Finding], severity: Severity = Severity.WARNING) -> Finding:
+def only(findings: Iterable[DoctorFinding], severity: Severity = Severity.WARNING) -> DoctorFinding:
     """The one finding that is at least so bad."""
     (found,) = [f for f in findings if f.severity >= severity]
     return found

@@ -1,13 +1,13 @@
 """How findings are shown."""
 
-from rosproxy.doctor.findings import Finding, Severity, as_json, failed, render
+from rosproxy.doctor.findings import DoctorFinding, Severity, as_json, failed, render
 from rosproxy.doctor.rules import diagnose
 from tests.unit.doctor.cases import make_facts
 
-OK = Finding(Severity.OK, "ports", "ports", "100 free")
-NOTE = Finding(Severity.INFO, "node", "nodes", "3 registered")
-WARNING = Finding(Severity.WARNING, "time", "", "no clock", "rosparam set")
-ERROR = Finding(Severity.ERROR, "node", "/talker", "gone", "rosnode cleanup")
+OK = DoctorFinding(Severity.OK, "ports", "ports", "100 free")
+NOTE = DoctorFinding(Severity.INFO, "node", "nodes", "3 registered")
+WARNING = DoctorFinding(Severity.WARNING, "time", "", "no clock", "rosparam set")
+ERROR = DoctorFinding(Severity.ERROR, "node", "/talker", "gone", "rosnode cleanup")
 
 
 def test_a_sound_system_gives_no_errors() -> None:
@@ -59,7 +59,9 @@ def test_as_json() -> None:
 
 
 def test_many_of_a_kind_are_counted() -> None:
-    many = [Finding(Severity.ERROR, "stale", f"/node_{n}", "gone", "cleanup") for n in range(300)]
+    many = [
+        DoctorFinding(Severity.ERROR, "stale", f"/node_{n}", "gone", "cleanup") for n in range(300)
+    ]
     lines = render(many, 80).split("\n")
     assert lines[9:12] == [
         "ERROR    /node_9: gone",
@@ -70,11 +72,11 @@ def test_many_of_a_kind_are_counted() -> None:
 
 
 def test_names_cannot_reach_the_terminal() -> None:
-    evil = Finding(Severity.ERROR, "node", "\x1b[2J", "\x1b]0;owned\x07\r", "\u202ehcum os")
+    evil = DoctorFinding(Severity.ERROR, "node", "\x1b[2J", "\x1b]0;owned\x07\r", "\u202ehcum os")
     assert all(line.isprintable() for line in render([evil], 80).split("\n"))
 
 
 def test_commands_are_not_torn_apart() -> None:
     command = "docker run -p 45000-45099:45000-45099"
-    text = render([Finding(Severity.ERROR, "range", "range", "x " * 60, command)], 30)
+    text = render([DoctorFinding(Severity.ERROR, "range", "range", "x " * 60, command)], 30)
     assert "45000-45099:45000-45099" in text

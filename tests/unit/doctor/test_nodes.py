@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.doctor.facts import Attempt, Facts, Graph, Node, Reach
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach, SystemState
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import node as node_rules
 from tests.unit.doctor.cases import (
     ANSWERED,
@@ -23,20 +23,20 @@ from tests.unit.status_json import make_node, make_status
 REFUSED = Attempt(Reach.REFUSED)
 
 
-def check(facts: Facts) -> list[Finding]:
+def check(facts: DoctorFacts) -> list[DoctorFinding]:
     return [*node_rules.check(facts)]
 
 
-def faults(facts: Facts) -> list[Finding]:
+def faults(facts: DoctorFacts) -> list[DoctorFinding]:
     return [f for f in check(facts) if f.severity >= Severity.WARNING]
 
 
-def inside(**changes: Any) -> Finding:
+def inside(**changes: Any) -> DoctorFinding:
     """The finding on a node behind the proxy."""
     return only(check(make_facts(status=make_status(make_node(**changes)))))
 
 
-def outside(**changes: Any) -> Finding:
+def outside(**changes: Any) -> DoctorFinding:
     """The finding on a node that the master knows."""
     return only(check(make_facts(nodes=by_name(listener(**changes)))))
 
@@ -109,7 +109,7 @@ def test_two_nodes_of_one_name() -> None:
 
 
 def test_a_registration_with_a_port_that_nobody_holds() -> None:
-    nodes = by_name(Node("/old", "http://robot-host:45007/10.0.0.9:4/"))
+    nodes = by_name(NodeFacts("/old", "http://robot-host:45007/10.0.0.9:4/"))
     found = only(check(make_facts(nodes=nodes)))
     assert (found.check, found.subject) == ("stale registration", "/old")
     assert "a port that no node holds any more" in found.text
@@ -117,13 +117,13 @@ def test_a_registration_with_a_port_that_nobody_holds() -> None:
 
 
 def test_a_registration_with_a_port_that_another_node_holds() -> None:
-    nodes = by_name(Node("/old", "http://robot-host:45000/10.0.0.9:4/"))
+    nodes = by_name(NodeFacts("/old", "http://robot-host:45000/10.0.0.9:4/"))
     assert "a port that /talker holds by now" in only(check(make_facts(nodes=nodes))).text
 
 
 def test_nodes_that_share_a_lease_are_sound() -> None:
     status = make_status(make_node(nodes=["/manager", "/talker"]))
-    nodes = by_name(talker(), Node("/manager", INSIDE_URI))
+    nodes = by_name(talker(), NodeFacts("/manager", INSIDE_URI))
     assert not faults(make_facts(status=status, nodes=nodes))
 
 
@@ -202,7 +202,7 @@ def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
 
 
 def test_a_service_with_a_port_that_nobody_holds() -> None:
-    graph = Graph({}, {}, {"/add": ["/listener"], "/other": ["/listener"]})
+    graph = SystemState({}, {}, {"/add": ["/listener"], "/other": ["/listener"]})
     uris = {"/add": "rosrpc://robot-host:45009", "/other": "rosrpc://192.168.0.9:4"}
     found = only(check(make_facts(graph=graph, service_uris=uris)))
     assert (found.subject, found.check) == ("/listener", "stale registration")
@@ -211,14 +211,14 @@ def test_a_service_with_a_port_that_nobody_holds() -> None:
 
 def test_simulated_time_without_a_clock() -> None:
     assert "nobody publishes /clock" in only(check(make_facts(clock=True))).text
-    graph = Graph({"/clock": ["/talker"]}, {}, {})
+    graph = SystemState({"/clock": ["/talker"]}, {}, {})
     assert not faults(make_facts(clock=True, graph=graph))
 
 
 def test_names_leave_out_what_is_said_of_others() -> None:
     nodes = by_name(talker(), listener(), listener(name="/dead", attempt=REFUSED))
     assert not check(make_facts(nodes=nodes, names=("/chatter",)))
-    graph = Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener", "/dead"]}, {})
+    graph = SystemState({"/chatter": ["/talker"]}, {"/chatter": ["/listener", "/dead"]}, {})
     facts = make_facts(nodes=nodes, names=("/chatter",), graph=graph)
     assert [f.subject for f in check(facts)] == ["/dead"]
 

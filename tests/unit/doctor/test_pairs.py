@@ -5,8 +5,16 @@ from typing import Any
 
 import pytest
 
-from rosproxy.doctor.facts import Attempt, Facts, Graph, Node, Reach, Words, scope
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.facts import (
+    Attempt,
+    DoctorFacts,
+    NodeFacts,
+    Reach,
+    SlaveReport,
+    SystemState,
+    scope,
+)
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import pair as pair_rules
 from tests.unit.doctor.cases import (
     INSIDE_URI,
@@ -20,18 +28,18 @@ from tests.unit.doctor.cases import (
 from tests.unit.status_json import make_connection, make_node, make_status
 
 STRING = "std_msgs/String"
-GRAPH = Graph(
+GRAPH = SystemState(
     {"/chatter": ["/talker"], "/a": ["/listener"], "/b": ["/talker"], "/rosout": ["/talker"]},
     {"/chatter": ["/listener", "/other"], "/c": ["/other"], "/rosout": ["/rosout"]},
     {"/add": ["/adder"]},
 )
 
 
-def check(names: Sequence[str], **changes: Any) -> list[Finding]:
+def check(names: Sequence[str], **changes: Any) -> list[DoctorFinding]:
     return [*pair_rules.check(make_facts(names=tuple(names), **changes))]
 
 
-def apart(giver: Node, taker: Node, **changes: Any) -> Finding:
+def apart(giver: NodeFacts, taker: NodeFacts, **changes: Any) -> DoctorFinding:
     """The finding on a publisher and a subscriber that are not connected."""
     (found,) = check(["/chatter"], nodes=by_name(giver, taker), **changes)
     assert found.severity is Severity.ERROR
@@ -40,9 +48,9 @@ def apart(giver: Node, taker: Node, **changes: Any) -> Finding:
     return found
 
 
-def silent_talker(**changes: Any) -> Node:
+def silent_talker(**changes: Any) -> NodeFacts:
     """A publisher that nobody is connected to."""
-    return talker(**{"words": Words({"/chatter": STRING}), **changes})
+    return talker(**{"report": SlaveReport({"/chatter": STRING}), **changes})
 
 
 @pytest.mark.parametrize(
@@ -91,7 +99,7 @@ def test_a_name_that_nobody_knows() -> None:
 
 
 def test_a_name_without_its_namespace() -> None:
-    graph = Graph({"/robot1/scan": ["/talker"]}, {}, {})
+    graph = SystemState({"/robot1/scan": ["/talker"]}, {}, {})
     assert "there is /robot1/scan" in only(check(["/scan"], graph=graph)).text
 
 
@@ -99,29 +107,31 @@ def test_a_name_without_its_namespace() -> None:
     ("graph", "text"),
     [
         (
-            Graph({"/chatter": ["/talker"], "/ns/chatter": []}, {"/ns/chatter": ["/listener"]}),
+            SystemState(
+                {"/chatter": ["/talker"], "/ns/chatter": []}, {"/ns/chatter": ["/listener"]}
+            ),
             "published by /talker; nobody subscribes to it",
         ),
         (
-            Graph({"/ns/chatter": ["/talker"]}, {"/chatter": ["/listener"]}),
+            SystemState({"/ns/chatter": ["/talker"]}, {"/chatter": ["/listener"]}),
             "subscribed to by /listener; nobody publishes it",
         ),
     ],
 )
-def test_a_topic_with_one_side_only(graph: Graph, text: str) -> None:
+def test_a_topic_with_one_side_only(graph: SystemState, text: str) -> None:
     found = only(check(["/chatter"], graph=graph))
     assert found.text == text
     assert found.fix.startswith("there is also /ns/chatter: a namespace or remapping?")
 
 
 def test_the_lonely_topics_of_a_node_are_no_error() -> None:
-    graph = Graph({"/chatter": ["/talker"]}, {}, {})
+    graph = SystemState({"/chatter": ["/talker"]}, {}, {})
     (found,) = check(["/talker"], graph=graph)
     assert (found.subject, found.severity) == ("/chatter", Severity.INFO)
 
 
 def test_nodes_with_nothing_in_common() -> None:
-    graph = Graph({"/a": ["/talker"]}, {"/b": ["/listener"]}, {})
+    graph = SystemState({"/a": ["/talker"]}, {"/b": ["/listener"]}, {})
     found = only(check(["/talker", "/listener"], graph=graph))
     assert found.subject == "/talker and /listener"
     assert found.fix.startswith("compare: rosnode info /talker /listener")
@@ -129,7 +139,9 @@ def test_nodes_with_nothing_in_common() -> None:
 
 def test_a_topic_that_a_node_has_nothing_to_do_with() -> None:
     nodes = by_name(talker(), listener(), listener(name="/other"))
-    graph = Graph({"/chatter": ["/talker"]}, {"/chatter": ["/listener"], "/c": ["/other"]}, {})
+    graph = SystemState(
+        {"/chatter": ["/talker"]}, {"/chatter": ["/listener"], "/c": ["/other"]}, {}
+    )
     assert only(check(["/chatter", "/other"], graph=graph, nodes=nodes)).check == "pair"
 
 
@@ -144,41 +156,43 @@ def test_a_connected_pair_with_what_it_moves() -> None:
 
 def test_the_subscribers_word_counts_where_the_publisher_cannot_be_asked() -> None:
     peers = frozenset({("i", "/chatter", INSIDE_URI)})
-    nodes = by_name(talker(words=None), listener(words=Words({}, {"/chatter": STRING}, peers)))
+    nodes = by_name(
+        talker(report=None), listener(report=SlaveReport({}, {"/chatter": STRING}, peers))
+    )
     (found,) = check(["/chatter"], nodes=nodes)
     assert found.text == "connected"
 
 
 def test_the_publishers_word_counts_more() -> None:
     peers = frozenset({("i", "/chatter", INSIDE_URI)})
-    taker = listener(words=Words({}, {"/chatter": STRING}, peers))
+    taker = listener(report=SlaveReport({}, {"/chatter": STRING}, peers))
     apart(silent_talker(), taker)
 
 
 def test_a_node_that_cannot_be_reached() -> None:
     status = make_status(make_node(state="silent"))
     assert "/talker can't be reached" in apart(silent_talker(), listener(), status=status).text
-    taker = listener(attempt=Attempt(Reach.SILENT), words=None)
+    taker = listener(attempt=Attempt(Reach.SILENT), report=None)
     assert "/listener can't be reached" in apart(silent_talker(), taker).text
     gone = silent_talker(uri="http://robot-host:45050/10.0.0.9:1/")
     assert "/talker can't be reached" in apart(gone, listener()).text
 
 
 def test_nodes_that_deny_what_the_master_says() -> None:
-    giver = talker(words=Words())
+    giver = talker(report=SlaveReport())
     assert "/talker says that it does not publish it" in apart(giver, listener()).text
-    taker = listener(words=Words())
+    taker = listener(report=SlaveReport())
     assert "/listener says that it is not subscribed" in apart(silent_talker(), taker).text
 
 
 def test_types_that_differ() -> None:
-    taker = listener(words=Words({}, {"/chatter": "std_msgs/Int32"}))
+    taker = listener(report=SlaveReport({}, {"/chatter": "std_msgs/Int32"}))
     found = apart(silent_talker(), taker)
     assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
 
 
 def test_any_type_fits_all() -> None:
-    taker = listener(words=Words({}, {"/chatter": "*"}))
+    taker = listener(report=SlaveReport({}, {"/chatter": "*"}))
     assert "types differ" not in apart(silent_talker(), taker).text
 
 
@@ -188,7 +202,7 @@ def test_a_subscriber_outside_that_does_not_come() -> None:
     assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 
-def outside_pair(data_port: tuple[str, Attempt]) -> Finding:
+def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:
     """A publisher outside whose data port was tried."""
     giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
     ports = {("/talker", "/chatter"): data_port}
@@ -214,10 +228,10 @@ def test_what_is_left_is_the_message_definition() -> None:
     assert "md5sum" in found.text
 
 
-SERVICE_GRAPH = Graph({}, {}, {"/add": ["/talker"]})
+SERVICE_GRAPH = SystemState({}, {}, {"/add": ["/talker"]})
 
 
-def service(attempt: Attempt) -> Finding:
+def service(attempt: Attempt) -> DoctorFinding:
     """The finding on a service."""
     (found,) = check(
         ["/add"],
@@ -237,4 +251,4 @@ def test_services() -> None:
 
 
 def test_no_facts_at_all() -> None:
-    assert not [*pair_rules.check(Facts())]
+    assert not [*pair_rules.check(DoctorFacts())]

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.doctor.facts import Attempt, Facts, Reach
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import proxy as proxy_rules
 from tests.unit.doctor.cases import (
     make_facts,
@@ -17,11 +17,11 @@ from tests.unit.doctor.cases import (
 from tests.unit.status_json import make_node, make_status
 
 
-def check(facts: Facts) -> list[Finding]:
+def check(facts: DoctorFacts) -> list[DoctorFinding]:
     return [*proxy_rules.check(facts)]
 
 
-def of(check_name: str, facts: Facts) -> list[Finding]:
+def of(check_name: str, facts: DoctorFacts) -> list[DoctorFinding]:
     return [f for f in check(facts) if f.check == check_name]
 
 

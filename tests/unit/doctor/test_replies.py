@@ -4,19 +4,19 @@ from typing import Any
 
 import pytest
 
-from rosproxy.doctor.facts import Graph, Words
-from rosproxy.doctor.replies import data_port, graph, words
+from rosproxy.doctor.facts import SlaveReport, SystemState
+from rosproxy.doctor.replies import data_port, slave_report, system_state
 from rosproxy.net.addresses import HostPort
 
 
 def test_graph() -> None:
     state = [[["/t", ["/a", "/b"]]], [["/t", ["/c"]]], [["/s", ["/a"]]]]
-    assert graph(state) == Graph({"/t": ["/a", "/b"]}, {"/t": ["/c"]}, {"/s": ["/a"]})
+    assert system_state(state) == SystemState({"/t": ["/a", "/b"]}, {"/t": ["/c"]}, {"/s": ["/a"]})
 
 
 @pytest.mark.parametrize("state", [None, "x", 7, [], [1, 2, 3], [[["/t"]], [[1, []]], {}]])
 def test_a_broken_graph_is_an_empty_one(state: Any) -> None:
-    found = graph(state)
+    found = system_state(state)
     assert not found.topics
     assert not found.names()
 
@@ -29,10 +29,10 @@ def test_words() -> None:
         [4, "short"],
         "broken",
     ]
-    assert words([["/t", "T"], ["/x"], 3], [["/u", "U"]], bus) == Words(
+    assert slave_report([["/t", "T"], ["/x"], 3], [["/u", "U"]], bus) == SlaveReport(
         {"/t": "T"}, {"/u": "U"}, frozenset({("o", "/t", "/c"), ("i", "/u", "http://a:1/")})
     )
-    assert words(None, "x", 3) == Words()
+    assert slave_report(None, "x", 3) == SlaveReport()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a controller can do to a Docker host: data, carried out by `rosproxy_operator.docker.apply`.
+"""What the operator can do to a Docker host: data, carried out by `rosproxy_operator.docker.apply`.
 
 Containers are named, not numbered: a plan may start what it has yet to create.
 """

@@ -11,7 +11,7 @@ from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.masters import ALIAS
-from rosproxy_operator.docker.planner.model import Container, Desired, Key, Observed, Sandbox
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Sandbox
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 
 Aliases = Mapping[tuple[Key, str], tuple[str, ...]]
@@ -43,7 +43,7 @@ class _Claim:
         return (needed or [one.key for one in self.claimants])[0]
 
 
-def assign(desired: Iterable[Desired], observed: Observed) -> tuple[Aliases, tuple[Problem, ...]]:
+def assign(desired: Iterable[Desired], observed: HostState) -> tuple[Aliases, tuple[Problem, ...]]:
     """The names of the proxies that are wanted, and the containers that won't find theirs."""
     claims = [*_claims(sorted(desired, key=lambda one: one.key), observed)]
     given: dict[tuple[Key, str], tuple[str, ...]] = {}
@@ -57,9 +57,9 @@ def assign(desired: Iterable[Desired], observed: Observed) -> tuple[Aliases, tup
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
     """The containers of a proxy on a network that look for it by this name."""
     return tuple(
-        wish.container
-        for wish in desired.wishes
-        if network in wish.networks and wish.needs == alias
+        member.container
+        for member in desired.members
+        if network in member.networks and member.needs == alias
     )
 
 
@@ -78,7 +78,7 @@ def _names(key: Key) -> tuple[str, ...]:
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
 
 
-def _claims(desired: list[Desired], observed: Observed) -> Iterator[_Claim]:
+def _claims(desired: list[Desired], observed: HostState) -> Iterator[_Claim]:
     live = [one for one in desired if one.live]
     for network in sorted({name for one in live for name in one.networks}):
         there = [one for one in desired if network in one.networks]
@@ -86,7 +86,7 @@ def _claims(desired: list[Desired], observed: Observed) -> Iterator[_Claim]:
             yield _claim(network, alias, there, observed)
 
 
-def _claim(network: str, alias: str, there: list[Desired], observed: Observed) -> _Claim:
+def _claim(network: str, alias: str, there: list[Desired], observed: HostState) -> _Claim:
     others = [
         container.name
         for container in observed.containers

@@ -1,4 +1,4 @@
-"""Text for people: what a controller's host looks like, and what it would do.
+"""Text for people: what the operator's host looks like, and what it would do.
 
 Names of containers, networks and nodes are whatever their users say, so all are made harmless.
 """

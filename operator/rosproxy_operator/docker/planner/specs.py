@@ -12,8 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import DataPlane, SettingError, parse_range
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.docker.planner.model import Key
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -42,7 +41,7 @@ _SLUG = 30
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """What a container's labels say that this controller made. ``role`` is one of ``ROLE_…``."""
+    """What a container's labels say that this operator made. ``role`` is one of ``ROLE_…``."""
 
     role: str
     key: Key
@@ -86,7 +85,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
 
 
 def read_own(labels: Mapping[str, str]) -> Own | None:
-    """What the labels of a container of this controller say.
+    """What the labels of a container of this operator say.
 
     None if they are not those of one, or not whole.
     """

@@ -1,11 +1,10 @@
 """The names asked for: which publisher and subscriber are not connected, and why."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
-from typing import Any
 
-from rosproxy.doctor.facts import Attempt, Facts, Node, Reach
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, size
@@ -13,16 +12,16 @@ from rosproxy.telemetry.text import listed, size
 PAIR, ANY = "pair", "*"
 
 
-def check(facts: Facts) -> Iterator[Finding]:
+def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about the names asked for."""
     if facts.names and facts.graph is None:
         text = "nothing can be said: the master does not answer"
-        yield Finding(Severity.INFO, PAIR, ", ".join(facts.names), text)
+        yield DoctorFinding(Severity.INFO, PAIR, ", ".join(facts.names), text)
     elif facts.names:
         yield from _named(facts)
 
 
-def _named(facts: Facts) -> Iterator[Finding]:
+def _named(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
     yield from (_lonely(facts, topic) for topic in scope.lonely)
@@ -33,7 +32,7 @@ def _named(facts: Facts) -> Iterator[Finding]:
         yield _nothing_common(together)
 
 
-def _unknown(facts: Facts, name: str) -> Finding:
+def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
     graph = facts.graph
     known = sorted(graph.names() | graph.topics | {*graph.services}) if graph else []
     alike = get_close_matches(name, known, 3, 0.7)
@@ -41,10 +40,10 @@ def _unknown(facts: Facts, name: str) -> Finding:
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
     fix = "rosnode list; rostopic list; look for a namespace or a remapping too many"
-    return Finding(Severity.ERROR, PAIR, name, text, fix)
+    return DoctorFinding(Severity.ERROR, PAIR, name, text, fix)
 
 
-def _lonely(facts: Facts, topic: str) -> Finding:
+def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
     graph = facts.graph
     publishers = graph.publishers.get(topic, ()) if graph else ()
     sides = graph.sides(topic) if graph else ()
@@ -55,51 +54,53 @@ def _lonely(facts: Facts, topic: str) -> Finding:
     fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
     fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
     severity = Severity.ERROR if topic in facts.names else Severity.INFO
-    return Finding(severity, PAIR, topic, text, fix)
+    return DoctorFinding(severity, PAIR, topic, text, fix)
 
 
-def _nothing_common(names: Sequence[str]) -> Finding:
+def _nothing_common(names: Sequence[str]) -> DoctorFinding:
     text = "none publishes what another of them subscribes to"
     fix = f"compare: rosnode info {' '.join(names)}; look for namespaces and remappings"
-    return Finding(Severity.ERROR, PAIR, " and ".join(names), text, fix)
+    return DoctorFinding(Severity.ERROR, PAIR, " and ".join(names), text, fix)
 
 
-def _pair(facts: Facts, topic: str, publisher: str, subscriber: str) -> Finding:
+def _pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
     giver, taker = facts.nodes[publisher], facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
     if connected(topic, giver, taker):
-        return Finding(Severity.OK, PAIR, label, "connected" + _traffic(facts, topic, giver, taker))
+        return DoctorFinding(
+            Severity.OK, PAIR, label, "connected" + _traffic(facts, topic, giver, taker)
+        )
     text, fix = _why(facts, topic, giver, taker)
-    return Finding(Severity.ERROR, PAIR, label, f"not connected: {text}", fix)
+    return DoctorFinding(Severity.ERROR, PAIR, label, f"not connected: {text}", fix)
 
 
-def connected(topic: str, giver: Node, taker: Node) -> bool:
+def connected(topic: str, giver: NodeFacts, taker: NodeFacts) -> bool:
     """Whether a publisher says that a subscriber is connected.
 
     The publisher knows best: a subscriber lists connections that it only tries to make. Where the
     publisher can't be asked, the subscriber's word has to do.
     """
-    if giver.words is not None:
-        return ("o", topic, taker.name) in giver.words.peers
-    return taker.words is not None and ("i", topic, giver.uri) in taker.words.peers
+    if giver.report is not None:
+        return ("o", topic, taker.name) in giver.report.peers
+    return taker.report is not None and ("i", topic, giver.uri) in taker.report.peers
 
 
-def _traffic(facts: Facts, topic: str, giver: Node, taker: Node) -> str:
+def _traffic(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> str:
     lease = facts.leases.get(giver.where.port) if giver.where and facts.ours(giver.where) else None
-    for connection in lease["connections"] if lease else ():
-        if (connection["name"], connection["caller_id"]) == (topic, taker.name):
-            rate = f"{size(connection['sent_rate'])}/s just now"
-            return f", {size(connection['sent'])} so far, {rate}"
+    for connection in lease.connections if lease else ():
+        if (connection.name, connection.caller_id) == (topic, taker.name):
+            rate = f"{size(connection.sent_rate)}/s just now"
+            return f", {size(connection.sent)} so far, {rate}"
     return ""
 
 
-def _why(facts: Facts, topic: str, giver: Node, taker: Node) -> tuple[str, str]:
+def _why(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> tuple[str, str]:
     """Why a pair is not connected, the most certain reason first, and what mends it."""
     for node in (giver, taker):
         if unreachable(facts, node):
             return f"{node.name} can't be reached from here", "see what is said of it"
-    offered = giver.words.publishes.get(topic) if giver.words else ANY
-    wanted = taker.words.subscribes.get(topic) if taker.words else ANY
+    offered = giver.report.publishes.get(topic) if giver.report else ANY
+    wanted = taker.report.subscribes.get(topic) if taker.report else ANY
     if offered is None:
         return f"{giver.name} says that it does not publish it", f"restart {giver.name}"
     if wanted is None:
@@ -109,15 +110,17 @@ def _why(facts: Facts, topic: str, giver: Node, taker: Node) -> tuple[str, str]:
     return _why_no_transport(facts, topic, giver, taker)
 
 
-def unreachable(facts: Facts, node: Node) -> bool:
+def unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
     """Whether a node can't be reached, as far as is known."""
     if facts.ours(node.where) and node.where:
-        lease: Mapping[str, Any] | None = facts.leases.get(node.where.port)
-        return lease is None or lease["state"] not in ("ok", "new")
+        lease = facts.leases.get(node.where.port)
+        return lease is None or lease.state not in ("ok", "new")
     return node.attempt.failed or (node.where is None)
 
 
-def _why_no_transport(facts: Facts, topic: str, giver: Node, taker: Node) -> tuple[str, str]:
+def _why_no_transport(
+    facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts
+) -> tuple[str, str]:
     address, attempt = facts.data_ports.get((giver.name, topic), ("", Attempt()))
     where = parse_host_port(address)
     restart = f"restart {taker.name}"
@@ -139,14 +142,14 @@ def _why_no_transport(facts: Facts, topic: str, giver: Node, taker: Node) -> tup
     return text, f"look into the log of {taker.name}; {restart}"
 
 
-def _service(facts: Facts, service: str) -> Finding:
+def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
     uri, attempt = facts.service_uris.get(service, ""), facts.services.get(service, Attempt())
     providers = listed(facts.graph.services.get(service, ())) if facts.graph else ""
     if not attempt.failed:
         text = f"{providers} provides it at {uri}: {attempt.reach.value}"
-        return Finding(Severity.OK, PAIR, service, text)
+        return DoctorFinding(Severity.OK, PAIR, service, text)
     text = f"{providers} provides it at {uri}: {attempt.reach.value}"
     fix = f"restart {providers}; if it is gone: rosnode cleanup"
     if attempt.reach is Reach.UNRESOLVABLE:
         fix = f"where {providers} runs: ROS_IP=ADDRESS, then restart it"
-    return Finding(Severity.ERROR, PAIR, service, text, fix)
+    return DoctorFinding(Severity.ERROR, PAIR, service, text, fix)

@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from urllib.parse import urlsplit
 
-from rosproxy.doctor.facts import Facts, Master, Reach
-from rosproxy.doctor.findings import Finding, Severity
+from rosproxy.admin.status_document import MasterStatus, PortsStatus
+from rosproxy.doctor.facts import DoctorFacts, MasterFacts, Reach
+from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.net.addresses import is_loopback
 from rosproxy.telemetry.text import duration, plural
 
@@ -25,35 +26,37 @@ _TRIES = {
 }
 
 
-def check(facts: Facts) -> Iterator[Finding]:
+def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about the proxy."""
     for rule in (_admin, _master, _advertised_host, _range, _ports, _published_master):
         yield from rule(facts)
 
 
-def _admin(facts: Facts) -> Iterator[Finding]:
+def _admin(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.status is not None:
         status = facts.status
-        text = f"rosproxy {status['version']} at {facts.admin}, up {duration(status['uptime'])}"
-        yield Finding(Severity.OK, "admin", "proxy", text)
+        text = f"rosproxy {status.version} at {facts.admin}, up {duration(status.uptime)}"
+        yield DoctorFinding(Severity.OK, "admin", "proxy", text)
     elif facts.admin_error:
         text = f"{facts.admin_error}. What else is said here was found without it"
         fix = "docker ps; docker logs CONTAINER; docker exec CONTAINER rosproxy doctor"
-        yield Finding(Severity.ERROR, "admin", "proxy", text, fix)
+        yield DoctorFinding(Severity.ERROR, "admin", "proxy", text, fix)
 
 
-def _master(facts: Facts) -> Iterator[Finding]:
+def _master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     master = facts.master
     if master is None:
         text = "not checked: no address is known"
-        yield Finding(Severity.INFO, "master", "master", text, "give --master-uri (ROS_MASTER_URI)")
+        yield DoctorFinding(
+            Severity.INFO, "master", "master", text, "give --master-uri (ROS_MASTER_URI)"
+        )
         return
     if master.looped:
         text = f"{master.uri} leads back to this proxy itself"
         yield _error_of_master(text, _other_uri())
     elif master.attempt.reach is Reach.ANSWERED:
         trip = f" in {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
-        yield Finding(Severity.OK, "master", "master", f"{master.uri} answers{trip}")
+        yield DoctorFinding(Severity.OK, "master", "master", f"{master.uri} answers{trip}")
         yield from _master_elsewhere(facts, master)
         if facts.graph is None:
             yield _error_of_master(
@@ -63,16 +66,16 @@ def _master(facts: Facts) -> Iterator[Finding]:
         yield _error_of_master(*_unanswered(master))
 
 
-def _master_elsewhere(facts: Facts, master: Master) -> Iterator[Finding]:
+def _master_elsewhere(facts: DoctorFacts, master: MasterFacts) -> Iterator[DoctorFinding]:
     """The master answers the doctor: does it answer the proxy as well?"""
-    seen = facts.status["master"] if facts.status else {"up": True}
-    if not seen["up"] and seen["error"]:
-        text = f"{master.uri} answers here, but the proxy says: {seen['error']}"
+    seen = facts.status.master if facts.status else MasterStatus(up=True)
+    if not seen.up and seen.error:
+        text = f"{master.uri} answers here, but the proxy says: {seen.error}"
         fix = "wait some seconds; if it stays, run this where the proxy runs"
-        yield Finding(Severity.WARNING, "master", "master", text, fix)
+        yield DoctorFinding(Severity.WARNING, "master", "master", text, fix)
 
 
-def _unanswered(master: Master) -> tuple[str, str]:
+def _unanswered(master: MasterFacts) -> tuple[str, str]:
     parts = urlsplit(master.uri)
     host, port = parts.hostname or "", parts.port
     match master.attempt.reach:
@@ -114,26 +117,26 @@ def _other_uri() -> str:
     return "give the real master's address: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
 
 
-def _error_of_master(text: str, fix: str) -> Finding:
-    return Finding(Severity.ERROR, "master", "master", text, fix)
+def _error_of_master(text: str, fix: str) -> DoctorFinding:
+    return DoctorFinding(Severity.ERROR, "master", "master", text, fix)
 
 
-def _advertised_host(facts: Facts) -> Iterator[Finding]:
+def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     host, check = facts.advertise_host, "advertised host"
     if not host:
         if facts.admin_error:
             fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
-            yield Finding(Severity.INFO, check, check, "not checked: it is not known", fix)
+            yield DoctorFinding(Severity.INFO, check, check, "not checked: it is not known", fix)
     elif is_loopback(host) and facts.master and not local_master(facts):
         text = f"{host} is a loopback address: to every other machine it means that machine itself"
         fix = "--advertise-host ADDRESS, the address of this host in the network of the robots"
-        yield Finding(Severity.ERROR, check, check, text, f"{fix} (ROSPROXY_ADVERTISE_HOST)")
+        yield DoctorFinding(Severity.ERROR, check, check, text, f"{fix} (ROSPROXY_ADVERTISE_HOST)")
     elif not facts.advertised_addresses and facts.status is None:
         text = f"the host name {host} can't be resolved here"
-        yield Finding(Severity.ERROR, check, check, text, _BY_ADDRESS)
+        yield DoctorFinding(Severity.ERROR, check, check, text, _BY_ADDRESS)
 
 
-def local_master(facts: Facts) -> bool:
+def local_master(facts: DoctorFacts) -> bool:
     """Whether the master is on loopback, so that all of ROS is on this machine."""
     if facts.master is None:
         return False
@@ -141,46 +144,46 @@ def local_master(facts: Facts) -> bool:
     return is_loopback(host) or any(map(is_loopback, facts.master.addresses))
 
 
-def _range(facts: Facts) -> Iterator[Finding]:
+def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.status is None:
         return
     if facts.probe is None:
         text = f"not tried: {facts.probe_error}"
-        yield Finding(Severity.WARNING, RANGE, RANGE, text)
+        yield DoctorFinding(Severity.WARNING, RANGE, RANGE, text)
         return
     outcomes: dict[tuple[str, str], list[str]] = {}
-    for probe in facts.probe["probes"]:
-        port = probe["advertised"].rpartition(":")[2]
-        outcomes.setdefault((probe["from_proxy"], probe["from_master"]), []).append(port)
+    for probe in facts.probe.probes:
+        port = probe.advertised.rpartition(":")[2]
+        outcomes.setdefault((probe.from_proxy, probe.from_master), []).append(port)
     for (mine, masters), ports in outcomes.items():
         at = f"{facts.advertise_host}, port {' and '.join(ports)}"
         yield _tried(facts, mine, masters, at, len(outcomes) == 1)
 
 
-def _tried(facts: Facts, mine: str, masters: str, at: str, whole: bool) -> Finding:
+def _tried(facts: DoctorFacts, mine: str, masters: str, at: str, whole: bool) -> DoctorFinding:
     """What tries at free ports mean: one by the proxy itself and one by the master."""
     if masters == "ok":
         back = "" if mine == "ok" else f" (the proxy itself does not, {mine}: no harm)"
-        return Finding(Severity.OK, RANGE, RANGE, f"the master reaches {at}{back}")
+        return DoctorFinding(Severity.OK, RANGE, RANGE, f"the master reaches {at}{back}")
     if mine == "ok" and masters == "unknown":
         text = f"the proxy reaches {at}; the master could not be asked to try"
-        return Finding(Severity.OK, RANGE, RANGE, text)
+        return DoctorFinding(Severity.OK, RANGE, RANGE, text)
     if mine == "ok":
         text = (
             f"{at}: reached from here, but not from the master's machine. For that it is another "
             "machine, an address that only this side has, or behind a firewall"
         )
-        return Finding(Severity.ERROR, RANGE, RANGE, text, _fix_host(facts, at))
+        return DoctorFinding(Severity.ERROR, RANGE, RANGE, text, _fix_host(facts, at))
     text, severity = f"{at}: {_TRIES.get(mine, mine)}", Severity.ERROR
     if masters == "missed":
         text += ". The master does not get through either"
     elif mine in _NO_WAY_BACK:
         severity = Severity.WARNING
         text += ". Or only the way back is missing; the master, which could tell, is not there"
-    return Finding(severity, RANGE, RANGE, text, _fix_range(facts, mine, whole))
+    return DoctorFinding(severity, RANGE, RANGE, text, _fix_range(facts, mine, whole))
 
 
-def _fix_host(facts: Facts, at: str) -> str:
+def _fix_host(facts: DoctorFacts, at: str) -> str:
     port = at.rpartition(" ")[2]
     return (
         "--advertise-host ADDRESS: this host as the master's machine knows it "
@@ -188,11 +191,11 @@ def _fix_host(facts: Facts, at: str) -> str:
     )
 
 
-def _fix_range(facts: Facts, mine: str, whole: bool) -> str:
+def _fix_range(facts: DoctorFacts, mine: str, whole: bool) -> str:
     if mine == "unresolvable":
         return _BY_ADDRESS
-    ports = facts.status["ports"] if facts.status else {}
-    publish = f"docker run -p {ports['advertise']}:{ports['listen']}"
+    ports = facts.status.ports if facts.status else PortsStatus()
+    publish = f"docker run -p {ports.advertise}:{ports.listen}"
     if not whole:
         return f"publish the whole range: {publish}"
     return (
@@ -201,18 +204,18 @@ def _fix_range(facts: Facts, mine: str, whole: bool) -> str:
     )
 
 
-def _ports(facts: Facts) -> Iterator[Finding]:
+def _ports(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.status is None:
         return
-    ports = facts.status["ports"]
-    used, free, blocked = ports["used"], ports["free"], ports["blocked"]
+    ports = facts.status.ports
+    used, free, blocked = ports.used, ports.free, ports.blocked
     larger = (
         "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
         "was refused"
     )
     if blocked:
-        first, last = ports["listen"].split("-")
-        text = f"{plural(blocked, 'port')} of the range {ports['listen']} held by other programs"
+        first, _, last = ports.listen.partition("-")
+        text = f"{plural(blocked, 'port')} of the range {ports.listen} held by other programs"
         look = f"ss -ltnp 'sport >= :{first} and sport <= :{last}'"
         yield _of_ports(Severity.WARNING, text, f"{look}; or another --port-range")
     if not free:
@@ -222,25 +225,25 @@ def _ports(facts: Facts) -> Iterator[Finding]:
     elif free < FEW_FREE * (used + free + blocked):
         yield _of_ports(Severity.WARNING, f"only {free} left, {used} used", larger)
     else:
-        mapped = f"{ports['listen']} as {ports['advertise']}"
+        mapped = f"{ports.listen} as {ports.advertise}"
         yield _of_ports(Severity.OK, f"{mapped}, {used} used, {free} free")
 
 
-def _of_ports(severity: Severity, text: str, fix: str = "") -> Finding:
-    return Finding(severity, "ports", "ports", text, fix)
+def _of_ports(severity: Severity, text: str, fix: str = "") -> DoctorFinding:
+    return DoctorFinding(severity, "ports", "ports", text, fix)
 
 
-def _published_master(facts: Facts) -> Iterator[Finding]:
-    port = facts.status["settings"]["publish_master"] if facts.status else None
+def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    port = facts.status.settings.publish_master if facts.status else None
     if port is None:
         return
     check, attempt = "published master", facts.published_master
     text = f"http://{facts.advertise_host}:{port} for nodes outside: {attempt.reach.value}"
     if not attempt.failed:
-        yield Finding(Severity.OK, check, check, text)
-    elif facts.probe and any(probe["from_proxy"] == "ok" for probe in facts.probe["probes"]):
-        yield Finding(Severity.ERROR, check, check, text, f"docker run -p {port}:{port}")
+        yield DoctorFinding(Severity.OK, check, check, text)
+    elif facts.probe and any(probe.from_proxy == "ok" for probe in facts.probe.probes):
+        yield DoctorFinding(Severity.ERROR, check, check, text, f"docker run -p {port}:{port}")
     else:
         text += ". From here that proves little: no port of this host was reached"
         fix = f"docker run -p {port}:{port}; to try outside: nc -vz {facts.advertise_host} {port}"
-        yield Finding(Severity.WARNING, check, check, text, fix)
+        yield DoctorFinding(Severity.WARNING, check, check, text, fix)

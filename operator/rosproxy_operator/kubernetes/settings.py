@@ -1,50 +1,33 @@
-"""The settings of the controllers, validated."""
+"""The settings of ``rosproxy-operator kubernetes``, validated."""
 
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from ipaddress import ip_address
 from typing import Any
 
-from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import SettingError, parse_admin, parse_host, parse_range, parse_seconds
-from rosproxy_operator.docker.planner.settings import MOST_PORTS, PlanSettings
+from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.settings import SettingError, parse_admin, parse_range, parse_seconds
+from rosproxy_operator.common.settings import parse_image
 from rosproxy_operator.kubernetes.planner.model import Name
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 
-DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
-CLUSTER_ADMIN = HostPort("0.0.0.0", 11313)
-CLUSTER_LIVENESS = HostPort("0.0.0.0", 8080)
-CLUSTER_WEBHOOK = HostPort("0.0.0.0", 9443)
+DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
+DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
+DEFAULT_WEBHOOK = HostPort("0.0.0.0", 9443)
 _LABEL = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
 _SUBDOMAIN = re.compile(rf"(?=.{{1,253}}$){_LABEL.pattern}(\.{_LABEL.pattern})*")
-_NAME = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-"
-
-
-@dataclass(frozen=True, slots=True)
-class DockerSettings:
-    """Everything that ``rosproxy-operator docker`` can be told.
-
-    ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
-    serves its own health.
-    """
-
-    plan: PlanSettings
-    resync: float = 30.0
-    admin: HostPort = DEFAULT_ADMIN
 
 
 @dataclass(frozen=True, slots=True)
 class WebhookSettings:
     """How the admission webhook is served, and with which certificate.
 
-    Either the controller makes the certificate, for the names of ``service``, keeps it in
+    Either the operator makes the certificate, for the names of ``service``, keeps it in
     ``secret`` and writes its CA into ``configuration`` (each may be None or empty: it is left
     out); or somebody else puts it into ``directory`` (tls.crt, tls.key).
     """
 
-    bind: HostPort = CLUSTER_WEBHOOK
+    bind: HostPort = DEFAULT_WEBHOOK
     service: Name | None = None
     secret: Name | None = None
     configuration: str = ""
@@ -63,38 +46,9 @@ class KubernetesSettings:
     plan: ClusterSettings = field(default_factory=ClusterSettings)
     namespaces: tuple[str, ...] = ()
     resync: float = 30.0
-    admin: HostPort = CLUSTER_ADMIN
-    liveness: HostPort = CLUSTER_LIVENESS
+    admin: HostPort = DEFAULT_ADMIN
+    liveness: HostPort = DEFAULT_LIVENESS
     webhook: WebhookSettings | None = None
-
-
-def parse_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
-    """Settings from the values of the command line's options.
-
-    Raises SettingError for the first value that can't be used.
-    """
-    host = options.get("advertise_host")
-    plan = PlanSettings(
-        master_uri=_master(options.get("master_uri") or ""),
-        advertise_host=parse_host("--advertise-host", host) if host else "",
-        ports=_ports(options["ports"]),
-        window=parse_range("--port-window", options["port_window"]),
-        publish=tuple(map(_publish, options["publish_address"] or ("0.0.0.0",))),
-        image=_image(options["proxy_image"]),
-        expose_by_default=options["expose_by_default"],
-        grace=parse_seconds("--grace", options["grace"], 0.0),
-        uplink=_uplink(options["uplink"]),
-        data_plane=options.get("data_plane") or "auto",
-    )
-    if len(plan.window) < plan.ports:
-        raise SettingError(
-            "--port-window", f"{plan.window} has {len(plan.window)} ports, --ports is {plan.ports}"
-        )
-    return DockerSettings(
-        plan=plan,
-        resync=parse_seconds("--resync", options["resync"], 1.0),
-        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
-    )
 
 
 def parse_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
@@ -103,7 +57,7 @@ def parse_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
     Raises SettingError for the first value that can't be used.
     """
     plan = ClusterSettings(
-        image=_image(options["proxy_image"]),
+        image=parse_image(options["proxy_image"]),
         image_pull_policy=options.get("proxy_image_pull_policy") or "",
         node_ports=parse_range("--node-port-range", options["node_port_range"]),
         ephemeral=parse_range("--ephemeral-range", options["ephemeral_range"]),
@@ -112,8 +66,8 @@ def parse_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
         plan=plan,
         namespaces=_namespaces(options["namespace"]),
         resync=parse_seconds("--resync", options["resync"], 1.0),
-        admin=parse_admin(options["admin_bind"], CLUSTER_ADMIN),
-        liveness=_bind("--liveness-bind", options["liveness_bind"], CLUSTER_LIVENESS),
+        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
+        liveness=_bind("--liveness-bind", options["liveness_bind"], DEFAULT_LIVENESS),
         webhook=_webhook(options),
     )
 
@@ -136,7 +90,7 @@ def _webhook(options: Mapping[str, Any]) -> WebhookSettings | None:
     if options["webhook_bind"] == "none":
         return None
     settings = WebhookSettings(
-        bind=_bind("--webhook-bind", options["webhook_bind"], CLUSTER_WEBHOOK),
+        bind=_bind("--webhook-bind", options["webhook_bind"], DEFAULT_WEBHOOK),
         service=_object("--webhook-service", options.get("webhook_service")),
         secret=_object("--webhook-secret", options.get("webhook_secret")),
         configuration=options.get("webhook_configuration") or "",
@@ -168,41 +122,3 @@ def _object(option: str, text: str | None) -> Name | None:
     if not slash or not _LABEL.fullmatch(namespace) or not _SUBDOMAIN.fullmatch(name):
         raise SettingError(option, f"{text!r} is not of the form NAMESPACE/NAME")
     return Name(namespace, name)
-
-
-def _master(uri: str) -> str:
-    where = parse_slave_uri(uri)
-    if uri and where is None:
-        raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
-    if where and is_loopback(where.host):
-        raise SettingError(
-            "--master-uri",
-            f"{uri!r} means another machine to each container; give the address or name of the "
-            "master's host, or http://host.docker.internal:PORT for this one",
-        )
-    return uri
-
-
-def _ports(count: int) -> int:
-    if not 1 <= count <= MOST_PORTS:
-        raise SettingError("--ports", f"{count} is not between 1 and {MOST_PORTS}")
-    return count
-
-
-def _publish(text: str) -> str:
-    try:
-        return str(ip_address(text))
-    except ValueError:
-        raise SettingError("--publish-address", f"{text!r} is not an IP address") from None
-
-
-def _image(text: str) -> str:
-    if not text or any(c.isspace() for c in text):
-        raise SettingError("--proxy-image", f"{text!r} is not the name of an image")
-    return text
-
-
-def _uplink(text: str) -> str:
-    if not text or not text[0].isalnum() or any(c not in _NAME for c in text):
-        raise SettingError("--uplink", f"{text!r} is not a network's name")
-    return text

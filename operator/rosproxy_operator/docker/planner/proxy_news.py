@@ -4,12 +4,10 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, ip_address
-from typing import Any
 
-from rosproxy.net.addresses import is_address, parse_host_port
-from rosproxy_operator.docker.planner.model import STARTED, Container, Proxy, Wish
+from rosproxy.net.addresses import is_address
+from rosproxy_operator.docker.planner.model import STARTED, Container, HostState, Member, Proxy
 from rosproxy_operator.docker.planner.specs import master
-from rosproxy_operator.docker.snapshot import Look, sandbox_of
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
 """Seconds after a container's arrival at which its proxy is told: nodes take time to register."""
@@ -25,7 +23,7 @@ _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ContainerArrival:
     """A labelled container on a network of its proxy, since one start of it (``endpoint``)."""
 
     container: str
@@ -36,7 +34,7 @@ class Arrival:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class NetworkFacts:
     """What one look says to one proxy.
 
     ``addresses`` are those of running containers on its networks, by container id and network;
@@ -49,7 +47,7 @@ class Facts:
     addresses: Mapping[Place, str] = field(default_factory=dict)
     taken: frozenset[str] = frozenset()
     subnets: tuple[IPv4Network, ...] = ()
-    arrivals: frozenset[Arrival] = frozenset()
+    arrivals: frozenset[ContainerArrival] = frozenset()
     running: frozenset[str] = frozenset()
 
 
@@ -65,7 +63,7 @@ class Places:
         self._absent: dict[Place, float] = {}
         self._moves: dict[str, tuple[str, float]] = {}
 
-    def look(self, known: Facts, now: float) -> None:
+    def look(self, known: NetworkFacts, now: float) -> None:
         """Compare with what the last look has found."""
         missing = [place for place in self._at if place not in known.addresses]
         self._absent = {place: self._absent.get(place, now) for place in missing}
@@ -85,7 +83,7 @@ class Places:
             if now < since + MOVING and old not in taken
         }
 
-    def _follow(self, known: Facts, now: float) -> None:
+    def _follow(self, known: NetworkFacts, now: float) -> None:
         """Let nodes of a network that their container has left be found on one that it is on."""
         for container, network in list(self._absent):
             elsewhere = [
@@ -115,36 +113,35 @@ class Places:
         return {old: new for old, (new, _) in self._moves.items() if old in nodes}
 
 
-def facts(look: Look, proxy: Proxy, wishes: Iterable[Wish], master_address: str) -> Facts:
-    """What a look says to a proxy. ``wishes`` are those of all containers."""
-    observed = look.observed
-    box = sandbox_of(proxy, observed)
+def facts(
+    observed: HostState, proxy: Proxy, members: Iterable[Member], master_address: str
+) -> NetworkFacts:
+    """What a look says to a proxy. ``members`` are those of all proxies."""
+    box = observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
     by_id = {container.id: container for container in observed.containers}
-    mine = [by_id[w.id] for w in wishes if w.key == proxy.key and w.id in by_id]
-    gateways = {network.gateway for network in observed.networks}
-    return Facts(
+    mine = [by_id[m.id] for m in members if m.key == proxy.key and m.id in by_id]
+    running = [container for container in observed.containers if container.state in STARTED]
+    return NetworkFacts(
         master_address="" if is_address(master(proxy.key).host) else master_address,
         addresses={
             (container.id, a.network): a.address
-            for container in observed.containers
+            for container in running
             for a in container.attachments
-            if a.network in joined and a.address and container.state in STARTED
+            if a.network in joined and a.address
         },
-        taken=look.addresses | gateways,
-        subnets=tuple(subnet for name in joined for subnet in look.subnets.get(name, ())),
-        arrivals=frozenset(
-            arrival for container in mine for arrival in _arrivals(look, container, by_id, joined)
+        taken=observed.addresses | {network.gateway for network in observed.networks},
+        subnets=tuple(
+            subnet
+            for network in observed.networks
+            if network.name in joined
+            for subnet in network.subnets
         ),
-        running=frozenset(c.id for c in observed.containers if c.state in STARTED),
+        arrivals=frozenset(
+            arrival for container in mine for arrival in _arrivals(container, by_id, joined)
+        ),
+        running=frozenset(container.id for container in running),
     )
-
-
-def node_addresses(status: Mapping[str, Any]) -> frozenset[str]:
-    """The addresses of a proxy's nodes, from its status; not of those it has given up already."""
-    nodes = (node for node in status.get("nodes", ()) if node.get("state") != "cleaned")
-    found = (parse_host_port(str(node.get("address", ""))) for node in nodes)
-    return frozenset(where.host for where in found if where)
 
 
 def gone(
@@ -159,19 +156,19 @@ def gone(
 
 
 def _arrivals(
-    look: Look, container: Container, by_id: Mapping[str, Container], joined: set[str]
-) -> list[Arrival]:
+    container: Container, by_id: Mapping[str, Container], joined: set[str]
+) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
     host = by_id.get(container.network_mode.removeprefix(_SHARED), container)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
     return [
-        Arrival(
+        ContainerArrival(
             container.id,
             a.network,
             a.address,
-            look.endpoints.get((host.id, a.network), ""),
+            a.endpoint,
             frozenset(name for name in a.names | own if _HOST_NAME.fullmatch(name)),
         )
         for a in host.attachments

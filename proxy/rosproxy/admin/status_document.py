@@ -1,0 +1,211 @@
+"""The document at ``/status``: one definition for the proxy and for all who read it.
+
+`rosproxy.admin.status` fills it in; ``rosproxy status``, ``rosproxy doctor`` and the operator read
+it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made of what ROS
+nodes say of themselves and may come from another version of the proxy. So reading is tolerant:
+unknown keys are ignored, what is missing or of another type is as its default says, and an item of
+a list that is no such item is left out. No text and no list is bounded, and texts may hold control
+characters: `rosproxy.telemetry.text` makes them fit to be shown.
+
+Times are in seconds, rates in bytes per second; ``sent`` is what went outside.
+"""
+
+import json
+from types import UnionType
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+import msgspec
+
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
+Rate = Annotated[float, msgspec.Meta(ge=0, le=1e18)]
+Names = tuple[str, ...]
+Document = TypeVar("Document", bound=msgspec.Struct)
+
+
+class NotAStatus(ValueError):
+    """A text that is not the status of a rosproxy."""
+
+
+class StatusSettings(msgspec.Struct, frozen=True):
+    """The settings that others have to know. ``inside_networks``: those in force, as CIDRs."""
+
+    master_port: Count = 11311
+    publish_master: Count | None = None
+    advertise_host: str = ""
+    bind: str = "0.0.0.0"
+    inside_networks: Names = ()
+    cleanup_after: Seconds = 0.0
+    linger: Seconds = 0.0
+
+
+class MasterStatus(msgspec.Struct, frozen=True):
+    """The real master. ``pinned``: ``address`` was given and is not what its name leads to.
+
+    Neither ``up`` nor an ``error``: it has not been asked yet. ``since``: how long it is so.
+    """
+
+    uri: str = ""
+    address: str | None = None
+    pinned: bool = False
+    up: bool = False
+    error: str = ""
+    pid: int | None = None
+    since: Seconds = 0.0
+    round_trip: Seconds | None = None
+
+
+class PortsStatus(msgspec.Struct, frozen=True):
+    """The range of ports, ``A-B`` here and as outside sees it; ``blocked`` ones others hold."""
+
+    listen: str = ""
+    advertise: str = ""
+    used: Count = 0
+    free: Count = 0
+    blocked: Count = 0
+
+
+class DataPlaneStatus(msgspec.Struct, frozen=True):
+    """How topics are forwarded: as ``mode`` says or, for a ``reason``, by another ``plane``."""
+
+    mode: str = ""
+    plane: str = ""
+    reason: str = ""
+
+
+class NodePlaneStatus(msgspec.Struct, frozen=True):
+    """What the kernel forwards for a node through its data ``port``; bytes of IP packets."""
+
+    plane: str = ""
+    port: Count | None = None
+    reason: str | None = None
+    connections: Count = 0
+    sent: Count = 0
+    received: Count = 0
+    sent_rate: Rate = 0.0
+    received_rate: Rate = 0.0
+
+
+class AliasPortStatus(msgspec.Struct, frozen=True):
+    """A port that stands in for a node on the master's host."""
+
+    port: Count = 0
+    connections: Count = 0
+
+
+class ConnectionStatus(msgspec.Struct, frozen=True):
+    """A relayed TCPROS connection: ``kind`` is topic or service, ``peer`` who came from outside."""
+
+    kind: str = ""
+    name: str = ""
+    caller_id: str = ""
+    peer: str = ""
+    sent: Count = 0
+    received: Count = 0
+    sent_rate: Rate = 0.0
+    received_rate: Rate = 0.0
+
+
+class NodeStatus(msgspec.Struct, frozen=True):
+    """What is registered with one slave URI: one node as a rule, several for nodelets.
+
+    ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
+    ``state`` is one of `rosproxy.telemetry.metrics.STATES`.
+    """
+
+    nodes: Names = ()
+    uri: str = ""
+    address: str = ""
+    advertised_uri: str = ""
+    port: Count = 0
+    state: str = ""
+    publishes: Names = ()
+    subscribes: Names = ()
+    services: Names = ()
+    parameters: Names = ()
+    connections: tuple[ConnectionStatus, ...] = ()
+    problems: Names = ()
+    data_plane: NodePlaneStatus | None = None
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the proxy has unregistered it, because it was gone."""
+        return self.state == "cleaned"
+
+
+class ProblemStatus(msgspec.Struct, frozen=True):
+    """What the user should know, of which subject, and how long ago it was noted."""
+
+    age: Seconds = 0.0
+    subject: str = ""
+    text: str = ""
+
+
+class ProxyStatus(msgspec.Struct, frozen=True):
+    """Everything that a proxy tells of itself.
+
+    ``instance`` is another one after each start; ``retired``: it registers nothing any more;
+    ``mirrored`` are the ports that stand in for nodes on the master's host.
+    """
+
+    version: str = ""
+    pid: Count = 0
+    instance: str = ""
+    retired: bool = False
+    uptime: Seconds = 0.0
+    settings: StatusSettings = StatusSettings()
+    master: MasterStatus = MasterStatus()
+    ports: PortsStatus = PortsStatus()
+    data_plane: DataPlaneStatus | None = None
+    mirrored: tuple[AliasPortStatus, ...] = ()
+    nodes: tuple[NodeStatus, ...] = ()
+    problems: tuple[ProblemStatus, ...] = ()
+
+
+def parse_status(text: str | bytes) -> ProxyStatus:
+    """The status in the text of an answer. Raises NotAStatus if that is not a rosproxy's."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        document = None
+    if not isinstance(document, dict) or "settings" not in document:
+        raise NotAStatus("not the status of a rosproxy")
+    return read_status(document)
+
+
+def read_status(document: object) -> ProxyStatus:
+    """The status in decoded JSON; never raises."""
+    return _as_far_as_it_fits(document, ProxyStatus)
+
+
+def to_json(document: msgspec.Struct) -> dict[str, Any]:
+    """A document as plain data to be encoded as JSON."""
+    plain: dict[str, Any] = msgspec.to_builtins(document)
+    return plain
+
+
+def _as_far_as_it_fits(value: object, kind: type[Document]) -> Document:
+    """A document with defaults in place of what does not fit."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        given = value if isinstance(value, dict) else {}
+    fitting = {}
+    for field in msgspec.structs.fields(kind):
+        try:
+            fitting[field.name] = _field(given[field.encode_name], field.type)
+        except (KeyError, msgspec.ValidationError):
+            continue
+    return kind(**fitting)
+
+
+def _field(value: Any, kind: Any) -> Any:
+    """A value as a field's type. Raises ValidationError where nothing of it fits."""
+    inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
+    document = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
+    if document and isinstance(value, dict):
+        return _as_far_as_it_fits(value, inner)
+    if get_origin(kind) is not tuple or not isinstance(value, list):
+        return msgspec.convert(value, kind)
+    items = [item for item in value if isinstance(item, dict if document else str)]
+    return tuple(_as_far_as_it_fits(item, inner) if document else item for item in items)

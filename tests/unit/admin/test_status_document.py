@@ -1,0 +1,97 @@
+"""The document at ``/status``: read whatever it holds, and the same after writing."""
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.admin.status_document import (
+    ConnectionStatus,
+    NodeStatus,
+    NotAStatus,
+    ProxyStatus,
+    parse_status,
+    read_status,
+    to_json,
+)
+from tests.unit.status_json import make_connection, make_node, make_status
+
+PLANE = {"plane": "kernel", "port": 45050, "reason": None, "connections": 2, "sent": 7}
+
+
+def a_status() -> dict[str, Any]:
+    node = make_node(connections=[make_connection()], data_plane=PLANE)
+    return make_status(node, problems=[{"age": 3, "subject": "/talker", "text": "gone"}])
+
+
+def test_a_status_is_the_same_after_reading_and_writing() -> None:
+    found = parse_status(json.dumps(a_status()))
+    assert (found.version, found.pid, found.uptime) == ("0.1.0", 42, 75.0)
+    assert found.settings.inside_networks == ("10.0.0.0/24",)
+    (node,) = found.nodes
+    assert (node.nodes, node.address, node.given_up) == (("/talker",), "10.0.0.5:40001", False)
+    assert node.connections[0].caller_id == "/listener"
+    assert node.data_plane is not None
+    assert (node.data_plane.port, node.data_plane.reason) == (45050, None)
+    assert parse_status(json.dumps(to_json(found))) == found
+    assert make_status().keys() <= to_json(found).keys()
+    assert make_node().keys() <= to_json(found)["nodes"][0].keys()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "no JSON", "[]", "null", '{"hello": "world"}', "[" * 100_000, b"\xff"]
+)
+def test_what_is_no_status(text: str | bytes) -> None:
+    with pytest.raises(NotAStatus):
+        parse_status(text)
+
+
+def test_what_is_missing_has_a_default_and_what_is_unknown_is_ignored() -> None:
+    assert parse_status('{"settings": {}, "of another version": [1]}') == ProxyStatus()
+
+
+def test_what_does_not_fit_leaves_the_rest_alone() -> None:
+    status = a_status()
+    status |= {"uptime": float("nan"), "pid": 2**64, "mirrored": 3, "data_plane": []}
+    status["master"] |= {"error": None, "round_trip": "fast", "since": float("inf")}
+    status["ports"]["used"] = -1
+    status["nodes"][0] |= {"state": 7, "publishes": ["/a", 1, None], "data_plane": {"port": []}}
+    status["nodes"][0]["connections"] += ["x", {"name": "/b", "sent": True}]
+    status["nodes"] += ["x", None]
+    found = parse_status(json.dumps(status))
+    assert (found.uptime, found.pid, found.mirrored, found.data_plane) == (0.0, 0, (), None)
+    assert (found.master.up, found.master.uri) == (True, "http://robot:11311")
+    assert (found.master.error, found.master.round_trip, found.master.since) == ("", None, 0.0)
+    assert (found.ports.used, found.ports.free) == (0, 99)
+    (node,) = found.nodes
+    assert (node.state, node.publishes, node.address) == ("", ("/a",), "10.0.0.5:40001")
+    assert [c.name for c in node.connections] == ["/chatter", "/b"]
+    assert node.data_plane is not None
+    assert node.data_plane.port is None
+
+
+def test_names_hold_whatever_a_node_says() -> None:
+    odd = "/\udc80\x1b[2J\u202e" + "x" * 100_000
+    assert parse_status(json.dumps(make_status(make_node(odd)))).nodes[0].nodes == (odd,)
+
+
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: (
+        st.lists(inner)
+        | st.dictionaries(
+            st.sampled_from([*ProxyStatus.__struct_fields__, *NodeStatus.__struct_fields__])
+            | st.sampled_from(ConnectionStatus.__struct_fields__)
+            | st.text(),
+            inner,
+        )
+    ),
+)
+
+
+@given(_JSON)
+def test_nothing_is_too_strange(document: Any) -> None:
+    found = read_status(document)
+    assert parse_status(json.dumps(to_json(found))) == found
