@@ -6,9 +6,14 @@ MAKEFLAGS += --no-print-directory
 
 VENV ?= .venv
 BIN := $(VENV)/bin
-IMAGE ?= rosproxy:latest
-OPERATOR_IMAGE ?= rosproxy-operator:latest
-# Which layers `make test` runs, for example: make test LAYERS="unit ros"
+# The project's version, from the one place that has it. The chart pulls images of this tag.
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"$$/\1/p' proxy/rosproxy/__init__.py)
+TAG ?= $(VERSION)
+# What stands before the images' names, for example: make image push REGISTRY=registry.example/ros
+REGISTRY ?=
+IMAGE := $(REGISTRY:%=%/)rosproxy
+OPERATOR_IMAGE := $(REGISTRY:%=%/)rosproxy-operator
+# Which layers `make test-all` runs, for example: make test-all LAYERS="unit ros"
 LAYERS ?=
 # Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
 BENCH ?=
@@ -28,14 +33,18 @@ $(VENV)/.bench: $(VENV)/.dev
 
 .PHONY: help
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
 	@$(BIN)/python -m rosproxy.demo
 
 .PHONY: test
-test: $(VENV)/.dev ## every test layer that this machine can run; installs ROS, Docker and a Kubernetes cluster's programs on Debian and Ubuntu as root
+test: $(VENV)/.dev ## unit and integration tests; and a smoke test with real ROS and Docker, which it installs, as root on Debian or Ubuntu
+	@$(BIN)/python scripts/test_layers.py --smoke
+
+.PHONY: test-all
+test-all: $(VENV)/.dev ## every test of every layer that this machine can run; builds a Kubernetes cluster's programs, too
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
 .PHONY: bench
@@ -49,7 +58,7 @@ check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pytest -q tests/unit
+	$(BIN)/pytest -q -n 2 tests/unit
 
 .PHONY: format
 format: $(VENV)/.dev ## rewrite the sources in the house format
@@ -68,9 +77,14 @@ manifests: $(VENV)/.dev ## write manifests/install.yaml and the tables of docs/k
 	@PYTHON=$(BIN)/python scripts/manifests.sh
 
 .PHONY: image
-image: ## build the container images of the proxy and of the controllers (IMAGE, OPERATOR_IMAGE)
-	docker build --target proxy --tag $(IMAGE) .
-	docker build --target operator --tag $(OPERATOR_IMAGE) .
+image: ## build the images rosproxy and rosproxy-operator, tagged with the version and latest (REGISTRY, TAG)
+	docker build --target proxy --tag $(IMAGE):$(TAG) --tag $(IMAGE):latest .
+	docker build --target operator --tag $(OPERATOR_IMAGE):$(TAG) --tag $(OPERATOR_IMAGE):latest .
+
+.PHONY: push
+push: ## push both to REGISTRY, with the version as tag
+	docker push $(IMAGE):$(TAG)
+	docker push $(OPERATOR_IMAGE):$(TAG)
 
 .PHONY: clean
 clean: ## remove what the other targets made

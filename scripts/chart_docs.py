@@ -1,4 +1,4 @@
-"""Write the tables of docs/kubernetes.md that are made from the chart.
+"""Write the tables of docs/reference/custom-resource.md, which are made from the chart.
 
     python scripts/chart_docs.py [--check]
 
@@ -18,7 +18,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs/kubernetes.md"
+PAGE = ROOT / "docs/reference/custom-resource.md"
 INSTALL = ROOT / "manifests/install.yaml"
 VALUES = ROOT / "charts/rosproxy/values.yaml"
 

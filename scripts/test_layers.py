@@ -1,62 +1,89 @@
-"""Run the test layers and say at the end which of them ran.
+"""Run layers of tests, side by side as far as they allow it, and say what ran and how long it took.
 
-    python scripts/test_layers.py [unit] [integration] [ros] [docker] [chart] [kubernetes]
+    python scripts/test_layers.py --smoke          what `make test` runs
+    python scripts/test_layers.py                  what `make test-all` runs
+    python scripts/test_layers.py unit ros         these layers only
 
-First what they need is installed. Then the layers of a lane run one after another, and lanes
-side by side: real nodes and containers mostly wait for something. With several lanes each layer's
-output is shown when it ends.
+How it works. A layer is a directory under tests/. There are two halves, each in lanes: what is in
+a lane runs one after another, the lanes run side by side.
 
-A layer that this machine cannot run is named together with the reason; with CI=true in the
-environment that counts as a failure, so a pipeline never turns green by leaving a layer out.
+  1. The integration tests, which mind a busy machine, have a processor for themselves. Beside them
+     what other layers need is prepared: packages, programs and images, by scripts that do nothing
+     where their work is done already. After that the layers of plain computing run: unit, chart.
+  2. The layers with real nodes, engines and clusters, a lane for each: these mostly wait. They
+     don't start earlier because they mind a machine that is busy with compiling.
 
-Layers with real nodes, engines and clusters depend on the time that these take. Up to three tests
-that fail there are tried once more when the layer has ended, and are named in the summary even if
-they pass then: each of those is a bug to be found, in a test or in what it tests.
+With --smoke, only tests marked `smoke` run of the layers that have such, and layers without are
+left to `make test-all`. So all that `make test` runs is part of `make test-all`.
+
+What a step prints goes to build/test-logs. A layer's is shown whole when it ends, a preparation's
+when it fails. A layer that this machine cannot run is named together with the reason; with CI=true
+in the environment that counts as a failure, so a pipeline never turns green by leaving a layer out.
+No test is tried twice.
 """
 
+import argparse
 import os
 import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
+LOGS = ROOT / "build/test-logs"
 CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
-SOME_FAILED = 1
-"""pytest's exit code when it has run them all; any other failure is one of the whole layer."""
-SECOND_CHANCES = 3
-"""Most tests of a layer that are tried again."""
+ALL, MARKED, NONE = "all", "marked", "none"
+
+ROS, ENGINE, COMPOSE, KUBERNETES, IMAGES = PREPARATIONS = (
+    "install-ros",
+    "install-docker",
+    "install-compose",
+    "install-kubernetes",
+    "build-images",
+)
+COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
+    IMAGES: [sys.executable, "-m", "tests.docker.images"]
+}
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A directory of tests, the lane it runs in, what it needs, and why it may not run here.
+    """A directory of tests, and how it is run.
 
-    Lane 0 runs before all others; its layers have nothing real in them that would be slow at times.
+    ``real``: it belongs to the second half. ``setup``: what prepares this machine for it;
+    ``smoke_setup``: those of them that its smoke needs. ``smoke``: ALL of its tests are in the
+    smoke, those that are MARKED, or NONE. ``workers``: how many processes of pytest share the
+    tests, one file each at a time. ``obstacle`` says why it can't run here, if so.
     """
 
     name: str
-    lane: int = 0
+    real: bool = False
+    smoke: str = NONE
     setup: tuple[str, ...] = ()
+    smoke_setup: tuple[str, ...] = ()
+    workers: int = 0
     obstacle: Callable[[], str | None] = lambda: None
 
-    @property
-    def path(self) -> Path:
-        return ROOT / "tests" / self.name
+    def command(self, report: Path, smoke: bool) -> list[str]:
+        words = [sys.executable, "-m", "pytest", f"tests/{self.name}", f"--junitxml={report}"]
+        words += ["--durations=15", "-o", f"cache_dir={LOGS}/{self.name}-cache"]
+        if self.workers:
+            words += ["-n", str(self.workers), "--dist=loadfile"]
+        return words + (["-m", "smoke"] if smoke and self.smoke == MARKED else [])
 
 
 @dataclass(frozen=True)
 class Outcome:
+    """What became of a layer: whether it ran, whether that is good, and numbers or a reason."""
+
     layer: Layer
     ran: bool
     good: bool
@@ -91,85 +118,96 @@ def effective_capabilities() -> int:
     return 0
 
 
-LAYERS = (
-    Layer("unit"),
-    Layer("integration"),
-    Layer("ros", 1, ("scripts/install-ros.sh",), debian_root_obstacle),
-    Layer("docker", 2, ("scripts/install-docker.sh",), debian_root_obstacle),
-    Layer("chart", 1, ("scripts/install-kubernetes.sh",), debian_root_obstacle),
-    Layer(
-        "kubernetes",
-        2,
-        ("scripts/install-ros.sh", "scripts/install-docker.sh", "scripts/install-kubernetes.sh"),
-        debian_root_obstacle,
-    ),
+UNIT = Layer("unit", smoke=ALL)
+INTEGRATION = Layer("integration", smoke=ALL)
+CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
+ROS_NODES = Layer("ros", True, MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
+DOCKER_ENGINE = Layer(
+    "docker", True, MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
 )
+CLUSTER = Layer(
+    "kubernetes", True, setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle
+)
+LAYERS = (UNIT, INTEGRATION, CHART, ROS_NODES, DOCKER_ENGINE, CLUSTER)
 
 
-def run_all(layers: list[Layer]) -> list[Outcome]:
-    """Run lane 0 first, which minds a busy machine, and then the others side by side."""
-    failed = install(layers)
-    outcomes = [run(layer, failed, None) for layer in layers if layer.lane == 0]
-    numbers = sorted({layer.lane for layer in layers if layer.lane})
-    lanes = [[layer for layer in layers if layer.lane == number] for number in numbers]
-    quiet = threading.Lock() if len(lanes) > 1 else None
-    with ThreadPoolExecutor() as pool:
-        for ran in pool.map(lambda lane: [run(layer, failed, quiet) for layer in lane], lanes):
-            outcomes += ran
-    return outcomes
+class Run:
+    """One run of some layers."""
 
+    def __init__(self, layers: Iterable[Layer], smoke: bool) -> None:
+        self.layers = list(layers)
+        self.smoke = smoke
+        self._started = time.monotonic()
+        self._failed: set[str] = set()
+        self._printing = threading.Lock()
 
-def install(layers: list[Layer]) -> set[str]:
-    """Run the scripts that the layers need, each once; those that failed."""
-    needed = [layer for layer in layers if layer.obstacle() is None]
-    scripts = dict.fromkeys(script for layer in needed for script in layer.setup)
-    return {s for s in scripts if subprocess.run([ROOT / s], cwd=ROOT, check=False).returncode}
+    def all(self) -> list[Outcome]:
+        """Prepare and run; the outcomes in the order of the layers."""
+        LOGS.mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor() as pool:
+            integration = pool.submit(self._lane, [INTEGRATION])
+            self._prepare()
+            outcomes = self._lane([UNIT, CHART]) + integration.result()
+            real = [[layer] for layer in LAYERS if layer.real]
+            for more in pool.map(self._lane, real):
+                outcomes += more
+        return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
+    def _prepare(self) -> None:
+        able = [layer for layer in self.layers if layer.obstacle() is None]
+        for step in dict.fromkeys(step for layer in able for step in self._steps(layer)):
+            code, text = self._run(step, COMMANDS[step])
+            if code:
+                self._failed.add(step)
+                self._say(f"{step} failed:\n{text}")
 
-def run(layer: Layer, failed: set[str], quiet: "threading.Lock | None") -> Outcome:
-    obstacle = layer.obstacle()
-    if obstacle is not None:
-        return Outcome(layer, False, os.environ.get("CI") != "true", f"did not run: {obstacle}")
-    missing = [script for script in layer.setup if script in failed]
-    if missing:
-        return Outcome(layer, False, False, f"did not run: {missing[0]} failed")
-    return run_pytest(layer, quiet)
+    def _steps(self, layer: Layer) -> tuple[str, ...]:
+        return layer.smoke_setup if self.smoke else layer.setup
 
+    def _lane(self, layers: list[Layer]) -> list[Outcome]:
+        return [self._layer(layer) for layer in layers if layer in self.layers]
 
-def run_pytest(layer: Layer, quiet: "threading.Lock | None") -> Outcome:
-    """Run a layer; with ``quiet`` its output is kept until it has ended, and is shown whole."""
-    started = time.monotonic()
-    print(f"\n=== {layer.name} ===", flush=True)
-    with tempfile.TemporaryDirectory() as name, (Path(name) / "output").open("w+") as output:
-        here, shown = Path(name), output if quiet else None
-        code, text = attempt(layer, here / "first.xml", shown)
-        failed = failures(here / "first.xml")
-        if code == SOME_FAILED and layer.lane and 0 < len(failed) <= SECOND_CHANCES:
-            code, said = attempt(layer, here / "second.xml", shown, "--lf", "--lfnf=none")
-            text += f"; at the second attempt {said}: {', '.join(failed)}"
-        if quiet:
-            output.seek(0)
-            with quiet:
-                print(f"\n=== {layer.name} ended ===\n{output.read()}", flush=True)
-    seconds = time.monotonic() - started
-    return Outcome(layer, True, code == 0, f"{text} in {seconds:.0f} s")
+    def _layer(self, layer: Layer) -> Outcome:
+        obstacle = layer.obstacle()
+        if obstacle is not None:
+            return Outcome(layer, False, os.environ.get("CI") != "true", f"did not run: {obstacle}")
+        missing = [step for step in self._steps(layer) if step in self._failed]
+        if missing:
+            return Outcome(layer, False, False, f"did not run: {missing[0]} failed")
+        report, began = LOGS / f"{layer.name}.xml", time.monotonic()
+        report.unlink(missing_ok=True)
+        code, text = self._run(f"tests/{layer.name}", layer.command(report, self.smoke))
+        self._say(f"=== {layer.name} ===\n{text}")
+        numbers = count(report) if report.exists() else "no report"
+        return Outcome(layer, True, code == 0, f"{numbers} in {time.monotonic() - began:.0f} s")
 
+    def _run(self, title: str, command: list[str]) -> tuple[int, str]:
+        """Run a step; its exit code and what it has printed."""
+        log, began = LOGS / f"{title.replace('/', '-')}.log", time.monotonic()
+        self._say(f"{title} …")
+        with log.open("wb") as output:
+            code = subprocess.run(
+                command, cwd=ROOT, check=False, stdout=output, stderr=subprocess.STDOUT
+            ).returncode
+        self._say(f"{title}: {'failed' if code else 'ok'} after {time.monotonic() - began:.0f} s")
+        return code, log.read_text(errors="replace")
 
-def attempt(layer: Layer, report: Path, output: IO[str] | None, *more: str) -> tuple[int, str]:
-    """Run pytest; its exit code, and the numbers as one line of text."""
-    command = [sys.executable, "-m", "pytest", str(layer.path), f"--junitxml={report}"]
-    command += ["-o", f"cache_dir={report.parent / 'cache'}", *more]
-    code = subprocess.run(command, cwd=ROOT, check=False, stdout=output).returncode
-    return code, count(report) if report.exists() else "no report"
+    def _say(self, text: str) -> None:
+        with self._printing:
+            print(f"[{time.monotonic() - self._started:4.0f} s] {text}", flush=True)
 
-
-def failures(report: Path) -> list[str]:
-    """The names of the tests of a JUnit report that have failed."""
-    if not report.exists():
-        return []
-    cases = ElementTree.parse(report).getroot().iter("testcase")
-    bad = [one for one in cases if {"failure", "error"} & {part.tag for part in one}]
-    return [f"{one.get('classname', '').rpartition('.')[2]}::{one.get('name')}" for one in bad]
+    def summary(self, outcomes: list[Outcome]) -> str:
+        minutes, seconds = divmod(round(time.monotonic() - self._started), 60)
+        lines = ["", f"Test layers, {minutes} min {seconds} s in all:"]
+        for outcome in outcomes:
+            mark = "ok" if outcome.good and outcome.ran else "--" if outcome.good else "FAILED"
+            only = " (smoke)" if self.smoke and outcome.layer.smoke == MARKED else ""
+            lines.append(f"  {outcome.layer.name + only:<16} {mark:<7} {outcome.text}")
+        if self.smoke:
+            lines.append(
+                "The whole of each layer, the chart and a Kubernetes cluster: make test-all"
+            )
+        return "\n".join(lines)
 
 
 def count(report: Path) -> str:
@@ -185,26 +223,22 @@ def count(report: Path) -> str:
     return ", ".join(parts[: 1 if not failed + skipped else 3])
 
 
-def summary(outcomes: list[Outcome]) -> str:
-    lines = ["", "Test layers:"]
-    for outcome in outcomes:
-        mark = "ok" if outcome.good and outcome.ran else "--" if outcome.good else "FAILED"
-        lines.append(f"  {outcome.layer.name:<12} {mark:<7} {outcome.text}")
-    return "\n".join(lines)
-
-
-def chosen(names: list[str]) -> list[Layer]:
-    unknown = set(names) - {layer.name for layer in LAYERS}
-    if unknown:
-        sys.exit(f"no such test layer: {', '.join(sorted(unknown))}")
-    return [layer for layer in LAYERS if not names or layer.name in names]
-
-
 def main() -> int:
+    names = [layer.name for layer in LAYERS]
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--smoke", action="store_true", help="of real programs a small part only")
+    parser.add_argument("layers", nargs="*", metavar="layer", help=", ".join(names))
+    options = parser.parse_args()
+    if unknown := set(options.layers) - set(names):
+        parser.error(f"no such layer: {', '.join(sorted(unknown))}")
     # In the background a shell has it ignored, and programs under test inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    outcomes = run_all(chosen(sys.argv[1:]))
-    print(summary(outcomes))
+    wanted = [layer for layer in LAYERS if not options.layers or layer.name in options.layers]
+    if options.smoke:
+        wanted = [layer for layer in wanted if layer.smoke != NONE]
+    run = Run(wanted, options.smoke)
+    outcomes = run.all()
+    print(run.summary(outcomes))
     return 0 if all(outcome.good for outcome in outcomes) else 1
 
 

@@ -117,7 +117,7 @@ def docker(
     """
     from rosproxy.settings import SettingError
     from rosproxy.telemetry import logs
-    from rosproxy_operator.settings import parse_docker_settings
+    from rosproxy_operator.docker.settings import parse_docker_settings
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
@@ -267,7 +267,7 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
     """
     from rosproxy.settings import SettingError
-    from rosproxy_operator.settings import parse_kubernetes_settings
+    from rosproxy_operator.kubernetes.settings import parse_kubernetes_settings
 
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")
@@ -305,17 +305,18 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        reason = str(error) if "HTTP" in str(error) else f"no controller answers at {url}"
+        reason = str(error) if "HTTP" in str(error) else f"no operator answers at {url}"
         click.echo(f"rosproxy-operator: {reason}", err=True)
         sys.exit(1)
 
 
 def _or_exit(work: Callable[[], Any]) -> Any:
     """Do something that may find no engine, and say so in one line."""
+    from rosproxy_operator.common.control_loop import LookFailed
     from rosproxy_operator.docker.errors import EngineError
 
     try:
         return work()
-    except EngineError as error:
+    except (EngineError, LookFailed) as error:
         click.echo(f"rosproxy-operator: {error}", err=True)
         sys.exit(1)

@@ -25,12 +25,13 @@ from rosproxy.ros1.servers.master import MasterApi, PublishedMaster
 from rosproxy.ros1.servers.slave import SlaveApi
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
-from rosproxy.ros1.upkeep.containers.events import ContainerEvents, Parts
+from rosproxy.ros1.upkeep.containers.events import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.prober import TICK, Prober
-from rosproxy.ros1.upkeep.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription.publisher_updates import PublisherUpdates
-from rosproxy.ros1.upkeep.resubscription.resubscriber import SILENT_TICK, Resubscriber
+from rosproxy.ros1.upkeep.prober.prober import PROBE_TICK, Prober
+from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
+from rosproxy.ros1.upkeep.recovery.recovery import Recovery
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscription.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.settings import SettingError, Settings
 from rosproxy.telemetry.metrics import StateCollector
 
@@ -49,23 +50,28 @@ class App:
         nodes = NodeClient(context.upstream, settings.probe_timeout)
         self._tcpros = TcprosServer(context, nodes)
         self._plane = KernelPlane(context)
-        self._mirror = Alias(context)
-        updates = PublisherUpdates(context, self._mirror)
-        silent = Resubscriber(context, updates, self._tcpros.topic_connections, self._plane.look)
+        self.alias = Alias(context)
+        updates = PublisherUpdates(context, self.alias)
+        self.registrar = registrar = Registrar(context, nodes, updates)
+        self._resubscriber = Resubscriber(context, registrar, updates, self._tcpros, self._plane)
         self._leases = Leases(
             context,
             nodes,
             self._plane,
             self._connection,
             self._close_port,
-            lambda endpoint: silent.watch([endpoint]),
+            lambda endpoint: self._resubscriber.watch([endpoint]),
         )
-        self._upkeep = Registrar(context, nodes, updates, silent)
-        self._keeper = Prober(context, self._leases, nodes, self._upkeep)
-        self._watch = MasterMonitor(context, self._keeper, self._upkeep, self._plane)
-        self._strays = Adopter(context, self._leases, nodes, self._upkeep)
+        self._recovery = Recovery(
+            context, self._leases, nodes, registrar, self._resubscriber, self._plane
+        )
+        self.prober = Prober(
+            context, self._leases, nodes, registrar, self._resubscriber, self._recovery
+        )
+        self.master_monitor = MasterMonitor(context, self._recovery, registrar)
+        self._adopter = Adopter(context, self._leases, nodes, registrar)
         self._slaves = XmlRpcServer(
-            SlaveApi(context, self._leases, self._mirror, self._strays.spared),
+            SlaveApi(context, self._leases, self.alias, self._adopter),
             "rosproxy: slave API of a ROS node behind it\n",
         )
         self._servers = [self._slaves]
@@ -78,9 +84,7 @@ class App:
         self._reserve_range()
         await self._plane.start()
         settings = self.settings
-        master = MasterApi(
-            self.context, self._leases, self._mirror, self._watch.recovered, self._strays.heed
-        )
+        master = MasterApi(self.context, self._leases, self.alias, self._recovery, self._adopter)
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
@@ -89,11 +93,11 @@ class App:
         self.context.metrics.registry.register(self._state_metrics())
         await self._start_admin()
         repeat = self.context.tasks.repeat
-        repeat(self._watch.look, settings.master_interval, "watching the master")
-        repeat(self._keeper.look, TICK, "looking after nodes")
+        repeat(self.master_monitor.look, settings.master_interval, "watching the master")
+        repeat(self.prober.look, PROBE_TICK, "looking after nodes")
         repeat(self._leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
-        repeat(self._upkeep.look_for_silent, SILENT_TICK, "looking for silent subscribers")
-        repeat(self._mirror.tidy, TIDY_INTERVAL, "looking after mirrored ports")
+        repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
+        repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
         repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
@@ -105,31 +109,33 @@ class App:
         for endpoint in self.context.registry:
             self._leases.close(endpoint)
         self.context.bank.close_all()
-        self._mirror.close()
+        self.alias.close()
         await self.context.tasks.cancel()
         await self._plane.stop()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), self._mirror.stop(), *servers)
+        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), self.alias.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return to_json(describe(self.context, self._watch, self._tcpros, self._mirror, self._plane))
+        return to_json(
+            describe(self.context, self.master_monitor, self._tcpros, self.alias, self._plane)
+        )
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
-        parts = Parts(
+        containers = ContainerEvents(
             self.context,
             self._leases,
             nodes,
-            self._upkeep,
-            self._strays,
-            self._watch.recovered,
-            self._cut,
+            self.registrar,
+            self._adopter,
+            self._recovery,
+            self._tcpros,
+            self._plane,
         )
-        containers = ContainerEvents(parts)
         actions = {
             "/probe": self._probe,
-            "/containers": containers.hear,
+            "/containers": containers.handle,
             "/master-address": self._set_master_address,
             "/retire": containers.retire,
         }
@@ -144,9 +150,9 @@ class App:
     def _unready(self) -> str | None:
         if self.context.retired:
             return "retired: nothing is registered any more"
-        if self._watch.up:
+        if self.master_monitor.up:
             return None
-        return self._watch.error or f"master {self.settings.master_uri} was not asked yet"
+        return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
         return to_json(await probe_range(self.context, self._leases))
@@ -157,7 +163,7 @@ class App:
         if address != upstream.master_address:
             log.info("master %s is looked for at %s", self.settings.master_uri, address)
             upstream.master_address = address
-            self.context.tasks.spawn(self._watch.look(), "looking for the master")
+            self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
 
     async def _connection(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
@@ -169,13 +175,6 @@ class App:
             await self._slaves.serve(conn)
         else:
             await self._tcpros.serve(endpoint, conn, peer)
-
-    def _cut(self, port: int) -> None:
-        """End the connections through a lease, also those that the kernel forwards."""
-        self._tcpros.cut(port)
-        endpoint = self.context.registry.by_port.get(port)
-        if endpoint is not None:
-            self._plane.cut(endpoint)
 
     def _close_port(self, port: int) -> None:
         self._slaves.close_port(port)
@@ -226,8 +225,8 @@ class App:
             self.context.registry,
             self._tcpros.traffic,
             lambda: len(self._tcpros.relays),
-            lambda: len(self._mirror),
-            lambda: bool(self._watch.up),
+            lambda: len(self.alias),
+            lambda: bool(self.master_monitor.up),
             self._plane.tally,
         )
 

@@ -106,10 +106,10 @@ def read_range(text: str) -> PortRange:
     """A range of ports, ``first-last``. Raises ValueError."""
     found = _RANGE.fullmatch(text)
     if found is None:
-        raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 45000-45099")
+        raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
     ports = PortRange(int(found[1]), int(found[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
-        raise ValueError(f"{text!r} must rise and lie between 1 and 65535, such as 45000-45099")
+        raise ValueError(f"{text!r} must rise and lie between 1 and 65535, such as 11000-11099")
     return ports
 
 

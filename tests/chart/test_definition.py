@@ -9,12 +9,12 @@ from scripts.chart_docs import custom_resource
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
     Name,
     NodeState,
     Pod,
     ProxyPod,
-    Service,
+    ProxyReport,
+    ProxyService,
 )
 from rosproxy_operator.kubernetes.planner.spec import MOST_NAME, MOST_PORTS, rosproxy
 from rosproxy_operator.kubernetes.planner.status import status_of
@@ -126,12 +126,14 @@ def test_status_is_in_the_definition() -> None:
     ports = PortRange(11400, 11431)
     proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", ports, "f", "rosproxy:1", ready=True)
     pod = Pod(Name("b", "talker"), "v", node="n", ip="192.0.2.3")
-    answer = Answer(True, True, nodes={"192.0.2.3": ("/talker",)}, topics=frozenset({"/chatter"}))
+    answer = ProxyReport(
+        True, True, nodes={"192.0.2.3": ("/talker",)}, topics=frozenset({"/chatter"})
+    )
     states = (
         NodeState("n", "192.0.2.1", ports, proxy, (pod,), answer),
         NodeState("m", "192.0.2.2", None, None, (pod,), None, "no ports", "PortsExhausted"),
     )
-    service = Service(own.id, "c", "w", "192.0.2.9", "f")
+    service = ProxyService(own.id, "c", "w", "192.0.2.9", "f")
     status = status_of(own, states, (), service, "http://robot:11311", "2026-01-01T00:00:00Z")
     written = set(paths(status, "status"))
     assert written <= set(STATUS)

@@ -9,7 +9,7 @@ import pytest
 
 from rosproxy import __version__
 from rosproxy_operator.cli import main
-from rosproxy_operator.settings import WebhookSettings, parse_kubernetes_settings
+from rosproxy_operator.kubernetes.settings import WebhookSettings, parse_kubernetes_settings
 from tests.chart.chart import (
     CHART,
     NAMESPACE,

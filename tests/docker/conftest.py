@@ -1,14 +1,14 @@
 """The engine, the images and machines outside, made once for all tests."""
 
-import hashlib
 import os
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 
 import pytest
 
+from tests.docker import images
 from tests.docker.controller import Controller, proxies, remove_proxies, running_controller
-from tests.docker.engine import ROOT, build, docker, run, running_engine
+from tests.docker.engine import docker, running_engine
 from tests.docker.inside import Inside, inside
 from tests.docker.machines import Machine
 from tests.docker.robot import Robot, laptop, named_robot, robot_outside
@@ -35,44 +35,28 @@ def _engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def base_image() -> str:
-    """Debian without a registry; ROSPROXY_TEST_BASE_IMAGE names another base."""
-    chosen = os.environ.get("ROSPROXY_TEST_BASE_IMAGE")
-    if chosen:
-        return chosen
-    script = ROOT / "scripts/base-image.sh"
-    version = hashlib.sha256(script.read_bytes()).hexdigest()[:12]
-    name = f"rosproxy-test-base:{version}"
-    run(script, name, seconds=600)
-    return name
+def base_image(_engine: None) -> str:
+    return images.base_image()
 
 
 @pytest.fixture(scope="session")
-def proxy_image(base_image: str) -> str:
-    """The image as a user builds it, on the base that is at hand."""
-    arguments = ("--build-arg", f"BASE_IMAGE={base_image}", "--target", "proxy")
-    return build("rosproxy:test", *arguments, ROOT)
+def proxy_image(_engine: None) -> str:
+    return images.build_image(images.PROXY)
 
 
 @pytest.fixture(scope="session")
-def controller_image(base_image: str) -> str:
-    arguments = ("--build-arg", f"BASE_IMAGE={base_image}", "--target", "operator")
-    return build("rosproxy-operator:test", *arguments, ROOT)
+def controller_image(_engine: None) -> str:
+    return images.build_image(images.OPERATOR)
 
 
 @pytest.fixture(scope="session")
-def ros_image(base_image: str) -> str:
-    """A machine with ROS 1 on it."""
-    arguments = ("--build-arg", f"BASE_IMAGE={base_image}")
-    dockerfile = ("--file", ROOT / "tests/docker/ros.Dockerfile")
-    return build("rosproxy-test-ros:latest", *arguments, *dockerfile, ROOT / "tests/ros/nodes")
+def ros_image(_engine: None) -> str:
+    return images.build_image(images.ROS)
 
 
 @pytest.fixture(scope="session")
-def haproxy_image(base_image: str) -> str:
-    here = ROOT / "tests/docker"
-    arguments = ("--build-arg", f"BASE_IMAGE={base_image}", "--file", here / "haproxy.Dockerfile")
-    return build("rosproxy-test-haproxy:latest", *arguments, here)
+def haproxy_image(_engine: None) -> str:
+    return images.build_image(images.HAPROXY)
 
 
 @pytest.fixture(scope="module")

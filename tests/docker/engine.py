@@ -1,5 +1,6 @@
 """The Docker engine that the tests use, by its command line."""
 
+import fcntl
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+_USERS = Path("/run/lock/rosproxy-tests-engine")
 
 
 def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
@@ -68,21 +70,39 @@ def answers() -> bool:
 
 @contextmanager
 def running_engine(log: Path) -> Iterator[None]:
-    """Use the engine that runs; start one and stop it again where none does."""
-    if answers():
-        yield
-        return
-    policy = forward_policy()
-    with log.open("wb") as output:
-        daemon = subprocess.Popen(["dockerd"], stdout=output, stderr=output, start_new_session=True)
-    try:
-        wait_until(lambda: daemon.poll() is not None or answers(), 60, log.read_text)
-        assert daemon.poll() is None, log.read_text()
-        yield
-    finally:
-        daemon.terminate()
-        daemon.wait(60)
-        run("iptables", "-P", "FORWARD", policy)
+    """Use the engine that runs; start one where none does.
+
+    Several processes may be in here at the same time. The one that has started the engine stops it
+    after waiting for the others.
+    """
+    with _USERS.open("w") as users:
+        fcntl.flock(users, fcntl.LOCK_EX)
+        own = None if answers() else _Daemon(log)
+        fcntl.flock(users, fcntl.LOCK_SH)
+        try:
+            yield
+        finally:
+            if own:
+                fcntl.flock(users, fcntl.LOCK_EX)
+                own.stop()
+
+
+class _Daemon:
+    """An engine that was started here, and answers."""
+
+    def __init__(self, log: Path) -> None:
+        self._policy = forward_policy()
+        with log.open("wb") as output:
+            self._process = subprocess.Popen(
+                ["dockerd"], stdout=output, stderr=output, start_new_session=True
+            )
+        wait_until(lambda: self._process.poll() is not None or answers(), 60, log.read_text)
+        assert self._process.poll() is None, log.read_text()
+
+    def stop(self) -> None:
+        self._process.terminate()
+        self._process.wait(60)
+        run("iptables", "-P", "FORWARD", self._policy)
 
 
 def forward_policy() -> str:

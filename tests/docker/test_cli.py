@@ -57,7 +57,7 @@ def test_health_and_metrics(controller: Controller, net: Inside) -> None:
     wait_until(lambda: get("/readyz")[0] == 200, 10, lambda: get("/readyz")[1])
     code, text = get("/metrics")
     assert code == 200
-    for name in ("rosproxy_controller_", "process_cpu_seconds_total"):
+    for name in ("rosproxy_operator_", "process_cpu_seconds_total"):
         assert name in text
     assert get("/nosuch")[0] == 404
 

@@ -25,7 +25,7 @@ def old_talker(net: Inside, network: str, robot: Robot) -> Container:
     return node
 
 
-@pytest.mark.parametrize("end", ["kill", "rm --force"])
+@pytest.mark.parametrize("end", [pytest.param("kill", marks=pytest.mark.smoke), "rm --force"])
 def test_dead_containers_nodes_are_unregistered_at_once(
     end: str, controller: Controller, net: Inside, named: Robot
 ) -> None:
@@ -51,6 +51,7 @@ def test_stopped_containers_nodes_are_unregistered(
     wait_until(lambda: not named.uri(node.node), 2, "the master forgets the node")
 
 
+@pytest.mark.smoke
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_restarted_container_is_heard_again(
     library: str, controller: Controller, net: Inside, named: Robot

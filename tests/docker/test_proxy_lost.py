@@ -62,8 +62,8 @@ def test_lost_ports_come_back(how: str, flow: Traffic) -> None:
 
 
 CASES = [
-    ("docker kill", "rospy"),
-    ("docker kill", "roscpp"),
+    pytest.param("docker kill", "rospy", marks=pytest.mark.smoke),
+    pytest.param("docker kill", "roscpp", marks=pytest.mark.smoke),
     ("docker rm --force", "rospy"),
     ("docker stop", "roscpp"),
     ("crash", "rospy"),

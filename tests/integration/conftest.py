@@ -9,14 +9,14 @@ import pytest
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web import RequestPayloadError
 
-from tests.integration.master import Master
-from tests.integration.net import NODE
-from tests.integration.node import Node
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
+from tests.integration.net import MASTER, NODE
 from tests.integration.process import Process
 from tests.integration.proxy import Proxy, settings_for
 
 MakeProxy = Callable[..., Awaitable[Proxy]]
-MakeNode = Callable[..., Awaitable[Node]]
+MakeNode = Callable[..., Awaitable[FakeNode]]
 LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 
 
@@ -58,9 +58,9 @@ def is_left_out(record: logging.LogRecord) -> bool:
 
 
 @pytest.fixture
-async def master() -> AsyncIterator[Master]:
+async def master() -> AsyncIterator[FakeMaster]:
     """A ROS master outside."""
-    made = Master()
+    made = FakeMaster(MASTER)
     await made.start()
     yield made
     await made.stop()
@@ -69,12 +69,12 @@ async def master() -> AsyncIterator[Master]:
 @pytest.fixture
 async def make_node() -> AsyncIterator[MakeNode]:
     """Starts inside nodes."""
-    made: list[Node] = []
+    made: list[FakeNode] = []
 
     async def make(
         name: str = "/talker", address: str = NODE, host: str = "", port: int = 0
-    ) -> Node:
-        node = Node(name, address, host)
+    ) -> FakeNode:
+        node = FakeNode(name, address, host)
         node.slave.address = address, port
         made.append(node)
         await node.start()
@@ -86,13 +86,13 @@ async def make_node() -> AsyncIterator[MakeNode]:
 
 @pytest.fixture
 async def make_proxy(
-    master: Master, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+    master: FakeMaster, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[MakeProxy]:
     """Starts proxies in this process, for the master unless told otherwise.
 
     They are stopped before the nodes: a node can't close connections that are just being made.
     """
-    monkeypatch.setattr("rosproxy.app.TICK", 0.03)
+    monkeypatch.setattr("rosproxy.app.PROBE_TICK", 0.03)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:
@@ -112,13 +112,13 @@ async def proxy(make_proxy: MakeProxy) -> Proxy:
 
 
 @pytest.fixture
-async def node(make_node: MakeNode) -> Node:
+async def node(make_node: MakeNode) -> FakeNode:
     """An inside node that has not registered yet."""
     return await make_node()
 
 
 @pytest.fixture
-def start_process(master: Master) -> Iterator[Callable[..., Process]]:
+def start_process(master: FakeMaster) -> Iterator[Callable[..., Process]]:
     """Starts proxies as processes of their own, for the master unless told otherwise."""
     made: list[Process] = []
 

@@ -1,10 +1,9 @@
-"""Addresses, free ports, raw connections and XML-RPC for the tests.
+"""Addresses, raw connections, XML-RPC and TCPROS headers for the tests.
 
 All of 127.0.0.0/8 is loopback on Linux: every host of a test gets an address of its own there.
 """
 
 import asyncio
-import random
 import socket
 import struct
 import xmlrpc.client
@@ -13,7 +12,10 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
-from urllib.parse import urlsplit
+
+from rosproxy.demo.fake_http import Where, call, where
+from rosproxy.demo.fake_node import Header
+from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 
 MASTER = "127.0.1.1"
 OUTSIDE = "127.0.1.9"
@@ -24,38 +26,6 @@ HOST = "127.0.3.1"
 
 PATIENCE = 5.0
 """Seconds after which something awaited counts as missing."""
-
-Where = tuple[str, int]
-
-
-def free_ports(count: int, address: str = "") -> int:
-    """The first of ``count`` ports in a row that nobody uses; below the ephemeral range."""
-    while True:
-        first = random.randrange(15000, 32000 - count)
-        if all(_is_free(port, address) for port in range(first, first + count)):
-            return first
-
-
-def _is_free(port: int, address: str) -> bool:
-    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
-        try:
-            probe.bind((address, port))
-        except OSError:
-            return False
-    return True
-
-
-def bracketed(host: str) -> str:
-    """A host as it stands in a URI."""
-    return f"[{host}]" if ":" in host else host
-
-
-def where(uri: str) -> Where:
-    """Host and port of a URI."""
-    parts = urlsplit(uri)
-    assert parts.hostname
-    assert parts.port
-    return parts.hostname, parts.port
 
 
 async def until(condition: Callable[[], Any], what: str, within: float = PATIENCE) -> None:
@@ -239,9 +209,28 @@ async def rpc(
 
     ``host`` is what the caller calls the peer, for one that it reaches through NAT.
     """
+    return await call(address, method, *params, source=source, host=host)
+
+
+def topic_header(topic: str = "/chatter", caller: str = "/outside") -> bytes:
+    """The connection header of a subscriber."""
+    return encode_header({"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"})
+
+
+def service_header(service: str = "/add", caller: str = "/outside") -> bytes:
+    """The connection header of a service client."""
+    return encode_header({"callerid": caller, "service": service, "md5sum": "*"})
+
+
+async def read_header(wire: Wire) -> Header:
+    """The next TCPROS header."""
+    size = int.from_bytes(await wire.exactly(4), "little")
+    return decode_header(await wire.exactly(size))
+
+
+async def greet(address: Where | str, header: bytes) -> Header:
+    """What a TCPROS header is answered with."""
     target = where(address) if isinstance(address, str) else address
-    host = host or f"{bracketed(target[0])}:{target[1]}"
-    body = xml(method, *params)
-    lines = ["POST / HTTP/1.1", f"Host: {host}", f"Content-Length: {len(body)}"]
-    request = "\r\n".join([*lines, "", ""]).encode() + body
-    return (await exchange(target, request, source)).value
+    async with connect(target) as wire:
+        await wire.send(header)
+        return await read_header(wire)

@@ -9,7 +9,8 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from tests.integration.net import PROXY, Where
+from rosproxy.demo.fake_http import Where
+from tests.integration.net import PROXY
 from tests.integration.proxy import options_for
 
 

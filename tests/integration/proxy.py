@@ -5,10 +5,11 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from rosproxy.app import App
+from rosproxy.demo.fake_http import Where, free_ports, where
+from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings
-from tests.integration.net import HOST, PROXY, Where, free_ports, where
-from tests.integration.node import Node
+from tests.integration.net import HOST, PROXY, refuses, until
 from tests.run_options import parse_settings
 
 PORTS = 8
@@ -74,16 +75,29 @@ class Proxy:
             async with asyncio.timeout(5):
                 await self.app.stop()
 
-    def endpoint(self, node: Node) -> Endpoint:
+    def metric(self, name: str, **labels: str) -> float:
+        """What a metric stands at; 0 if there is none of these labels yet."""
+        registry = self.app.context.metrics.registry
+        return registry.get_sample_value(f"rosproxy_{name}", labels) or 0
+
+    async def serves(self, node: FakeNode) -> bool:
+        """Whether a node's port is open."""
+        return not await refuses(self.lease(node))
+
+    async def quiet(self) -> None:
+        """Wait until no connection is relayed any more."""
+        await until(lambda: not self.metric("open_connections"), "all relays end")
+
+    def endpoint(self, node: FakeNode) -> Endpoint:
         """What the proxy knows of a node."""
         key = node.address, node.slave.address[1]
         return next(e for e in self.app.context.registry if e.key == key)
 
-    def lease(self, node: Node) -> Where:
+    def lease(self, node: FakeNode) -> Where:
         """Where outside reaches a node."""
         endpoint = self.endpoint(node)
         return where(self.app.context.addressing.advertised_uri(endpoint))
 
-    def uri(self, node: Node) -> str:
+    def uri(self, node: FakeNode) -> str:
         """A node's slave URI as outside sees it."""
         return self.app.context.addressing.advertised_uri(self.endpoint(node))

@@ -7,10 +7,22 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.master import Master
-from tests.integration.net import HOST, NODE, OTHER_NODE, OUTSIDE, PROXY, connect, rpc, until
-from tests.integration.node import Node, greet, service_header, topic_header
+from tests.integration.net import (
+    HOST,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    PROXY,
+    connect,
+    greet,
+    rpc,
+    service_header,
+    topic_header,
+    until,
+)
 from tests.integration.proxy import Proxy
 
 
@@ -30,15 +42,15 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture
-async def master6() -> AsyncIterator[Master]:
-    made = Master()
-    await made.start("::1")
+async def master6() -> AsyncIterator[FakeMaster]:
+    made = FakeMaster("::1")
+    await made.start()
     yield made
     await made.stop()
 
 
 @pytest.fixture
-async def proxy6(make_proxy: MakeProxy, master6: Master) -> Proxy:
+async def proxy6(make_proxy: MakeProxy, master6: FakeMaster) -> Proxy:
     networks = ("127.0.2.0/24", "::1/128")
     proxy = await make_proxy(
         bind="::", master_uri=master6.uri, advertise_host="::1", inside_network=networks
@@ -48,12 +60,12 @@ async def proxy6(make_proxy: MakeProxy, master6: Master) -> Proxy:
 
 
 @pytest.fixture
-async def node6(make_node: MakeNode) -> Node:
+async def node6(make_node: MakeNode) -> FakeNode:
     return await make_node("/six", "::1")
 
 
 async def test_a_node_master_and_peers_over_ipv6(
-    proxy6: Proxy, master6: Master, node6: Node
+    proxy6: Proxy, master6: FakeMaster, node6: FakeNode
 ) -> None:
     assert (await node6.publish(proxy6.master))[0] == 1
     port = proxy6.endpoint(node6).port
@@ -85,7 +97,7 @@ async def test_both_stacks_on_the_same_ports(proxy6: Proxy, make_node: Any) -> N
 
 
 async def test_the_peer_of_a_connection_is_shown_without_a_prefix(
-    proxy6: Proxy, node6: Node, make_node: Any
+    proxy6: Proxy, node6: FakeNode, make_node: Any
 ) -> None:
     four = await make_node("/four")
     proxy6.master = PROXY, proxy6.settings.master_port
@@ -98,7 +110,7 @@ async def test_the_peer_of_a_connection_is_shown_without_a_prefix(
 
 
 async def test_recovery_over_ipv6(
-    proxy6: Proxy, make_proxy: MakeProxy, master6: Master, node6: Node
+    proxy6: Proxy, make_proxy: MakeProxy, master6: FakeMaster, node6: FakeNode
 ) -> None:
     await node6.publish(proxy6.master)
     (uri,) = master6.holds("publishers", "/chatter")
@@ -111,5 +123,5 @@ async def test_recovery_over_ipv6(
         port_range=str(proxy6.settings.ports.listen),
     )
     await until(lambda: len(fresh.app.context.registry), "the node is found")
-    await until(lambda: fresh.app._leases.is_open(fresh.endpoint(node6)), "it is served")
+    await until(lambda: fresh.serves(node6), "it is served")
     assert (await rpc(uri, "getPid", "/outside"))[2] == node6.pid

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import Where
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
-from tests.integration.net import HOST, NODE, Where, connect, exchange, post, rpc, xml
+from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
 XML = b"<?xml version='1.0'?>"
@@ -365,6 +366,8 @@ async def test_a_name_server_that_hangs_does_not_hold_up_a_call_to_a_node(proxy,
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_more: answer.wait(20) and [])
     try:
         with pytest.raises(Unreachable, match="can't be resolved"):
-            await proxy.app.context.upstream.node(HostPort("nowhere.invalid", 1), b"", within=10)
+            await proxy.app.context.upstream.post_to_node(
+                HostPort("nowhere.invalid", 1), b"", within=10
+            )
     finally:
         answer.set()

@@ -5,21 +5,23 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from tests.integration.http_fake import Answer, HttpFake, Request, ok, value
+from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, ok, value
 from tests.integration.net import (
     HOST,
     NODE,
     OTHER_NODE,
     PROXY,
     connect,
+    greet,
     knock,
     post,
     refuses,
     rpc,
+    service_header,
+    topic_header,
     until,
     xml,
 )
-from tests.integration.node import greet, service_header, topic_header
 
 SECRET = b"<html>the other host's secret</html>"
 
@@ -29,14 +31,14 @@ class Victim:
 
     def __init__(self) -> None:
         self.answer: Answer = ok(SECRET)
-        self.seen: list[Request] = []
-        self.http = HttpFake(self._respond)
+        self.seen: list[FakeRequest] = []
+        self.http = FakeHttpServer(self._respond)
 
     @property
     def port(self) -> int:
         return self.http.address[1]
 
-    async def _respond(self, request: Request) -> Answer:
+    async def _respond(self, request: FakeRequest) -> Answer:
         self.seen.append(request)
         return self.answer
 
@@ -211,6 +213,6 @@ async def test_a_forged_claim_does_not_displace_the_real_node(master, make_proxy
     await forge(master, "/evil2", port + 1, here, *topics)
     fresh = await make_proxy(port_range=str(proxy.settings.ports.listen))
     await until(lambda: len(fresh.app.context.registry), "the node is found")
-    await until(lambda: fresh.app._leases.is_open(fresh.endpoint(node)), "the node is served")
+    await until(lambda: fresh.serves(node), "the node is served")
     assert fresh.uri(node) == uri
     assert (await rpc(uri, "getPid", "/outside"))[2] == node.pid

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tests.docker.engine import wait_until
+from tests.docker.images import ROS
 from tests.docker.nodes import Log, node_command
 from tests.kubernetes import api
 from tests.kubernetes.api import Json
 from tests.kubernetes.cluster.control_plane import kubectl
-from tests.kubernetes.cluster.images import ROS_IMAGE
 from tests.kubernetes.cluster.layout import node_named
 from tests.kubernetes.cluster.node import crash_container
 
@@ -114,7 +114,7 @@ class Namespace:
         env: Mapping[str, str] | None = None, ports: tuple[int, ...] = (), **spec: Any,
     ) -> Json:  # fmt: skip
         container: Json = {
-            "name": "ros", "image": ROS_IMAGE, "imagePullPolicy": "Never", "command": list(command),
+            "name": "ros", "image": ROS, "imagePullPolicy": "Never", "command": list(command),
             "env": [{"name": key, "value": value} for key, value in (env or {}).items()],
             "ports": [{"containerPort": port, "hostPort": port} for port in ports],
         }  # fmt: skip

@@ -3,8 +3,9 @@
 import time
 
 from tests.docker.engine import run, wait_until
+from tests.docker.images import PROXY
 from tests.kubernetes import release
-from tests.kubernetes.cluster.images import PROXY_IMAGE, load_images
+from tests.kubernetes.cluster.images import load_images
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
@@ -34,7 +35,7 @@ def test_upgrade_of_the_controller_only(net: Namespace, robot: Robot) -> None:
 
 def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
     """Their image is changed in place: the same pod, the same ports."""
-    run("docker", "build", "--tag", OTHER, "--label", "other=1", "-", input=f"FROM {PROXY_IMAGE}")
+    run("docker", "build", "--tag", OTHER, "--label", "other=1", "-", input=f"FROM {PROXY}")
     load_images(OTHER)
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "rospy") as traffic:

@@ -34,3 +34,44 @@ def each_pair(first: str, second: str) -> pytest.MarkDecorator:
     """Every pair of libraries, as arguments with the two names."""
     pairs = [(a, b) for a in LIBRARIES for b in LIBRARIES]
     return pytest.mark.parametrize((first, second), pairs, ids=[f"{a}-to-{b}" for a, b in pairs])
+
+
+def each_way_and_order(
+    first: str, second: str, directions: tuple[str, ...] = tuple(DIRECTIONS)
+) -> pytest.MarkDecorator:
+    """Every pair of libraries in every direction; who starts first (``starter``) takes turns.
+
+    So each library is, in each role and direction, once the first and once the second to start;
+    and each pair of libraries starts in both orders.
+    """
+    rows = [
+        (a, b, *DIRECTIONS[way], (first, second)[(i + j + k) % 2], f"{a}-to-{b}-{way}")
+        for i, a in enumerate(LIBRARIES)
+        for j, b in enumerate(LIBRARIES)
+        for k, way in enumerate(directions)
+    ]
+    return pytest.mark.parametrize(
+        (first, second, "source", "sink", "starter"),
+        [row[:5] for row in rows],
+        ids=[f"{row[5]}-{row[4]}-first" for row in rows],
+    )
+
+
+def each_way_in_turn(
+    first: str, second: str, directions: tuple[str, ...] = tuple(DIRECTIONS)
+) -> pytest.MarkDecorator:
+    """Each library in each role in each direction, and each pair of libraries: half of all.
+
+    For what is built on messages and calls, which `each_way_and_order` tries in every combination:
+    a defect that needs both libraries and the direction to be certain ones shows there.
+    """
+    rows = [
+        (a, b, *DIRECTIONS[way], f"{a}-to-{b}-{way}")
+        for i, a in enumerate(LIBRARIES)
+        for j, b in enumerate(LIBRARIES)
+        for way in directions
+        if (i == j) == (way == "outside-to-inside")
+    ]
+    return pytest.mark.parametrize(
+        (first, second, "source", "sink"), [row[:4] for row in rows], ids=[row[4] for row in rows]
+    )

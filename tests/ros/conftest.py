@@ -17,6 +17,7 @@ import pytest
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+OWN = f"{HERE.relative_to(ROOT)}/"
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
@@ -32,6 +33,7 @@ _MISSING = pytest.StashKey[str]()
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "boundary: makes sense only with a boundary and a proxy")
     config.stash[report.KEY] = report.Report(flat=FLAT)
+    config.pluginmanager.register(Collector(config))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -62,9 +64,18 @@ def pytest_runtest_makereport(
     lab = getattr(item, "funcargs", {}).get("lab")
     if result.failed and isinstance(lab, Lab):
         result.sections += lab.transcripts()
-    if HERE in item.path.parents:
-        item.config.stash[report.KEY].add(result)
     return result
+
+
+class Collector:
+    """Gathers what the cases report, also those that run in other processes (pytest-xdist)."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._report = config.stash[report.KEY]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.nodeid.startswith(OWN):
+            self._report.add(report)
 
 
 def pytest_terminal_summary(
@@ -130,4 +141,4 @@ def lab(module_lab: Lab) -> Iterator[Lab]:
 @pytest.fixture
 def measure(request: pytest.FixtureRequest) -> Callable[[str, float], None]:
     """Notes a time in seconds for the report at the end."""
-    return request.config.stash[report.KEY].measure
+    return lambda name, seconds: report.measure(request.node, name, seconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import subprocess
@@ -15,10 +16,12 @@ FLAGS = ("-std=c++17", "-O1", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
 
 def compiled_node() -> Path:
     """The path of the C++ node program, compiled now if its sources have changed."""
+    CACHE.mkdir(parents=True, exist_ok=True)
     binary = CACHE / f"node-{_digest()}"
-    if not binary.exists():
-        CACHE.mkdir(parents=True, exist_ok=True)
-        _compile(binary)
+    with (CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # several processes may run tests
+        if not binary.exists():
+            _compile(binary)
     return binary
 
 

@@ -30,7 +30,7 @@ def missing(with_proxy: bool) -> str | None:
         names = ", ".join(gone)
         return f"this layer needs ROS 1: run `scripts/install-ros.sh` as root (missing: {names})"
     if os.geteuid() != 0:
-        return "this layer makes network namespaces: run it as root (`make test LAYERS=ros`)"
+        return "this layer makes network namespaces: run it as root (`make test-all LAYERS=ros`)"
     if with_proxy and importlib.util.find_spec("rosproxy") is None:
         return "rosproxy is not installed in this Python: run `make venv`"
     return None

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from tests.ros.combinations import each_direction, each_pair
+from tests.ros.combinations import each_way_in_turn
 from tests.ros.lab import Lab
 
 SUCCEEDED, PREEMPTED = 3, 2
 
 
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client")
 def test_a_goal_gives_feedback_and_a_result(
     lab: Lab, server: str, client: str, source: str, sink: str
 ) -> None:
@@ -21,8 +20,7 @@ def test_a_goal_gives_feedback_and_a_result(
     caller.wait_for(f"^finished 1 state {SUCCEEDED} sum 42$")
 
 
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client")
 def test_a_goal_is_cancelled(lab: Lab, server: str, client: str, source: str, sink: str) -> None:
     action = f"/{lab.unique('long')}"
     serving = lab.node(server, source, "actionserver", action=action, seconds=30)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.ros.combinations import LIBRARIES, each_direction, each_library, each_pair
+from tests.ros.combinations import LIBRARIES, each_library, each_way_in_turn
 from tests.ros.lab import Lab
 
 INSIDE_TO = {"to-outside": "out", "to-another-inside": "c2"}
@@ -75,8 +75,7 @@ def test_a_node_bound_to_loopback_is_named_in_the_log_with_the_fix(lab: Lab, lib
     assert f"set ROS_IP={lab.place('c1').address}" in warning
 
 
-@each_direction
-@each_pair("first", "second")
+@each_way_in_turn("first", "second")
 def test_nodes_in_a_namespace(lab: Lab, first: str, second: str, source: str, sink: str) -> None:
     """The same relative names, pushed into a namespace, meet each other."""
     space = [f"__ns:=/{lab.unique('robot')}/arm"]

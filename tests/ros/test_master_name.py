@@ -20,7 +20,7 @@ from tests.ros import (
     test_topics,
     test_udpros,
 )
-from tests.ros.combinations import DIRECTIONS, each_library, each_pair
+from tests.ros.combinations import each_library, each_pair, each_way_and_order, each_way_in_turn
 from tests.ros.lab import MASTER_URI, Lab
 from tests.ros.test_recovery import Measure, restart_proxy
 from tests.ros.topology import ALIAS, OUT_NODE
@@ -29,26 +29,18 @@ PLAN = ALIAS
 PROXY_OPTIONS = ("--master-address", OUT_NODE)
 
 CROSSING = ("inside-to-outside", "outside-to-inside")
-each_direction = pytest.mark.parametrize(
-    ("source", "sink"), [DIRECTIONS[way] for way in CROSSING], ids=CROSSING
-)
-each_order = pytest.mark.parametrize("order", ["giver", "taker"], ids=lambda w: f"{w}-first")
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
-@each_order
+@each_way_and_order("publisher", "subscriber", CROSSING)
 def test_messages(
-    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, order: str
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, starter: str
 ) -> None:
-    first = {"giver": "publisher", "taker": "subscriber"}[order]
     test_topics.test_every_message_arrives_once_and_in_order(
-        lab, publisher, subscriber, source, sink, first
+        lab, publisher, subscriber, source, sink, starter
     )
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
+@each_way_in_turn("publisher", "subscriber", CROSSING)
 def test_latched_messages(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str
 ) -> None:
@@ -57,16 +49,12 @@ def test_latched_messages(
     )
 
 
-@each_direction
-@each_pair("server", "client")
-@each_order
-def test_calls(lab: Lab, server: str, client: str, source: str, sink: str, order: str) -> None:
-    first = {"giver": "server", "taker": "client"}[order]
-    test_services.test_every_call_gets_its_answer(lab, server, client, source, sink, first)
+@each_way_and_order("server", "client", CROSSING)
+def test_calls(lab: Lab, server: str, client: str, source: str, sink: str, starter: str) -> None:
+    test_services.test_every_call_gets_its_answer(lab, server, client, source, sink, starter)
 
 
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client", CROSSING)
 def test_persistent_calls(lab: Lab, server: str, client: str, source: str, sink: str) -> None:
     test_services.test_a_persistent_connection_carries_every_call(lab, server, client, source, sink)
 
@@ -83,8 +71,7 @@ def test_messages_by_udp(lab: Lab) -> None:
 
 
 @pytest.mark.boundary
-@each_direction
-@each_pair("publisher", "subscriber")
+@each_way_in_turn("publisher", "subscriber", CROSSING)
 def test_messages_flow_again_after_the_proxy_was_killed(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str, measure: Measure
 ) -> None:
@@ -94,8 +81,7 @@ def test_messages_flow_again_after_the_proxy_was_killed(
 
 
 @pytest.mark.boundary
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client", CROSSING)
 def test_calls_are_answered_again_after_the_proxy_was_killed(
     lab: Lab, server: str, client: str, source: str, sink: str, measure: Measure
 ) -> None:

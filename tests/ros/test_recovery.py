@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.ros.combinations import LIBRARIES, each_direction, each_library, each_pair
+from tests.ros.combinations import LIBRARIES, each_library, each_pair, each_way_in_turn
 from tests.ros.lab import Lab
 from tests.ros.processes import Process
 
@@ -51,8 +51,8 @@ def next_time(process: Process, pattern: str, started: float) -> float:
     raise AssertionError(f"{process.title} has printed nothing since:\n{process.output()[-3000:]}")
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
+@pytest.mark.smoke
+@each_way_in_turn("publisher", "subscriber")
 def test_messages_flow_again_after_the_proxy_was_killed(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str, measure: Measure
 ) -> None:
@@ -72,8 +72,8 @@ def test_messages_flow_again_after_the_proxy_was_killed(
     assert sender.returncode is None
 
 
-@each_direction
-@each_pair("server", "client")
+@pytest.mark.smoke
+@each_way_in_turn("server", "client")
 def test_calls_are_answered_again_after_the_proxy_was_killed(
     lab: Lab, server: str, client: str, source: str, sink: str, measure: Measure
 ) -> None:

@@ -6,19 +6,18 @@ from typing import Any
 
 import pytest
 
-from tests.ros.combinations import each_direction, each_pair
+from tests.ros.combinations import each_way_and_order, each_way_in_turn
 from tests.ros.lab import Lab
 
 
-@each_direction
-@each_pair("server", "client")
-@pytest.mark.parametrize("first", ["server", "client"], ids=lambda w: f"{w}-first")
+@pytest.mark.smoke
+@each_way_and_order("server", "client")
 def test_every_call_gets_its_answer(
-    lab: Lab, server: str, client: str, source: str, sink: str, first: str
+    lab: Lab, server: str, client: str, source: str, sink: str, starter: str
 ) -> None:
     service = f"/{lab.unique('service')}"
     options: dict[str, Any] = {"service": service, "count": 5, "rate": 50}
-    if first == "server":
+    if starter == "server":
         lab.node(server, source, "serve", service=service).wait_for("^ready")
         caller = lab.node(client, sink, "call", **options)
     else:
@@ -30,8 +29,7 @@ def test_every_call_gets_its_answer(
     assert answered == ["0", "1", "2", "3", "4"]
 
 
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client")
 def test_a_persistent_connection_carries_every_call(
     lab: Lab, server: str, client: str, source: str, sink: str
 ) -> None:
@@ -49,8 +47,7 @@ def test_a_persistent_connection_carries_every_call(
     assert len(caller.wait_for_count(r"^reply ask \d+ size 5000 crc", 20)) == 20
 
 
-@each_direction
-@each_pair("server", "client")
+@each_way_in_turn("server", "client")
 def test_requests_and_answers_of_1_mb_arrive_unharmed(
     lab: Lab, server: str, client: str, source: str, sink: str
 ) -> None:

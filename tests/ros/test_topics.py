@@ -6,20 +6,19 @@ import re
 
 import pytest
 
-from tests.ros.combinations import each_direction, each_library, each_pair
+from tests.ros.combinations import each_library, each_way_and_order, each_way_in_turn
 from tests.ros.lab import Lab
 
 BIG = 10 * 1024 * 1024
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
-@pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
+@pytest.mark.smoke
+@each_way_and_order("publisher", "subscriber")
 def test_every_message_arrives_once_and_in_order(
-    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, first: str
+    lab: Lab, publisher: str, subscriber: str, source: str, sink: str, starter: str
 ) -> None:
     topic = f"/{lab.unique('topic')}"
-    if first == "publisher":
+    if starter == "publisher":
         lab.node(publisher, source, "pub", topic=topic, rate=50).wait_for(r"sent hello 2 ")
         receiver = lab.node(subscriber, sink, "sub", topic=topic)
     else:
@@ -31,8 +30,7 @@ def test_every_message_arrives_once_and_in_order(
     assert numbers == list(range(numbers[0], numbers[0] + 20))
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
+@each_way_in_turn("publisher", "subscriber")
 def test_a_latched_message_reaches_a_late_subscriber(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str
 ) -> None:
@@ -43,8 +41,7 @@ def test_a_latched_message_reaches_a_late_subscriber(
     assert receiver.wait_for(r"^got (\w+ \d+ size \d+ crc \w+)")[1] == sent
 
 
-@each_direction
-@each_pair("publisher", "subscriber")
+@each_way_in_turn("publisher", "subscriber")
 def test_messages_of_10_mb_arrive_unharmed(
     lab: Lab, publisher: str, subscriber: str, source: str, sink: str
 ) -> None:

@@ -1,4 +1,4 @@
-"""Prometheus metrics of the controllers."""
+"""Prometheus metrics of the operator."""
 
 import re
 from collections import Counter as Tally
@@ -24,22 +24,23 @@ _WORD = re.compile(r"(?<!^)(?=[A-Z])")
 
 
 class CommonMetrics:
-    """The metrics of any controller, in a registry of their own.
+    """The metrics for any engine, in a registry of their own.
 
-    ``of`` is what it looks at, ``on`` what it acts on, ``states`` those that a proxy can be in.
+    ``of`` is what is looked at, by the gauge ``up`` whether it answers; ``on`` what is acted on;
+    ``states`` those that a proxy can be in.
     """
 
-    def __init__(self, of: str, on: str, states: Sequence[str]) -> None:
+    def __init__(self, of: str, on: str, states: Sequence[str], up: str) -> None:
         self.registry = registry = CollectorRegistry()
         self._states = states
         ProcessCollector(registry=registry)
-        build = Info("rosproxy_controller_build", "The controller's version.", registry=registry)
+        build = Info("rosproxy_operator_build", "The operator's version.", registry=registry)
         build.info({"version": __version__})
         self.looks = self.counter(
             "looks", f"Looks at the {of} by outcome (ok, unavailable, failed).", "outcome"
         )
         self.look_time = Histogram(
-            "rosproxy_controller_look_seconds",
+            "rosproxy_operator_look_seconds",
             "Time for a look: listing everything and planning.",
             registry=registry,
             buckets=_BUCKETS,
@@ -50,6 +51,7 @@ class CommonMetrics:
             "action",
             "outcome",
         )
+        self.up = self.gauge(up, f"Whether the {of} answers.")
         self.problems = self.gauge("problems", "Problems that are there now.")
         self.proxies = self.gauge("proxies", "Proxies by state.", "state")
 
@@ -66,28 +68,26 @@ class CommonMetrics:
 
     def counter(self, name: str, text: str, *labels: str) -> Counter:
         """A new counter."""
-        return Counter(f"rosproxy_controller_{name}", text, labels, registry=self.registry)
+        return Counter(f"rosproxy_operator_{name}", text, labels, registry=self.registry)
 
     def gauge(self, name: str, text: str, *labels: str) -> Gauge:
         """A new gauge."""
-        return Gauge(f"rosproxy_controller_{name}", text, labels, registry=self.registry)
+        return Gauge(f"rosproxy_operator_{name}", text, labels, registry=self.registry)
 
 
-class Metrics(CommonMetrics):
-    """All metrics of a Docker controller."""
+class DockerMetrics(CommonMetrics):
+    """All metrics for a Docker host."""
 
     def __init__(self) -> None:
-        super().__init__("engine", "host", STATES)
+        super().__init__("engine", "host", STATES, up="engine_up")
         self.containers = self.gauge("containers", "Containers that a proxy is there for.")
-        self.engine_up = self.gauge("engine_up", "Whether the engine answers.")
 
 
 class ClusterMetrics(CommonMetrics):
-    """All metrics of a Kubernetes controller."""
+    """All metrics for a cluster."""
 
     def __init__(self) -> None:
-        super().__init__("API server", "cluster", POD_STATES)
-        self.api_up = self.gauge("api_up", "Whether the API server answers.")
+        super().__init__("API server", "cluster", POD_STATES, up="api_up")
         self.rosproxies = self.gauge("rosproxies", "RosProxies that can be read.")
         self.pods = self.gauge("pods", "Running pods that a RosProxy selects.")
         self.admissions = self.counter(

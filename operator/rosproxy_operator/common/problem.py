@@ -1,6 +1,10 @@
-"""What is wrong, as all controllers tell it."""
+"""What is wrong, told for every engine: texts for people, and each of them once in the log."""
 
+import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -14,3 +18,28 @@ class Problem:
     subject: str
     text: str
     fatal: bool = True
+
+
+def bounded(text: str, most: int) -> str:
+    """A text of at most so many characters."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+class ProblemLog:
+    """Remembers which problems were told."""
+
+    def __init__(self) -> None:
+        self._told: dict[Problem, None] = {}
+
+    def update(self, problems: Iterable[Problem]) -> None:
+        """Take note of the problems that there are now."""
+        now = dict.fromkeys(problems)
+        for problem in now:
+            if problem not in self._told:
+                level = logging.ERROR if problem.fatal else logging.WARNING
+                log.log(level, "%s: %s", problem.subject, problem.text)
+        subjects = {problem.subject for problem in now}
+        solved = {p.subject for p in self._told} - subjects
+        for subject in sorted(solved):
+            log.info("%s: solved", subject)
+        self._told = now

@@ -7,6 +7,7 @@ from typing import Any
 
 import aiohttp
 
+from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status
 from rosproxy.net.addresses import HostPort
 
 Json = dict[str, Any]
@@ -34,9 +35,13 @@ class ProxyClient:
     def __init__(self) -> None:
         self._session: aiohttp.ClientSession | None = None
 
-    async def status(self, where: HostPort) -> Json:
+    async def status(self, where: HostPort) -> ProxyStatus:
         """What a proxy's ``/status`` says."""
-        return await self._ask("GET", where, "/status")
+        text = await self._ask("GET", where, "/status")
+        try:
+            return parse_status(text)
+        except NotAStatus:
+            raise _no_rosproxy(where) from None
 
     async def master_address(self, where: HostPort, token: str, address: str) -> None:
         """Tell where the master's host is now."""
@@ -44,11 +49,12 @@ class ProxyClient:
 
     async def containers(self, where: HostPort, token: str, body: Mapping[str, Any]) -> Json:
         """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
-        return await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
+        text = await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
+        return _read(text, where)
 
     async def retire(self, where: HostPort, token: str) -> Json:
         """Let it unregister everything it holds at the master."""
-        return await self._ask("POST", where, "/retire", token, {}, WITHIN_MASTER)
+        return _read(await self._ask("POST", where, "/retire", token, {}, WITHIN_MASTER), where)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -63,7 +69,8 @@ class ProxyClient:
         token: str = "",
         body: Mapping[str, Any] | None = None,
         within: float = WITHIN,
-    ) -> Json:
+    ) -> str:
+        """The body of the answer, if that is HTTP 200."""
         if self._session is None:
             self._session = aiohttp.ClientSession()
         limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
@@ -73,24 +80,29 @@ class ProxyClient:
             async with self._session.request(
                 method, url, json=body, headers=headers, timeout=limits
             ) as reply:
-                return _read(reply.status, await reply.text(), f"{method} {url}")
+                text = await reply.text()
+                if reply.status == 200:
+                    return text
+                message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
+                raise ProxyError(message, later=reply.status == 503)
         except TimeoutError:
             raise ProxyError(f"{where} does not answer", away=True) from None
         except (OSError, aiohttp.ClientError) as error:
             raise _no_answer(where, error) from None
 
 
-def _read(status: int, text: str, what: str) -> Json:
-    if status != 200:
-        message = f"{what} answers HTTP {status}: {text.strip()[:200]}"
-        raise ProxyError(message, later=status == 503)
+def _read(text: str, where: HostPort) -> Json:
     try:
         found = json.loads(text)
     except ValueError:
         found = None
     if not isinstance(found, dict):
-        raise ProxyError(f"{what} does not answer as a rosproxy does")
+        raise _no_rosproxy(where)
     return found
+
+
+def _no_rosproxy(where: HostPort) -> ProxyError:
+    return ProxyError(f"{where} does not answer as a rosproxy does")
 
 
 def _no_answer(where: HostPort, error: Exception) -> ProxyError:

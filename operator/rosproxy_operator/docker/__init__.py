@@ -1,1 +1,1 @@
-"""The controller of one Docker host."""
+"""The operator of one Docker host."""

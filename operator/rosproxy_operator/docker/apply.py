@@ -9,9 +9,7 @@ import logging
 import secrets
 from collections.abc import Iterator
 
-from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
-from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.docker.client import DockerClient, Json
 from rosproxy_operator.docker.errors import Conflict, EngineError, Gone
@@ -29,7 +27,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     container_config,
@@ -37,45 +35,38 @@ from rosproxy_operator.docker.planner.specs import (
     read_own,
     sandbox_config,
 )
-from rosproxy_operator.docker.snapshot import Look, Way
+from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
 
 
-class Applier:
+class DockerApplier:
     """Carries out actions, each in a thread."""
 
-    def __init__(
-        self,
-        engine: DockerClient,
-        settings: PlanSettings,
-        proxies: ProxyClient,
-        masters: MasterResolver,
-    ) -> None:
-        self._engine, self._settings = engine, settings
-        self._proxies, self._masters = proxies, masters
+    def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
+        self._engine, self._settings, self._proxies = engine, settings, proxies
         self._former: dict[str, str] = {}
 
-    async def carry_out(self, action: Action, look: Look) -> None:
+    async def carry_out(self, action: Action, look: DockerSnapshot) -> None:
         """Carry out an action that was planned from a look. Raises EngineError."""
         if isinstance(action, Remove) and action.retire:
-            await self._retire(action.name, look.ways.get(self._seen_as(action.name, look)))
+            await self._retire(action.name, look.access.get(self._seen_as(action.name, look)))
         await in_thread(self._do, action, look)
 
-    def _seen_as(self, name: str, look: Look) -> str:
+    def _seen_as(self, name: str, look: DockerSnapshot) -> str:
         """The name that a container had when the look was made, of one renamed since then."""
         return name if name in look.tokens else self._former.get(name, name)
 
-    async def _retire(self, name: str, way: Way | None) -> None:
-        if way is None:
+    async def _retire(self, name: str, access: ProxyAccess | None) -> None:
+        if access is None:
             return
         try:
-            told = await self._proxies.retire(HostPort(way.host, way.port), way.token)
+            told = await self._proxies.retire(access.admin, access.token)
             log.info("%s has unregistered %s nodes at its master", name, told.get("unregistered"))
         except ProxyError as error:
             log.warning("%s could not unregister its nodes at the master: %s", name, error)
 
-    def _do(self, action: Action, look: Look) -> None:  # noqa: C901 - one case per action
+    def _do(self, action: Action, look: DockerSnapshot) -> None:  # noqa: C901 - one case per action
         engine = self._engine
         match action:
             case CreateNetwork(name):
@@ -130,9 +121,9 @@ class Applier:
                 with _fine("is not connected"):
                     self._engine.disconnect(name, network)
 
-    def _config(self, spec: ProxySpec, look: Look) -> Json:
+    def _config(self, spec: ProxySpec, look: DockerSnapshot) -> Json:
         token = look.tokens.get(self._seen_as(spec.replaces, look)) or secrets.token_hex(16)
-        address = self._masters.address(master(spec.key).host)
+        address = look.masters.get(master(spec.key).host.lower(), "")
         return container_config(spec, self._settings, token, address)
 
     def _create(self, name: str, config: Json) -> None:
@@ -142,7 +133,7 @@ class Applier:
             labels = self._engine.container(name)["Config"].get("Labels") or {}
             if read_own(labels) is None:
                 raise EngineError(
-                    f"a container that is not this controller's is called {name}; "
+                    f"a container that is not this operator's is called {name}; "
                     f"rename it (docker rename {name} …) or remove it"
                 ) from None
 

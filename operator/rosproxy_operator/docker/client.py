@@ -1,4 +1,4 @@
-"""The Docker engine as far as the controller needs it: a thin layer over the SDK's APIClient.
+"""The Docker engine as far as the operator needs it: a thin layer over the SDK's APIClient.
 
 A socket proxy in front of the engine has to let exactly these through, with ``/v1.41`` (whatever
 version both sides know) before each path but the first::

@@ -25,12 +25,14 @@ PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
 class Events:
     """Listens to an engine for good, in a thread of its own.
 
-    ``happened`` is called in the event loop when something has, and after each connect: what
-    happened before that was missed.
+    ``changed`` is called in the event loop when something has; ``connected`` after each connect:
+    the engine is there, and what happened before that was missed.
     """
 
-    def __init__(self, engine: DockerClient, happened: Callable[[], None]) -> None:
-        self._engine, self._happened = engine, happened
+    def __init__(
+        self, engine: DockerClient, connected: Callable[[], None], changed: Callable[[], None]
+    ) -> None:
+        self._engine, self._connected, self._changed = engine, connected, changed
 
     def start(self) -> None:
         """Begin. Needs a running event loop."""
@@ -43,12 +45,13 @@ class Events:
             with contextlib.suppress(EngineError):  # the looks tell of it
                 events = self._engine.events(FILTERS)
                 failures = 0
-                self._tell(loop)
+                _call(loop, self._connected)
                 for _ in events:
-                    self._tell(loop)
+                    _call(loop, self._changed)
             time.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
             failures += 1
 
-    def _tell(self, loop: asyncio.AbstractEventLoop) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has been closed meanwhile
-            loop.call_soon_threadsafe(self._happened)
+
+def _call(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop has been closed meanwhile
+        loop.call_soon_threadsafe(function)

@@ -3,27 +3,26 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection
 from ipaddress import IPv4Network
 from typing import Any
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
-from rosproxy_operator.common.resolver import MasterResolver
-from rosproxy_operator.docker.planner.model import Proxy, Wish
-from rosproxy_operator.docker.planner.specs import master
-from rosproxy_operator.docker.proxy_news import (
+from rosproxy_operator.common.proxy_status import nodes_by_address
+from rosproxy_operator.docker.planner.model import Member
+from rosproxy_operator.docker.planner.proxy_news import (
     AGAIN,
-    Arrival,
-    Facts,
+    ContainerArrival,
+    NetworkFacts,
     Places,
     facts,
     gone,
-    node_addresses,
 )
-from rosproxy_operator.docker.snapshot import Look, Way
+from rosproxy_operator.docker.planner.specs import master
+from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
 
@@ -35,24 +34,24 @@ STARTING = 8.0
 """Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
 
 
-class Conversation:
-    """What is told to one run of one proxy. ``answered`` is called when it does for the first time.
+class ProxyUpdater:
+    """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
     The proxy is asked for its nodes after each look, and told what has changed since it was last
     told: nothing gets lost while it can't be reached.
     """
 
     def __init__(
-        self, name: str, way: Way, proxies: ProxyClient, answered: Callable[[], None]
+        self, name: str, access: ProxyAccess, proxies: ProxyClient, answered: Callable[[], None]
     ) -> None:
-        self.name, self.way = name, way
+        self.name, self.access = name, access
         self.error: ProxyError | None = None
         self._proxies, self._answered = proxies, answered
-        self._facts = Facts()
+        self._facts = NetworkFacts()
         self._subnets: set[IPv4Network] = set()
         self._places = Places()
         self._moving = False
-        self._due: dict[Arrival, list[float]] = {}
+        self._due: dict[ContainerArrival, list[float]] = {}
         self._heard = False
         self._news = asyncio.Event()
         self._since = time.monotonic()
@@ -62,7 +61,7 @@ class Conversation:
         """Seconds since it did not answer any more (or was started); 0 while it does."""
         return 0.0 if self._heard and not self.error else time.monotonic() - self._since
 
-    def update(self, known: Facts) -> None:
+    def update(self, known: NetworkFacts) -> None:
         """Take note of what a look has found."""
         now = time.monotonic()
         self._facts = known
@@ -98,11 +97,11 @@ class Conversation:
 
     async def _tell(self) -> None:
         self._news.clear()
-        where, token = HostPort(self.way.host, self.way.port), self.way.token
+        where, token = self.access.admin, self.access.token
         status = await self._proxies.status(where)
         known = self._facts  # not older than need be: its nodes may have come since the last look
         address = known.master_address
-        if address and status.get("master", {}).get("address") != address:
+        if address and status.master.address != address:
             await self._proxies.master_address(where, token, address)
             log.info("%s: its master is now at %s", self.name, address)
         now = time.monotonic()
@@ -125,9 +124,9 @@ class Conversation:
             self._since = time.monotonic()
         self.error = error
 
-    def _body(self, status: Mapping[str, Any], known: Facts, now: float) -> dict[str, Any]:
+    def _body(self, status: ProxyStatus, known: NetworkFacts, now: float) -> dict[str, Any]:
         self._places.look(known, now)
-        nodes = node_addresses(status)
+        nodes = nodes_by_address(status).keys()
         arrived = [
             {"address": arrival.address, "names": sorted(arrival.names)}
             for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
@@ -156,59 +155,53 @@ class Conversation:
             log.info("%s: nodes %s", self.name, text)
 
 
-class ProxySync:
-    """The conversations with all running proxies."""
+class DockerProxySync:
+    """Keeps all running proxies up to date. ``answered``: one answers that did not before."""
 
     def __init__(
-        self,
-        tasks: Tasks,
-        proxies: ProxyClient,
-        masters: MasterResolver,
-        uplink: str,
-        answered: Callable[[], None],
+        self, tasks: Tasks, proxies: ProxyClient, uplink: str, answered: Callable[[], None]
     ) -> None:
-        self._tasks, self._proxies, self._masters = tasks, proxies, masters
+        self._tasks, self._proxies = tasks, proxies
         self._uplink, self._answered = uplink, answered
-        self._running: dict[str, tuple[Conversation, asyncio.Task[None]]] = {}
+        self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
 
-    def tell(self, look: Look, wishes: Iterable[Wish]) -> None:
+    def update(self, look: DockerSnapshot, members: Collection[Member]) -> None:
         """Begin to tell every running proxy what a look has found."""
-        for name, (talk, task) in list(self._running.items()):
-            if look.ways.get(name) != talk.way:
+        for name, (updater, task) in list(self._running.items()):
+            if look.access.get(name) != updater.access:
                 task.cancel()
                 del self._running[name]
-        every = list(wishes)
-        for proxy in look.observed.proxies:
-            way = look.ways.get(proxy.container.name)
-            if way is not None:
-                address = self._masters.address(master(proxy.key).host)
-                self._talk(proxy, way).update(facts(look, proxy, every, address))
+        for proxy in look.state.proxies:
+            access = look.access.get(proxy.container.name)
+            if access is not None:
+                address = look.masters.get(master(proxy.key).host.lower(), "")
+                known = facts(look.state, proxy, members, address)
+                self._updater(proxy.container.name, access).update(known)
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""
         found = self._running.get(name)
         return found is not None and found[0].silent_for == 0
 
-    def problems(self, look: Look) -> list[Problem]:
+    def problems(self, look: DockerSnapshot) -> list[Problem]:
         """The proxies that do not answer, and what to do about it."""
         return [
-            silence(name, talk.error, look, self._uplink)
-            for name, (talk, _) in self._running.items()
-            if talk.error is not None and talk.silent_for > STARTING
+            silence(name, updater.error, look, self._uplink)
+            for name, (updater, _) in self._running.items()
+            if updater.error is not None and updater.silent_for > STARTING
         ]
 
-    def _talk(self, proxy: Proxy, way: Way) -> Conversation:
-        name = proxy.container.name
+    def _updater(self, name: str, access: ProxyAccess) -> ProxyUpdater:
         if name not in self._running:
-            talk = Conversation(name, way, self._proxies, self._answered)
-            self._running[name] = talk, self._tasks.spawn(talk.run(), f"telling {name}")
+            updater = ProxyUpdater(name, access, self._proxies, self._answered)
+            self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
         return self._running[name][0]
 
 
-def silence(name: str, error: ProxyError, look: Look, uplink: str) -> Problem:
+def silence(name: str, error: ProxyError, look: DockerSnapshot, uplink: str) -> Problem:
     """The problem of a proxy that does not answer."""
     if error.away and not look.at_host:
-        advice = f"attach the controller to network {uplink} or run it with network_mode: host"
+        advice = f"attach the operator to network {uplink} or run it with network_mode: host"
     else:
         advice = f"docker logs {name} may say why"
     return Problem(f"proxy {name}", f"its admin endpoint {error}: {advice}")

@@ -1,4 +1,4 @@
-"""Running the Docker controller's commands."""
+"""Running the commands for Docker."""
 
 import asyncio
 import json
@@ -8,15 +8,15 @@ import time
 
 from rosproxy import __version__
 from rosproxy.cli.terminal import size, watch, write
-from rosproxy_operator.common.health import Health
-from rosproxy_operator.common.metrics import Metrics
+from rosproxy_operator.common.health import HealthServer
+from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.report import plan_text, render
-from rosproxy_operator.docker.planner.settings import PlanSettings
-from rosproxy_operator.docker.status import Survey, describe, survey
-from rosproxy_operator.settings import DockerSettings
+from rosproxy_operator.docker.settings import DockerSettings
+from rosproxy_operator.docker.status import describe, survey
 
 log = logging.getLogger(__name__)
 
@@ -25,12 +25,12 @@ ONCE = 60.0
 
 
 def run(settings: DockerSettings) -> None:
-    """Run the controller until a signal ends it; its proxies go on. Raises SettingError."""
+    """Run the operator until a signal ends it; its proxies go on. Raises SettingError."""
     asyncio.run(_run(settings))
 
 
 def run_once(settings: DockerSettings) -> list[Problem]:
-    """Look and act until nothing is left to do; what is not as wanted. Raises EngineError."""
+    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
     return asyncio.run(_run_once(settings))
 
 
@@ -45,7 +45,8 @@ def show_plan(settings: PlanSettings) -> None:
 def show_status(settings: PlanSettings, as_json: bool) -> None:
     """Print what there is on the host. Raises EngineError."""
     found = asyncio.run(survey(settings))
-    write(_text(found, settings, as_json, size()[0], None))
+    status = describe(found, settings)
+    write(json.dumps(status, indent=2) if as_json else render(status, size()[0]))
 
 
 def watch_status(settings: PlanSettings) -> None:
@@ -53,27 +54,20 @@ def watch_status(settings: PlanSettings) -> None:
 
     def draw(columns: int, lines: int | None) -> str:
         try:
-            return _text(asyncio.run(survey(settings)), settings, False, columns, lines)
+            return render(describe(asyncio.run(survey(settings)), settings), columns, lines)
         except EngineError as error:
             return f"{time.strftime('%H:%M:%S')} {error}"
 
     watch(draw)
 
 
-def _text(
-    found: Survey, settings: PlanSettings, as_json: bool, columns: int, lines: int | None
-) -> str:
-    status = describe(found, settings)
-    return json.dumps(status, indent=2) if as_json else render(status, columns, lines)
-
-
 async def _run(settings: DockerSettings) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    metrics = Metrics()
+    metrics = DockerMetrics()
     controller = DockerController(settings, metrics)
-    health = Health(metrics.registry, controller.dead, controller.unready)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, settings.admin)
     running = asyncio.create_task(controller.run())
@@ -86,4 +80,4 @@ async def _run(settings: DockerSettings) -> None:
 
 
 async def _run_once(settings: DockerSettings) -> list[Problem]:
-    return await DockerController(settings, Metrics()).run_once(ONCE)
+    return await DockerController(settings, DockerMetrics()).run_once(ONCE)

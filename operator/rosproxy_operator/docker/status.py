@@ -1,28 +1,26 @@
-"""What there is on a host, for ``status`` and ``plan``: found out without a running controller."""
+"""What there is on a host, for ``status`` and ``plan``: found out without a running operator."""
 
 import asyncio
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rosproxy import __version__
-from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
-from rosproxy_operator.docker.details import Inspector
 from rosproxy_operator.docker.planner.actions import Action
-from rosproxy_operator.docker.planner.model import Container, Key, Proxy, Sandbox
-from rosproxy_operator.docker.planner.plan import Plan, plan
-from rosproxy_operator.docker.planner.report import line
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings, Proxy, Sandbox
+from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
-from rosproxy_operator.docker.sense import sense, unresolved
-from rosproxy_operator.docker.snapshot import Look, Observer
+from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 Own = TypeVar("Own", Proxy, Sandbox)
 PATIENCE = 3.0
@@ -33,45 +31,47 @@ PATIENCE = 3.0
 class Survey:
     """One look at a host, what would be done there, and what its proxies say, by name."""
 
-    look: Look
-    plan: Plan
-    said: Mapping[str, Json | ProxyError]
+    look: DockerSnapshot
+    plan: DockerPlan
+    said: Mapping[str, ProxyStatus | ProxyError]
     problems: tuple[Problem, ...]
+
+    def answer(self, proxy: str) -> ProxyStatus | None:
+        """What a proxy says of itself, by its container's name; None if it does not answer."""
+        said = self.said.get(proxy)
+        return None if isinstance(said, ProxyError) else said
 
     @property
     def actions(self) -> list[Action]:
         """What would be done, but for what the engine is busy with and tells nothing of."""
-        own: list[Proxy | Sandbox] = [*self.look.observed.proxies, *self.look.observed.sandboxes]
-        busy = {each.key for each in own if each.container.name in self.look.unsure}
-        return [a for group in self.plan.groups if group.key not in busy for a in group.actions]
+        groups = (*self.plan.groups, *self.plan.deferred)
+        return [action for group in groups for action in group.actions]
 
 
 async def survey(settings: PlanSettings) -> Survey:
     """Look at the engine and ask all proxies. Raises EngineError."""
     engine, masters, proxies = DockerClient(), MasterResolver(_nothing), ProxyClient()
-    observer = Observer(engine, settings, Inspector(engine, _nothing))
+    observer = DockerObserver(engine, settings, masters, _nothing)
     try:
-        look = await sense(observer, masters, settings, PATIENCE)
-        planned = plan(look.observed, settings, Memory(), time.monotonic())
-        answers = await asyncio.gather(
-            *(_ask(proxies, HostPort(way.host, way.port)) for way in look.ways.values())
-        )
+        look = await observer.look(PATIENCE)
+        planned = plan(look.state, look.labels, settings, DockerMemory(), time.monotonic())
+        ways = look.access.values()
+        answers = await asyncio.gather(*(_ask(proxies, access.admin) for access in ways))
     finally:
         await proxies.close()
-    said = dict(zip(look.ways, answers, strict=True))
+    said = dict(zip(look.access, answers, strict=True))
     silent = [
         silence(name, answer, look, settings.uplink)
         for name, answer in said.items()
         if isinstance(answer, ProxyError)
     ]
-    problems = (*planned.problems, *unresolved(look, masters, settings), *silent)
-    return Survey(look, planned, said, problems)
+    return Survey(look, planned, said, (*planned.problems, *silent))
 
 
 def describe(found: Survey, settings: PlanSettings) -> Json:
     """A survey as JSON: what `rosproxy_operator.docker.planner.report.render` shows."""
-    observed = found.look.observed
-    keys = {wish.id: wish.key for wish in found.plan.wishes if wish.key in observed.keys}
+    observed = found.look.state
+    keys = {member.id: member.key for member in found.plan.members if member.key in observed.keys}
     listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
     return {
         "version": __version__,
@@ -82,7 +82,7 @@ def describe(found: Survey, settings: PlanSettings) -> Json:
             {"subject": problem.subject, "text": problem.text, "fatal": problem.fatal}
             for problem in found.problems
         ],
-        "actions": [line(action) for action in found.actions],
+        "actions": [str(action) for action in found.actions],
     }
 
 
@@ -92,30 +92,28 @@ def _name(key: Key | None) -> str | None:
 
 def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
     """One row per proxy; its sandbox is only told of where it is what is wrong."""
-    observed, name = found.look.observed, proxy_name(key)
+    observed, name = found.look.state, proxy_name(key)
     process = _best([p for p in observed.proxies if p.key == key], name)
     box = _best([box for box in observed.sandboxes if box.key == key], sandbox_name(key))
-    answer = found.said.get(process.container.name) if process else None
-    said = answer if isinstance(answer, dict) else {}
-    its_master, ports = said.get("master") or {}, said.get("ports") or {}
+    said = found.answer(process.container.name) if process else None
     own = box or process
     networks = box.container.networks if box else frozenset()
     return {
         "name": name,
         "master_uri": key.master_uri,
-        "master_address": its_master.get("address") or "",
-        "master_up": its_master.get("up"),
+        "master_address": (said.master.address if said else None) or "",
+        "master_up": said.master.up if said else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
         "state": process.container.state if process else "absent",
-        "reachable": bool(said),
+        "reachable": said is not None,
         "networks": sorted(networks - {settings.uplink}),
-        "data_plane": (said.get("data_plane") or {}).get("plane"),
-        "used": ports.get("used"),
-        "free": ports.get("free"),
+        "data_plane": said.data_plane.plane if said and said.data_plane else None,
+        "used": said.ports.used if said else None,
+        "free": said.ports.free if said else None,
         "problems": [
             *_amiss(box, sandbox_name(key)),
-            *(f"{p['subject']}: {p['text']}" for p in said.get("problems") or ()),
+            *(f"{one.subject}: {one.text}" for one in (said.problems if said else ())),
         ],
     }
 
@@ -134,8 +132,8 @@ def _amiss(box: Sandbox | None, name: str) -> Iterator[str]:
 
 def _container(container: Container, proxy: str | None, found: Survey) -> Json:
     addresses = {a.network: a.address for a in container.attachments if a.address}
-    answer = found.said.get(proxy or "")
-    nodes = answer.get("nodes", ()) if isinstance(answer, dict) else ()
+    answer = found.answer(proxy or "")
+    nodes = nodes_by_address(answer) if answer else {}
     return {
         "name": container.name,
         "state": container.state,
@@ -143,25 +141,16 @@ def _container(container: Container, proxy: str | None, found: Survey) -> Json:
         "networks": sorted(container.networks),
         "addresses": addresses,
         "nodes": [
-            _node(node)
-            for node in nodes
-            if _host(node) in addresses.values() and node.get("state") != "cleaned"
+            {
+                "names": list(node.nodes),
+                "address": node.address,
+                "advertised_uri": node.advertised_uri,
+                "state": node.state,
+            }
+            for address in dict.fromkeys(addresses.values())
+            for node in nodes.get(address, ())
         ],
     }
-
-
-def _node(node: Mapping[str, Any]) -> Json:
-    return {
-        "names": node.get("nodes", []),
-        "address": node.get("address", ""),
-        "advertised_uri": node.get("advertised_uri", ""),
-        "state": node.get("state", ""),
-    }
-
-
-def _host(node: Mapping[str, Any]) -> str:
-    where = parse_host_port(str(node.get("address", "")))
-    return where.host if where else ""
 
 
 def _meant(container: Container, found: Survey) -> bool:
@@ -169,7 +158,7 @@ def _meant(container: Container, found: Survey) -> bool:
     return any(problem.subject == f"container {container.name}" for problem in found.problems)
 
 
-async def _ask(proxies: ProxyClient, where: HostPort) -> Json | ProxyError:
+async def _ask(proxies: ProxyClient, where: HostPort) -> ProxyStatus | ProxyError:
     try:
         return await proxies.status(where)
     except ProxyError as error:

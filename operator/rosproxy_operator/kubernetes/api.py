@@ -28,7 +28,7 @@ from kubernetes.config import ConfigException, load_incluster_config, load_kube_
 from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
-from rosproxy_operator.kubernetes.errors import ApiError, Kind, refusal, unreachable
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, refusal, unreachable
 from rosproxy_operator.kubernetes.planner.model import Json, Name
 from rosproxy_operator.kubernetes.planner.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
 
@@ -98,10 +98,10 @@ class Api:
         """One object of the core group, for example of the kind ``services``."""
         return self._ask("GET", _path(_CORE, id.namespace, kind, id.name), within=within)
 
-    def create(self, kind: str, body: Json, within: Timeout = WITHIN) -> Found:
+    def create(self, kind: str, body: Json) -> Found:
         """Create an object of the core group in the namespace that it names."""
         path = _path(_CORE, body["metadata"]["namespace"], kind)
-        return self._ask("POST", path, body=body, within=within)
+        return self._ask("POST", path, body=body)
 
     def delete(self, kind: str, id: Name, uid: str) -> None:
         """Delete an object of the core group if it still has this uid."""
@@ -162,7 +162,7 @@ class Api:
     def _items(self, found: Found) -> list[Found]:
         items = found.get("items")
         if not isinstance(items, list):
-            raise ApiError(Kind.AWAY, f"what answers at {self.server} is no API server")
+            raise ApiError(ErrorKind.AWAY, f"what answers at {self.server} is no API server")
         return [item for item in items if isinstance(item, dict)]
 
     def _ask(
@@ -184,7 +184,7 @@ class Api:
         except ValueError:
             found = None
         if not isinstance(found, dict):
-            raise ApiError(Kind.AWAY, f"what answers at {self.server}{path} is no API server")
+            raise ApiError(ErrorKind.AWAY, f"what answers at {self.server}{path} is no API server")
         return found
 
     def _call(
@@ -223,7 +223,7 @@ def _configuration() -> Any:
             load_kube_config(client_configuration=configuration)  # type: ignore[no-untyped-call]
     except (ConfigException, OSError) as error:
         raise ApiError(
-            Kind.AWAY,
+            ErrorKind.AWAY,
             f"no cluster is known here ({error}): run it in a pod with a service account, or name "
             "a kubeconfig (KUBECONFIG)",
         ) from error

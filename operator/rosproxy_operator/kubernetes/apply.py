@@ -13,8 +13,8 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import WITHIN, Api, Timeout
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.events import emit
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -27,7 +27,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
-from rosproxy_operator.kubernetes.planner.model import Failure, Json, Name, Observed
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Failure, Json, Name
 from rosproxy_operator.kubernetes.planner.names import CONTAINER, KIND, is_own
 from rosproxy_operator.kubernetes.proxy_sync import address_of
 
@@ -41,7 +41,7 @@ RETIRING = 10.0
 Count = Callable[[Action, str], None]
 
 
-class Applier:
+class ClusterApplier:
     """Carries out actions, those of one RosProxy one after the other.
 
     ``counted`` is called with each action and its outcome (ok, failed).
@@ -55,7 +55,7 @@ class Applier:
         self.failures: dict[Name, tuple[Failure, ...]] = {}
         self.problems: dict[Name, Problem] = {}
 
-    async def carry_out(self, actions: Iterable[Action], observed: Observed) -> None:
+    async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
         """Carry out what was planned from what was observed. What fails is noted, not raised."""
         groups: dict[Name, list[Action]] = {}
         for action in actions:
@@ -66,7 +66,7 @@ class Applier:
         self.problems = {of: each for of, each in self.problems.items() if of in there}
         self._retired &= {proxy.pod.uid for proxy in observed.proxies}
 
-    async def _group(self, of: Name, actions: list[Action], observed: Observed) -> None:
+    async def _group(self, of: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
         async with self._room:
             doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
             failures = [failure for a in doing if (failure := await self._one(a, observed))]
@@ -79,18 +79,18 @@ class Applier:
         told = [each for each in emits if not (failures and each.type == "Normal")]
         await asyncio.gather(*(self._tell(each, observed) for each in told))
 
-    async def _tell(self, event: Emit, observed: Observed) -> None:
+    async def _tell(self, event: Emit, observed: ClusterSnapshot) -> None:
         async with self._room:
             await self._one(event, observed)
 
-    async def _status(self, action: PatchStatus, observed: Observed) -> None:
+    async def _status(self, action: PatchStatus, observed: ClusterSnapshot) -> None:
         failure = await self._one(action, observed)
         self.problems.pop(action.of, None)
         if failure:
             text = f"its status can't be written: {failure.text}"
             self.problems[action.of] = Problem(f"rosproxy {action.of}", text)
 
-    async def _one(self, action: Action, observed: Observed) -> Failure | None:
+    async def _one(self, action: Action, observed: ClusterSnapshot) -> Failure | None:
         """Carry out one action; what went wrong."""
         if isinstance(action, DeleteProxy) and action.retire and action.uid not in self._retired:
             self._retire(action, observed)
@@ -121,11 +121,11 @@ class Applier:
         self._counted(action, "failed")
         return failure
 
-    def _do(self, action: Action, observed: Observed) -> None:
+    def _do(self, action: Action, observed: ClusterSnapshot) -> None:
         api = self._api
         match action:
             case CreateService():
-                create_service(api, action.body)
+                _create_service(api, action.body)
             case CreateProxy():
                 _create(api, "pods", with_token(action.body, secrets.token_hex(16)))
             case DeleteService():
@@ -139,20 +139,20 @@ class Applier:
             case Emit():
                 emit(api, action)
 
-    def _patch_status(self, action: PatchStatus, observed: Observed) -> None:
+    def _patch_status(self, action: PatchStatus, observed: ClusterSnapshot) -> None:
         found = next((each for each in observed.rosproxies if each.id == action.of), None)
         there = found or observed.unusable.get(action.of)
         if there is None or there.status == action.status:
             return
         self._api.patch_status(action.of, status_patch(there.uid, action.status))
 
-    def _retire(self, action: DeleteProxy, observed: Observed) -> None:
+    def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
         if action.uid not in self._retiring:
             self._retiring.add(action.uid)
             self._tasks.spawn(self._retire_and_delete(action, observed), f"retiring {action.id}")
 
-    async def _retire_and_delete(self, action: DeleteProxy, observed: Observed) -> None:
+    async def _retire_and_delete(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
@@ -168,18 +168,18 @@ class Applier:
             await self._one(action, observed)
 
 
-def create_service(api: Api, body: Json, within: Timeout = WITHIN) -> None:
+def _create_service(api: Api, body: Json) -> None:
     """Create a RosProxy's Service, if need be under another address than before.
 
     Raises ApiError.
     """
     try:
-        _create(api, "services", body, within)
+        _create(api, "services", body)
     except ApiError as error:
-        if error.kind is not Kind.INVALID or "clusterIP" not in body["spec"]:
+        if error.kind is not ErrorKind.INVALID or "clusterIP" not in body["spec"]:
             raise
         log.info("%s: %s; taking another address", _id(body), error)
-        _create(api, "services", without_cluster_ip(body), within)
+        _create(api, "services", without_cluster_ip(body))
 
 
 def status_patch(uid: str, status: Json) -> list[Json]:
@@ -206,11 +206,11 @@ def line(action: Action) -> str:
             return f"event for {action.of}: {action.reason}: {action.message}"
 
 
-def _create(api: Api, kind: str, body: Json, within: Timeout = WITHIN) -> None:
+def _create(api: Api, kind: str, body: Json) -> None:
     try:
-        api.create(kind, body, within)
+        api.create(kind, body)
     except ApiError as error:
-        if error.kind is not Kind.CONFLICT:
+        if error.kind is not ErrorKind.CONFLICT:
             raise
         _check_ours(api, kind, body)
 
@@ -224,13 +224,13 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
     try:
         there = api.get(kind, _id(body))["metadata"]
     except ApiError as error:
-        if error.kind is Kind.GONE:
+        if error.kind is ErrorKind.GONE:
             return
         raise
     owners = there.get("ownerReferences") or ()
     if not is_own(there.get("labels") or {}) or KIND not in {one.get("kind") for one in owners}:
         raise ApiError(
-            Kind.CONFLICT,
+            ErrorKind.CONFLICT,
             f"a {body.get('kind')} of this name that is not the controller's is there: rename it, "
             "or rename the RosProxy",
         )
@@ -260,11 +260,11 @@ def _id(body: Json) -> Name:
     return Name(str(body["metadata"]["namespace"]), str(body["metadata"]["name"]))
 
 
-def _nothing_left(action: Action) -> tuple[Kind, ...]:
+def _nothing_left(action: Action) -> tuple[ErrorKind, ...]:
     """The errors that mean that there is nothing left to do.
 
     The object is gone, or its whole namespace is about to be; or it is another one by now.
     """
     if isinstance(action, DeleteService | DeleteProxy | SetImage | PatchStatus):
-        return Kind.GONE, Kind.CONFLICT
-    return (Kind.GONE,)
+        return ErrorKind.GONE, ErrorKind.CONFLICT
+    return (ErrorKind.GONE,)

@@ -15,7 +15,7 @@ _TEST_FAILED = "the server rejected our request due to an error in our request"
 _LONGEST = 500
 
 
-class Kind(Enum):
+class ErrorKind(Enum):
     """Why the API server did not do what it was asked, as far as that makes a difference."""
 
     AWAY = "away"  # it can't be reached, or is not ready to answer
@@ -27,19 +27,19 @@ class Kind(Enum):
 
 
 _KINDS = {
-    400: Kind.INVALID,
-    401: Kind.AWAY,  # the token has just been replaced, or the server does not know it yet
-    404: Kind.GONE,
-    409: Kind.CONFLICT,
-    422: Kind.INVALID,
-    429: Kind.AWAY,
+    400: ErrorKind.INVALID,
+    401: ErrorKind.AWAY,  # the token has just been replaced, or the server does not know it yet
+    404: ErrorKind.GONE,
+    409: ErrorKind.CONFLICT,
+    422: ErrorKind.INVALID,
+    429: ErrorKind.AWAY,
 }
 
 
 class ApiError(Exception):
     """The API server did not do what it was asked; the message is one line."""
 
-    def __init__(self, kind: Kind, text: str) -> None:
+    def __init__(self, kind: ErrorKind, text: str) -> None:
         super().__init__(text)
         self.kind, self.text = kind, text
 
@@ -53,16 +53,16 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
         message = f"the API server does not know the controller's token or certificate ({message})"
     elif status >= 500 or status == 429:
         message = f"the API server answers HTTP {status}: {message}"
-        return ApiError(Kind.AWAY, message)
+        return ApiError(ErrorKind.AWAY, message)
     elif status == 422 and message == _TEST_FAILED:
-        return ApiError(Kind.CONFLICT, "the object has changed meanwhile")
-    return ApiError(_KINDS.get(status, Kind.OTHER), message)
+        return ApiError(ErrorKind.CONFLICT, "the object has changed meanwhile")
+    return ApiError(_KINDS.get(status, ErrorKind.OTHER), message)
 
 
 def unreachable(server: str, error: BaseException) -> ApiError:
     """The error for an API server that can't be asked."""
     reason = " ".join(str(error).split())[:200] or type(error).__name__
-    return ApiError(Kind.AWAY, f"the API server at {server} can't be reached: {reason}")
+    return ApiError(ErrorKind.AWAY, f"the API server at {server} can't be reached: {reason}")
 
 
 def missing_rule(message: str) -> str:
@@ -81,11 +81,11 @@ def missing_rule(message: str) -> str:
 def _forbidden(message: str) -> ApiError:
     """Why it is forbidden: by a role, or by an admission plug-in that has looked at the object."""
     if _TERMINATING in message:
-        return ApiError(Kind.GONE, message)
+        return ApiError(ErrorKind.GONE, message)
     rule = missing_rule(message)
     if rule:
-        return ApiError(Kind.DENIED, f"{rule} ({message})")
-    return ApiError(Kind.INVALID, message)
+        return ApiError(ErrorKind.DENIED, f"{rule} ({message})")
+    return ApiError(ErrorKind.INVALID, message)
 
 
 def _message(body: bytes) -> str:

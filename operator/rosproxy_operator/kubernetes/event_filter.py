@@ -1,16 +1,20 @@
-"""Which events of a cluster are worth a look: a busy one tells of something every moment."""
+"""Which events of a cluster are worth a look: a busy one tells of something every moment.
+
+kopf's watches hand every event to `handlers`, which ask here. An event matters if the object is new
+or gone, or if what a look would read of it has changed. What the last look has found says which
+pods and Services are of interest at all.
+"""
 
 import logging
 from collections.abc import Callable
 from typing import Any
 
-from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Json, Name
 from rosproxy_operator.kubernetes.planner.names import is_own
 from rosproxy_operator.kubernetes.planner.objects import node as parse_node
 from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_proxy_pod
 from rosproxy_operator.kubernetes.planner.selection import chosen
-from rosproxy_operator.kubernetes.snapshot import Cluster
 
 log = logging.getLogger(__name__)
 
@@ -26,12 +30,12 @@ class EventFilter:
     """
 
     def __init__(self) -> None:
-        self._cluster: Cluster | None = None
+        self._last: ClusterSnapshot | None = None
         self._seen: dict[tuple[str, str], Any] = {}
 
-    def learn(self, cluster: Cluster) -> None:
+    def learn(self, snapshot: ClusterSnapshot) -> None:
         """Take note of what the last look has found."""
-        self._cluster = cluster
+        self._last = snapshot
 
     def rosproxy(self, type: str | None, body: Json) -> bool:
         """Whether an event of a RosProxy matters: not if only its status has changed."""
@@ -50,19 +54,19 @@ class EventFilter:
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the controller's own, or a master's."""
-        if not _own(body) and (self._cluster is None or _id(body) not in self._cluster.masters):
+        if not _own(body) and (self._last is None or _id(body) not in self._last.masters):
             return False
         return self._new("service", type, body, lambda: body.get("spec"))
 
     def _selected(self, body: Json) -> bool:
         """Whether a RosProxy selects a pod now, or did at the last look."""
-        cluster = self._cluster
-        if cluster is None:
+        last = self._last
+        if last is None:
             return True
         pod = parse_pod(body)
-        namespace = [one for one in cluster.rosproxies if one.id.namespace == pod.id.namespace]
+        namespace = [one for one in last.rosproxies if one.id.namespace == pod.id.namespace]
         choice = chosen(pod, namespace)
-        return bool(choice.rosproxy or choice.finding) or pod.uid in cluster.selected
+        return bool(choice.rosproxy or choice.finding) or pod.uid in last.selected
 
     def _new(self, kind: str, type: str | None, body: Json, read: Callable[[], Any]) -> bool:
         key = kind, str((body.get("metadata") or {}).get("uid"))

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.actions import Emit
 from rosproxy_operator.kubernetes.planner.model import Name
 
@@ -25,7 +25,7 @@ def emit(api: Api, event: Emit) -> None:
     try:
         api.create("events", body)
     except ApiError as error:
-        if error.kind is not Kind.CONFLICT:
+        if error.kind is not ErrorKind.CONFLICT:
             raise
         _count(api, Name(body["metadata"]["namespace"], body["metadata"]["name"]), time.time())
 

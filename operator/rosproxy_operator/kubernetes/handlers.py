@@ -19,7 +19,7 @@ WIRE = "wire"
 class Wakeable(Protocol):
     """What events and probes are told to."""
 
-    concern: EventFilter
+    event_filter: EventFilter
 
     def wake(self) -> None:
         """Let it look again soon."""
@@ -28,21 +28,21 @@ class Wakeable(Protocol):
         """Why it is not alive; None if it is."""
 
 
-class Dead(Exception):
+class NotAlive(Exception):
     """The controller is not alive."""
 
 
 def registry(
     controller: Wakeable,
-    wirer: Injector | None,
+    injector: Injector | None,
     configure: Callable[[kopf.OperatorSettings], None],
 ) -> kopf.OperatorRegistry:
-    """All handlers. Without a ``wirer`` there is no webhook; ``configure`` is called at start."""
+    """All handlers; no webhook without an ``injector``. ``configure`` is called at start."""
     handlers = kopf.OperatorRegistry()
     _lifetime(handlers, controller, configure)
     _events(handlers, controller)
-    if wirer is not None:
-        _webhook(handlers, wirer)
+    if injector is not None:
+        _webhook(handlers, injector)
     return handlers
 
 
@@ -63,7 +63,7 @@ def _lifetime(
     async def alive(**_: Any) -> str:
         reason = controller.dead()
         if reason:
-            raise Dead(reason)
+            raise NotAlive(reason)
         return "ok"
 
     @kopf.on.cleanup(registry=handlers, id="cleanup")
@@ -72,7 +72,7 @@ def _lifetime(
 
 
 def _events(handlers: kopf.OperatorRegistry, controller: Wakeable) -> None:
-    concern = controller.concern
+    event_filter = controller.event_filter
 
     def on(matters: Callable[[str | None, Any], bool], *resource: str) -> None:
         @kopf.on.event(*resource, registry=handlers, id=resource[-1])
@@ -80,13 +80,13 @@ def _events(handlers: kopf.OperatorRegistry, controller: Wakeable) -> None:
             if matters(event["type"], event["object"]):
                 controller.wake()
 
-    on(concern.rosproxy, GROUP, VERSION, PLURAL)
-    on(concern.pod, "", "v1", "pods")
-    on(concern.node, "", "v1", "nodes")
-    on(concern.service, "", "v1", "services")
+    on(event_filter.rosproxy, GROUP, VERSION, PLURAL)
+    on(event_filter.pod, "", "v1", "pods")
+    on(event_filter.node, "", "v1", "nodes")
+    on(event_filter.service, "", "v1", "services")
 
 
-def _webhook(handlers: kopf.OperatorRegistry, wirer: Injector) -> None:
+def _webhook(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
     @kopf.on.mutate(
         "",
         "v1",
@@ -96,7 +96,6 @@ def _webhook(handlers: kopf.OperatorRegistry, wirer: Injector) -> None:
         operations=["CREATE"],
         labels={INJECT: kopf.PRESENT},
         ignore_failures=True,
-        side_effects=True,
     )
     async def wire(
         body: kopf.Body,
@@ -105,7 +104,7 @@ def _webhook(handlers: kopf.OperatorRegistry, wirer: Injector) -> None:
         dryrun: bool,
         **_: Any,
     ) -> None:
-        wiring = await wirer.wiring(_plain(body), dryrun)
+        wiring = await injector.wiring(_plain(body), dryrun)
         warnings.extend(wiring.warnings)
         if wiring.spec is not None:
             patch["spec"] = dict(wiring.spec)

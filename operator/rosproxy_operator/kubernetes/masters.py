@@ -4,7 +4,7 @@ from collections.abc import Collection
 from ipaddress import ip_address
 
 from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.model import Name
 
 
@@ -16,7 +16,7 @@ def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str
     try:
         return read_master(api.get("services", id), id, ports)
     except ApiError as error:
-        if error.kind is not Kind.GONE:
+        if error.kind is not ErrorKind.GONE:
             raise
         return "", f"there is no Service {id.name} in the namespace {id.namespace}: create it"
 

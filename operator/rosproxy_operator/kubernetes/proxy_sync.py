@@ -1,4 +1,10 @@
-"""Talking with the proxies: what they say of themselves, and news for them."""
+"""Keeping proxies and operator in step, over the proxies' admin endpoints.
+
+Each proxy's pod that has an address is asked for its ``/status`` every few seconds, by a
+`ProxyPoller` of its own, and told which pods on its node are gone (``/containers``) until it has
+confirmed that. What it says lands in `ClusterProxySync.reports`, from where the controller takes it
+with each look; a report that is another one than before wakes the controller.
+"""
 
 import asyncio
 import logging
@@ -8,9 +14,9 @@ from collections.abc import Callable, Iterable, Mapping
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
-from rosproxy_operator.kubernetes.planner.model import Answer, ProxyPod
+from rosproxy_operator.kubernetes.planner.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT
-from rosproxy_operator.kubernetes.planner.proxy_status import answer, no_answer
+from rosproxy_operator.kubernetes.planner.proxy_status import no_answer, report
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +32,8 @@ AT_ONCE = 32
 """Proxies that are asked at the same time."""
 
 
-class Conversation:
-    """Asks one proxy again and again, and tells it which pods are gone until it has heard.
+class ProxyPoller:
+    """Asks one proxy again and again, and tells it which pods are gone until it confirms that.
 
     ``changed`` is called when what is known of it has changed.
     """
@@ -40,60 +46,60 @@ class Conversation:
         changed: Callable[[], None],
     ) -> None:
         self.where = address_of(proxy)
-        self.answer: Answer | None = None
+        self.report: ProxyReport | None = None
         self._token = proxy.token
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
-        self._news = asyncio.Event()
+        self._pending = asyncio.Event()
         self._recheck = False
         self._failures = 0
         self._since = time.monotonic()
 
-    def tell(self, gone: Iterable[str]) -> None:
+    def report_gone(self, gone: Iterable[str]) -> None:
         """Let it know that the pods with these addresses are no more."""
         self._gone |= set(gone)
         if self._gone:
-            self._news.set()
+            self._pending.set()
 
     async def run(self) -> None:
-        """Converse until cancelled."""
+        """Ask and tell until cancelled."""
         while True:
             async with self._room:
-                told = await self._tell()
+                told = await self._tell_gone()
                 await self._ask()
                 self._recheck = told
-            heard = self.answer is not None and self.answer.answered
-            pause = EVERY if heard or self._waited(EVERY * 20) else EVERY_STARTING
+            answers = self.report is not None and self.report.answered
+            pause = EVERY if answers or self._waited(EVERY * 20) else EVERY_STARTING
             await self._pause(pause)
 
     async def _pause(self, seconds: float) -> None:
-        """Wait, but not with news that have just come in."""
+        """Wait, but not if there is something to tell by now."""
         try:
             async with asyncio.timeout(seconds):
-                await self._news.wait()
+                await self._pending.wait()
         except TimeoutError:
             pass
 
     async def _ask(self) -> None:
         try:
-            found = answer(await self._proxies.status(self.where))
+            found = report(await self._proxies.status(self.where))
             self._failures = 0
         except ProxyError as error:
             self._failures += 1
-            if self._failures < SILENT or not (self.answer or self._waited(STARTING)):
+            if self._failures < SILENT or not (self.report or self._waited(STARTING)):
                 return
             found = no_answer(str(error))
-        starting = self.answer is None and not self._waited(STARTING)
+        starting = self.report is None and not self._waited(STARTING)
         if starting and found.answered and not found.master_up:
             return  # it may not have asked its master yet
         # A process may outlive its pod for a moment: then the next look tells it again.
-        if found != self.answer or self._recheck:
-            self.answer = found
+        if found != self.report or self._recheck:
+            self.report = found
             self._changed()
 
-    async def _tell(self) -> bool:
-        """Tell the news, if there are any; whether there were and it has heard them."""
-        self._news.clear()
+    async def _tell_gone(self) -> bool:
+        """Tell which pods are gone, if any are; whether it has confirmed that."""
+        self._pending.clear()
         gone = sorted(self._gone)
         if not gone:
             return False
@@ -111,40 +117,40 @@ class Conversation:
         return time.monotonic() - self._since > seconds
 
 
-class ProxySync:
-    """All conversations, one for each proxy's pod that has an address."""
+class ClusterProxySync:
+    """All pollers, one for each proxy's pod that has an address."""
 
     def __init__(self, tasks: Tasks, proxies: ProxyClient, changed: Callable[[], None]) -> None:
         self._tasks, self._proxies, self._changed = tasks, proxies, changed
         self._room = asyncio.Semaphore(AT_ONCE)
-        self._all: dict[str, tuple[Conversation, asyncio.Task[None]]] = {}
+        self._all: dict[str, tuple[ProxyPoller, asyncio.Task[None]]] = {}
 
     @property
-    def answers(self) -> dict[str, Answer]:
+    def reports(self) -> dict[str, ProxyReport]:
         """What is known, by the uid of the proxy's pod; of one that is just starting, nothing."""
-        return {uid: one.answer for uid, (one, _) in self._all.items() if one.answer is not None}
+        return {uid: one.report for uid, (one, _) in self._all.items() if one.report is not None}
 
-    def hold(self, proxies: Iterable[ProxyPod]) -> None:
-        """Converse with these and no others."""
+    def follow(self, proxies: Iterable[ProxyPod]) -> None:
+        """Poll these and no others."""
         wanted = {each.pod.uid: each for each in proxies if each.pod.ip and not each.pod.ended}
         for uid in [*self._all]:
-            conversation, task = self._all[uid]
-            if uid not in wanted or address_of(wanted[uid]) != conversation.where:
+            poller, task = self._all[uid]
+            if uid not in wanted or address_of(wanted[uid]) != poller.where:
                 task.cancel()
                 del self._all[uid]
         for uid, proxy in wanted.items():
             if uid not in self._all:
-                one = Conversation(proxy, self._proxies, self._room, self._changed)
-                task = self._tasks.spawn(one.run(), f"conversation with {proxy.pod.id}")
+                one = ProxyPoller(proxy, self._proxies, self._room, self._changed)
+                task = self._tasks.spawn(one.run(), f"polling {proxy.pod.id}")
                 self._all[uid] = one, task
 
-    def tell(self, gone: Mapping[str, Iterable[str]]) -> None:
+    def report_gone(self, gone: Mapping[str, Iterable[str]]) -> None:
         """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
         for uid, addresses in gone.items():
             if uid in self._all:
-                self._all[uid][0].tell(addresses)
+                self._all[uid][0].report_gone(addresses)
 
 
 def address_of(proxy: ProxyPod) -> HostPort:
-    """Where a proxy answers the controller."""
+    """Where a proxy answers the operator."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)

@@ -5,15 +5,15 @@ import logging
 import signal
 
 from rosproxy import __version__
-from rosproxy_operator.common.health import Health
+from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.watch import Watch
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = ClusterMetrics()
     controller = KubernetesController(settings, api, metrics)
-    health = Health(metrics.registry, controller.dead, controller.unready)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
     log.info(
         "rosproxy-operator %s: looking after %s at %s; health and metrics at http://%s",
@@ -41,12 +41,12 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         api.server,
         settings.admin,
     )
-    keeper = (
+    rotation = (
         CertificateRotation(source(api, settings.webhook), metrics) if settings.webhook else None
     )
-    watch = _watch(settings, controller, api, keeper, metrics)
+    watch = _watch(settings, controller, api, rotation, metrics)
     controller.appeared = watch.restart
-    running = [controller.run(), stopped.wait(), *([keeper.run()] if keeper else [])]
+    running = [controller.run(), stopped.wait(), *([rotation.run()] if rotation else [])]
     tasks = [asyncio.ensure_future(work) for work in running]
     watch.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -62,10 +62,12 @@ def _watch(
     settings: KubernetesSettings,
     controller: KubernetesController,
     api: Api,
-    keeper: CertificateRotation | None,
+    rotation: CertificateRotation | None,
     metrics: ClusterMetrics,
-) -> Watch:
-    if settings.webhook is None or keeper is None:
-        return Watch(settings, controller, None, None, metrics)
-    server = WebhookServer(settings.webhook.bind, keeper)
-    return Watch(settings, controller, Injector(api, metrics), server, metrics)
+) -> ClusterWatch:
+    if settings.webhook is None or rotation is None:
+        return ClusterWatch(settings, controller, None, None, metrics)
+    server = WebhookServer(settings.webhook.bind, rotation)
+    return ClusterWatch(
+        settings, controller, Injector(api, metrics, controller.wake), server, metrics
+    )

@@ -1,28 +1,29 @@
-"""A look at the cluster: everything that matters is listed anew, so that nothing is ever missed."""
+"""A look at the cluster: everything that matters is listed anew, so that nothing is ever missed.
+
+First the RosProxies, then side by side nodes, the operator's own pods and Services, masters'
+Services and selected pods, then all pods on the nodes that matter. All of it or nothing.
+"""
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.masters import master_service
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
-    Failure,
+    ClusterSnapshot,
     InvalidRosProxy,
     Name,
-    Node,
-    Observed,
     Pod,
     ProxyPod,
+    ProxyService,
     RosProxy,
-    Service,
 )
 from rosproxy_operator.kubernetes.planner.objects import node as parse_node
 from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
@@ -30,7 +31,7 @@ from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_prox
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.planner.spec import Unusable, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import InvalidField, invalid, rosproxy
 
 T = TypeVar("T")
 AT_ONCE = 8
@@ -41,47 +42,14 @@ _IDS = re.compile(r"\b[0-9a-f]{32,64}\b")
 _LONGEST = 300
 
 
-@dataclass(frozen=True, slots=True)
-class Cluster:
-    """What one look has found, before anything is known of what the proxies answer.
-
-    ``selected`` are the uids of the pods that a RosProxy selects.
-    """
-
-    rosproxies: tuple[RosProxy, ...]
-    unusable: Mapping[Name, InvalidRosProxy]
-    nodes: Mapping[str, Node]
-    pods: tuple[Pod, ...]
-    proxies: tuple[ProxyPod, ...]
-    services: Mapping[Name, Service]
-    masters: Mapping[Name, tuple[str, str]]
-    selected: frozenset[str]
-
-    def observed(
-        self, answers: Mapping[str, Answer], failures: Mapping[Name, tuple[Failure, ...]]
-    ) -> Observed:
-        """The same for planning."""
-        return Observed(
-            rosproxies=self.rosproxies,
-            nodes=self.nodes,
-            pods=self.pods,
-            proxies=self.proxies,
-            services=self.services,
-            masters=self.masters,
-            answers=answers,
-            unusable=self.unusable,
-            failures=failures,
-        )
-
-
-class Observer:
-    """Looks at a cluster."""
+class SnapshotReader:
+    """Lists what matters in a cluster."""
 
     def __init__(self, api: Api) -> None:
         self._api = api
         self._room = asyncio.Semaphore(AT_ONCE)
 
-    async def look(self) -> Cluster:
+    async def read(self) -> ClusterSnapshot:
         """List everything; all of it or nothing. Raises ApiError.
 
         RosProxies come first and from the API server's store: a proxy that belongs to none of them
@@ -99,7 +67,7 @@ class Observer:
         refused = {id: each for id, each in selected.items() if isinstance(each, InvalidRosProxy)}
         found = [pod for each in selected.values() if isinstance(each, list) for pod in each]
         others = await self._on_nodes({*(pod.node for pod in found), *(p.on for p in proxies)})
-        return Cluster(
+        return ClusterSnapshot(
             rosproxies=tuple(each for each in usable if each.id not in refused),
             unusable={**unusable, **refused},
             nodes=nodes,
@@ -121,7 +89,7 @@ class Observer:
         for found in self._listed_rosproxies():
             try:
                 usable.append(rosproxy(found))
-            except Unusable as error:
+            except InvalidField as error:
                 what = invalid(found, error)
                 unusable[what.id] = what
         return usable, unusable
@@ -130,10 +98,10 @@ class Observer:
         try:
             return self._api.rosproxies()
         except ApiError as error:
-            if error.kind is not Kind.GONE:
+            if error.kind is not ErrorKind.GONE:
                 raise
             raise ApiError(
-                Kind.GONE,
+                ErrorKind.GONE,
                 "the cluster has no RosProxies: install the CustomResourceDefinition "
                 "rosproxies.rosproxy.io (it comes with the chart and with manifests/)",
             ) from None
@@ -142,7 +110,7 @@ class Observer:
         found = map(parse_proxy_pod, self._api.own("pods"))
         return [proxy for proxy in found if proxy]
 
-    def _services(self) -> dict[Name, Service]:
+    def _services(self) -> dict[Name, ProxyService]:
         found = map(parse_service, self._api.own("services"))
         return {service.of: service for service in found if service}
 
@@ -168,7 +136,7 @@ class Observer:
         try:
             found = self._api.pods(of.id.namespace, label_selector(of.spec, of.id.name))
         except ApiError as error:
-            if error.kind is not Kind.INVALID:
+            if error.kind is not ErrorKind.INVALID:
                 raise
             text = f"spec.podSelector: {error}"
             return InvalidRosProxy(of.id, of.uid, of.generation, text, of.status)

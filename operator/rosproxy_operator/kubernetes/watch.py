@@ -17,9 +17,9 @@ import kopf
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.handlers import Wakeable, registry
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 
 log = logging.getLogger(__name__)
 
@@ -44,19 +44,19 @@ class Endless:
             yield _BETWEEN_TRIES[-1]
 
 
-class Watch:
+class ClusterWatch:
     """Watches the cluster and serves liveness and webhook, in a thread."""
 
     def __init__(
         self,
         settings: KubernetesSettings,
         controller: Wakeable,
-        wirer: Injector | None,
+        injector: Injector | None,
         server: WebhookServer | None,
         metrics: ClusterMetrics,
     ) -> None:
         self._settings, self._controller, self._metrics = settings, controller, metrics
-        self._wirer, self._server = wirer, server
+        self._injector, self._server = injector, server
         self._ending = threading.Event()
         self._running: tuple[asyncio.AbstractEventLoop, asyncio.Task[None]] | None = None
         self._thread = threading.Thread(target=self._run, daemon=True, name="kopf")
@@ -125,7 +125,7 @@ class Watch:
         namespaces = self._settings.namespaces
         # kopf's own stop flag would hold it up for seconds when it ends for another reason.
         await kopf.operator(
-            registry=registry(self._controller, self._wirer, self.configure),
+            registry=registry(self._controller, self._injector, self.configure),
             standalone=True,
             # kopf would ask for the user's name otherwise, and an image's user has none.
             identity=cast(Any, "rosproxy-operator"),

@@ -147,16 +147,18 @@ async def _ask_master(context: Context, trial: _Trial) -> str:
 async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
     name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(trial.where)
-    batch = context.upstream.batch
+    multicall = context.upstream.multicall
     try:
-        done = await batch(
+        done = await multicall(
             [("subscribeParam", [name, uri, name]), ("setParam", [CALLER_ID, name, True])]
         )
         if None in done:
             raise Unreachable("the master refused a call")
         yield
     finally:
-        await batch([("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])])
+        await multicall(
+            [("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])]
+        )
 
 
 def _reply(secret: str) -> bytes:

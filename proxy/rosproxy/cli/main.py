@@ -65,7 +65,7 @@ def main() -> None:
 @click.option(
     "--port-range",
     type=PORT_RANGE,
-    default="45000-45099",
+    default="11000-11099",
     metavar="A-B",
     help="Ports to listen on, one per inside node.",
 )

@@ -1,6 +1,8 @@
-"""A demonstration that needs nothing but Python: two sides, a boundary, and the real proxy.
+"""A demonstration that needs nothing but Python: two sides, NAT between them, and the real proxy.
 
-``python -m rosproxy.demo`` starts an embedded ROS master and small ROS nodes (real XML-RPC, real
-TCPROS), each in a process of its own, on two sides of a boundary (see :mod:`.boundary`), with the
-real proxy between them; it kills and restarts the proxy in the middle and counts every message.
+`python -m rosproxy.demo` plays a scenario (:mod:`.scenario`) with a small ROS master and small
+nodes that speak real XML-RPC and real TCPROS, and with the proxy as a process of its own, which is
+killed and started again in the middle. The master and the nodes (:mod:`.fake_http`,
+:mod:`.fake_master`, :mod:`.fake_node`) are also those of the integration tests; what a test may
+set on them has no use here.
 """

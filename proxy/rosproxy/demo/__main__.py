@@ -1,103 +1,51 @@
-"""`python -m rosproxy.demo`: run the demo and judge it."""
+"""`python -m rosproxy.demo`: play the demonstration and say whether it worked."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
+import os
 import signal
 import sys
 from dataclasses import asdict
-from typing import Any
 
 import click
+from rich.console import Console
 
-from rosproxy.demo.board import Board
-from rosproxy.demo.course import Course
-from rosproxy.demo.layout import Layout, detect
-from rosproxy.demo.processes import DemoError, Processes
-from rosproxy.demo.screen import choose, keep_drawing, summary
-from rosproxy.demo.tally import Verdict, judge
+from rosproxy.demo.scenario import Scenario
+from rosproxy.demo.screen import print_summary, show
 
 SHORTEST = 4
 INTERRUPTED = 130
 
 
-class Outcome:
-    """What a run of the demo came to."""
-
-    def __init__(self, seconds: float, verdicts: list[Verdict], evidence: dict[str, Any]) -> None:
-        self.seconds = seconds
-        self.verdicts = verdicts
-        self.evidence = evidence
-        self.log: list[str] = []
-
-    @property
-    def ok(self) -> bool:
-        """Whether every expectation was met."""
-        return all(verdict.met for verdict in self.verdicts)
-
-    def to_json(self) -> str:
-        """Return the outcome as a JSON document."""
-        fields = {
-            "ok": self.ok,
-            "seconds": round(self.seconds, 3),
-            "expectations": [asdict(verdict) for verdict in self.verdicts],
-            "evidence": self.evidence,
-            "log": self.log,
-        }
-        return json.dumps(fields, indent=2)
-
-
-async def perform(seconds: float, layout: Layout, *, quiet: bool) -> Outcome:
-    """Run the demo; whatever happens, no process is left when this returns."""
-    board, screen = Board(), choose(quiet=quiet)
-    drawing = asyncio.create_task(keep_drawing(screen, board))
-    try:
-        outcome = await _run(seconds, layout, board)
-    finally:
-        drawing.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await drawing
-    screen.draw(board)
-    return outcome
-
-
-async def _run(seconds: float, layout: Layout, board: Board) -> Outcome:
-    problem, log = "", []
-    async with Processes() as processes:
-        course = Course(layout, processes, board, seconds)
-        try:
-            await course.run()
-        except DemoError as error:
-            problem = str(error)
-            board.tell(f"stopped: {problem}")
-    log = processes.last_words()
-    verdicts = judge(course.evidence)
-    if problem:
-        verdicts.insert(0, Verdict("the demo runs to its end", met=False, detail=problem))
-    outcome = Outcome(board.clock(), verdicts, course.evidence.to_json())
-    outcome.log = [] if outcome.ok else log
-    return outcome
-
-
-async def _interruptible(seconds: float, *, quiet: bool) -> Outcome | None:
-    """Run the demo so that the first signal ends it in good order, and further ones don't hurt."""
-    work = asyncio.create_task(perform(seconds, detect(), quiet=quiet))
+async def perform(seconds: float, console: Console) -> Scenario | None:
+    """Play to the end, or to the first signal: None; no process is left in either case."""
+    scenario = Scenario(seconds)
+    playing = asyncio.create_task(scenario.play())
     loop = asyncio.get_running_loop()
-    stopping = asyncio.Event()
-
-    def stop() -> None:
-        if not stopping.is_set():
-            stopping.set()
-            work.cancel()
-
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, stop)
+        loop.add_signal_handler(number, lambda: playing.cancelling() or playing.cancel())
+    showing = asyncio.create_task(show(scenario, console))
     try:
-        return await work
+        await playing
     except asyncio.CancelledError:
         return None
+    finally:
+        showing.cancel()
+        await showing
+    return scenario
+
+
+def as_json(scenario: Scenario) -> str:
+    """The outcome as a JSON document."""
+    fields = {
+        "ok": scenario.ok,
+        "seconds": round(scenario.clock(), 3),
+        "checks": [asdict(check) for check in scenario.checks],
+        "log": [] if scenario.ok else [*scenario.proxy.log],
+    }
+    return json.dumps(fields, indent=2)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -108,26 +56,27 @@ async def _interruptible(seconds: float, *, quiet: bool) -> Outcome | None:
     show_default=True,
     help="How long the demo takes, about.",
 )
-@click.option(
-    "--json", "as_json", is_flag=True, help="Show nothing live; print the summary as JSON."
-)
-def main(seconds: float, as_json: bool) -> None:
+@click.option("--json", "quiet", is_flag=True, help="Show nothing live; print the summary as JSON.")
+def main(seconds: float, quiet: bool) -> None:
     """Show rosproxy at work: nodes on both sides of a boundary, with the real proxy between them.
 
     A small ROS master and small nodes are built in; nothing else is needed. In the middle the
-    proxy is killed and restarted. Exits with 0 only if every message count fits.
+    proxy is killed and restarted. Exits with 0 only if all worked and every message count fits.
     """
-    outcome = asyncio.run(_interruptible(seconds, quiet=as_json))
-    if outcome is None:
+    # The inside names resolve nowhere; a resolver that is slow to say so must not slow us down.
+    os.environ["RES_OPTIONS"] = "timeout:1 attempts:1"
+    console = Console(quiet=quiet)
+    scenario = asyncio.run(perform(seconds, console))
+    if scenario is None:
         click.echo("interrupted; all processes ended", err=True)
         sys.exit(INTERRUPTED)
-    if as_json:
-        click.echo(outcome.to_json())
+    if quiet:
+        click.echo(as_json(scenario))
     else:
-        click.echo(summary(outcome.verdicts, color=sys.stdout.isatty()))
-        for line in outcome.log:
-            click.echo(line, err=True)
-    sys.exit(0 if outcome.ok else 1)
+        print_summary(scenario, console)
+        for line in () if scenario.ok else scenario.proxy.log:
+            click.echo(f"rosproxy: {line}", err=True)
+    sys.exit(0 if scenario.ok else 1)
 
 
 if __name__ == "__main__":

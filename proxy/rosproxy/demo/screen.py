@@ -1,140 +1,112 @@
-"""The demo on the terminal: a table that redraws itself, or plain lines where there is none."""
+"""The demonstration on the terminal: a live table, or plain lines where there is none."""
 
 from __future__ import annotations
 
 import asyncio
-import shutil
-import sys
-from dataclasses import astuple
-from typing import TextIO
+from contextlib import suppress
+from time import monotonic
 
-from rosproxy.demo.board import HEADINGS, Board, Row
-from rosproxy.demo.tally import Verdict
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
-BOLD, DIM, GREEN, RED, PLAIN = "\x1b[1m", "\x1b[2m", "\x1b[32m", "\x1b[31m", "\x1b[0m"
-CLEAR_LINE, CLEAR_BELOW = "\x1b[K", "\x1b[J"
+from rosproxy.demo.players import Adder, Listener, Talker
+from rosproxy.demo.scenario import Scenario
+
 EVENTS_SHOWN = 8
-# The counts stand to the right, everything else to the left.
-RIGHT = (False, False, False, False, True, True, True, False)
 
 
-def _widths(rows: list[Row]) -> list[int]:
-    columns = zip(*(astuple(row) for row in rows), strict=True)
-    return [max(len(cell) for cell in column) for column in columns]
+def state_of(node: Talker | Listener | Adder) -> str:
+    """What a node is up to, in few words."""
+    if not node.slave.listening:
+        return "stopped"
+    if isinstance(node, Adder):
+        return "1 call" if node.answered == 1 else f"{node.answered} calls"
+    if isinstance(node, Talker):
+        unheard = node.number - len(node.sent)
+        state = "connected" if node.subscribers else "nobody listens"
+        return f"{state}, {unheard} unheard" if unheard else state
+    return "connected" if node.connected else node.problem or "no publisher"
 
 
-def _line(row: Row, widths: list[int], gap: str) -> str:
-    cells = zip(astuple(row), widths, RIGHT, strict=True)
-    return gap.join(
-        cell.rjust(width) if right else cell.ljust(width) for cell, width, right in cells
-    ).rstrip()
+def rate_of(node: Talker | Listener | Adder) -> int:
+    """How many messages it sent or received in the last second."""
+    if isinstance(node, Adder):
+        return 0
+    moments = [*node.sent.values()] if isinstance(node, Talker) else [t for _, t in node.received]
+    return sum(moment > monotonic() - 1 for moment in moments[-100:])
 
 
-def table(rows: list[Row], width: int) -> list[str]:
-    """Return the table's lines, headings first; closer together where `width` is short."""
-    everything = [HEADINGS, *rows]
-    widths = _widths(everything)
-    gap = "  " if sum(widths) + 2 * len(widths) <= width else " "
-    return [_line(row, widths, gap) for row in everything]
+def frame(scenario: Scenario) -> Group:
+    """The whole screen: what is being played, the nodes, and what happened last."""
+    title = f"{scenario.clock():5.1f} s  [rosproxy {scenario.proxy.state}]  {scenario.act}"
+    table = Table(box=None, header_style="dim")
+    for name in ("SIDE", "NODE", "CALLS ITSELF", "OTHER SIDE USES"):
+        table.add_column(name)
+    for name in ("SENT", "RECV", "RATE"):
+        table.add_column(name, justify="right")
+    table.add_column("STATE", no_wrap=True)
+    for node in (*scenario.inside, *scenario.outside):
+        _, side, name = node.name.split("/")
+        table.add_row(
+            *(side, name, f"{node.host}:{node.slave.address[1]}", scenario.seen.get(node.name)),
+            str(len(node.sent)) if isinstance(node, Talker) else "",
+            str(len(node.received)) if isinstance(node, Listener) else "",
+            "" if isinstance(node, Adder) else f"{rate_of(node)}/s",
+            Text(state_of(node)),
+        )
+    events = [Text(event_line(*event)) for event in scenario.events[-EVENTS_SHOWN:]]
+    return Group(Text(title, style="bold"), "", table, "", *events)
 
 
-def event_lines(board: Board) -> list[str]:
-    """Return all that happened, each with its time."""
-    return [f"{moment:5.1f} s  {text}" for moment, text in board.events]
+def event_line(moment: float, text: str) -> str:
+    """An event with its time."""
+    return f"{moment:5.1f} s  {text}"
 
 
-def frame(board: Board, width: int) -> list[tuple[str, str]]:
-    """Return the whole screen as pairs (style, line)."""
-    title = f"{board.clock():5.1f} s  [rosproxy {board.proxy}]  {board.phase}"
-    headings, *rows = table(board.rows(), width)
-    events = event_lines(board)[-EVENTS_SHOWN:]
-    return [
-        (BOLD, title),
-        ("", ""),
-        (DIM, headings),
-        *(("", row) for row in rows),
-        ("", ""),
-        *(("", event) for event in events),
-    ]
+def counts_line(scenario: Scenario) -> str:
+    """Where the play is and what has been counted so far."""
+    counts = []
+    for node in (*scenario.inside, *scenario.outside):
+        if not isinstance(node, Adder):
+            number = len(node.sent) if isinstance(node, Talker) else len(node.received)
+            counts.append(f"{node.name[1:].replace('/', ' ')}: {number} ({state_of(node)})")
+    return event_line(scenario.clock(), f"[{scenario.act}] {'  '.join(counts)}")
 
 
-class LiveScreen:
-    """Redraws the frame in place a few times a second."""
-
-    interval = 0.2
-
-    def __init__(self, out: TextIO) -> None:
-        self._out = out
-        self._height = 0
-
-    def draw(self, board: Board) -> None:
-        """Draw over the frame that was drawn last."""
-        width = shutil.get_terminal_size().columns
-        shown = frame(board, width)
-        lines = [f"{style}{text[: width - 1]}{PLAIN}{CLEAR_LINE}" for style, text in shown]
-        up = f"\x1b[{self._height}A" if self._height else ""
-        self._out.write(up + "\n".join(lines) + "\n" + CLEAR_BELOW)
-        self._out.flush()
-        self._height = len(lines)
-
-
-class LineScreen:
-    """Prints each event once, and a line of counts every second."""
-
-    interval = 1.0
-
-    def __init__(self, out: TextIO) -> None:
-        self._out = out
-        self._told = 0
-
-    def draw(self, board: Board) -> None:
-        """Print what is new."""
-        lines = event_lines(board)[self._told :]
-        self._told += len(lines)
-        lines.append(f"{board.clock():5.1f} s  [{board.phase}] {_counts(board)}")
-        self._out.write("\n".join(lines) + "\n")
-        self._out.flush()
+async def show(scenario: Scenario, console: Console) -> None:
+    """Draw until cancelled, and once more then."""
+    if console.is_terminal:
+        with Live(frame(scenario), console=console, auto_refresh=False) as live:
+            with suppress(asyncio.CancelledError):
+                while True:
+                    live.update(frame(scenario), refresh=True)
+                    await asyncio.sleep(0.2)
+            live.update(frame(scenario), refresh=True)
+        return
+    shown = 0
+    with suppress(asyncio.CancelledError):
+        while True:
+            shown = _print_events(scenario, console, shown)
+            console.out(counts_line(scenario), highlight=False)
+            await asyncio.sleep(1.0)
+    _print_events(scenario, console, shown)
 
 
-def _counts(board: Board) -> str:
-    rows = [row for row in board.rows() if row.sent or row.received]
-    return "  ".join(
-        f"{row.side} {row.node}: {row.sent or row.received} ({row.state})" for row in rows
-    )
+def _print_events(scenario: Scenario, console: Console, shown: int) -> int:
+    for event in scenario.events[shown:]:
+        console.out(event_line(*event), highlight=False)
+    return len(scenario.events)
 
 
-class NoScreen:
-    """Shows nothing: for `--json`."""
-
-    interval = 1.0
-
-    def draw(self, board: Board) -> None:
-        """Draw nothing."""
-
-
-Screen = LiveScreen | LineScreen | NoScreen
-
-
-async def keep_drawing(screen: Screen, board: Board) -> None:
-    """Draw until cancelled."""
-    while True:
-        screen.draw(board)
-        await asyncio.sleep(screen.interval)
-
-
-def choose(*, quiet: bool) -> Screen:
-    """Choose the screen that fits standard output."""
-    if quiet:
-        return NoScreen()
-    return LiveScreen(sys.stdout) if sys.stdout.isatty() else LineScreen(sys.stdout)
-
-
-def summary(verdicts: list[Verdict], *, color: bool) -> str:
-    """Return the closing list of expectations."""
-    lines = [""]
-    for verdict in verdicts:
-        word, style = ("ok", GREEN) if verdict.met else ("FAILED", RED)
-        mark = f"{style}{word:<6}{PLAIN}" if color else f"{word:<6}"
-        lines.append(f"{mark}  {verdict.expectation}: {verdict.detail}")
-    met = sum(verdict.met for verdict in verdicts)
-    return "\n".join([*lines, "", f"{met} of {len(verdicts)} expectations met"])
+def print_summary(scenario: Scenario, console: Console) -> None:
+    """Print what was shown, and what did not work."""
+    console.out("")
+    for check in scenario.checks:
+        word, style = ("ok    ", "green") if check.kept else ("FAILED", "red")
+        console.print(
+            Text.assemble((word, style), f"  {check.promise}: {check.detail}"), soft_wrap=True
+        )
+    kept = sum(check.kept for check in scenario.checks)
+    console.out(f"\n{kept} of {len(scenario.checks)} promises kept")

@@ -175,7 +175,7 @@ class _Collector:
 
     async def master_state(self, facts: DoctorFacts) -> DoctorFacts:
         """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
-        ask = self._master.ask_master
+        ask = self._master.call_master
         graph = replies.system_state(await ask("getSystemState"))
         names, services = sorted(graph.names()), sorted(graph.services)
         uris = await self._look_up("lookupNode", names)
@@ -215,7 +215,7 @@ class _Collector:
     async def _ask_master(self) -> tuple[Attempt, bool]:
         """How the master answers ``getPid``, and whether it is the proxy that refuses a loop."""
         try:
-            reply = await self._master.master(xmlrpc.dump_call("getPid", CALLER_ID))
+            reply = await self._master.post_to_master(xmlrpc.dump_call("getPid", CALLER_ID))
             xmlrpc.parse_reply(reply)
             loads(reply)
         except Unreachable as error:
@@ -233,14 +233,14 @@ class _Collector:
 
     async def _simulated_time(self) -> bool:
         try:
-            said = await self._master.ask_master("getParam", "/use_sim_time")
+            said = await self._master.call_master("getParam", "/use_sim_time")
         except MasterError:
             return False
         return said in ("1", "true", 1)
 
     async def _look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
         wanted = list(names)
-        found = await self._master.batch([(method, [CALLER_ID, name]) for name in wanted])
+        found = await self._master.multicall([(method, [CALLER_ID, name]) for name in wanted])
         pairs = zip(wanted, found, strict=False)
         return {name: uri for name, uri in pairs if isinstance(uri, str)}
 
@@ -256,7 +256,7 @@ class _Collector:
 
     async def _ask_pid(self, where: HostPort) -> Attempt:
         try:
-            pid = await self._nodes.ask_node(where, WITHIN, "getPid")
+            pid = await self._nodes.call_node(where, WITHIN, "getPid")
         except (Unreachable, MasterError) as error:
             return _failed_attempt(error)
         if isinstance(pid, int):
@@ -277,7 +277,7 @@ class _Collector:
 
     async def _ask_slave(self, where: HostPort) -> SlaveReport:
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
-        ask = self._nodes.ask_node
+        ask = self._nodes.call_node
         return replies.slave_report(*[await ask(where, WITHIN, method) for method in methods])
 
     async def _try_data_port(
@@ -288,7 +288,7 @@ class _Collector:
         if where is None or node.report is None:
             return "", Attempt()
         try:
-            answer = await self._nodes.ask_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
+            answer = await self._nodes.call_node(where, WITHIN, "requestTopic", topic, [["TCPROS"]])
         except (Unreachable, MasterError) as error:
             return "", _failed_attempt(error)
         target = replies.data_port(answer)

@@ -3,29 +3,32 @@
 import asyncio
 import json
 import socket
-from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from rosproxy.demo.fake_http import End
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
 from rosproxy.telemetry.metrics import MOST_NAMES, Traffic
-from tests.integration.calling_master import CallingMaster
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.http_fake import End
-from tests.integration.net import HOST, OUTSIDE, connect, exchange, post, rpc, until, xml
-from tests.integration.node import Node, read_header, service_header, topic_header
+from tests.integration.net import (
+    HOST,
+    OUTSIDE,
+    connect,
+    exchange,
+    post,
+    read_header,
+    rpc,
+    service_header,
+    topic_header,
+    until,
+    xml,
+)
 from tests.integration.proxy import Proxy
 
 DEAD_HOST = "127.0.9.9"
-
-
-@pytest.fixture
-async def master() -> AsyncIterator[CallingMaster]:
-    made = CallingMaster()
-    await made.start()
-    yield made
-    await made.stop()
 
 
 async def ask(proxy: Proxy, path: str, verb: str = "GET") -> tuple[int, str]:
@@ -55,26 +58,26 @@ def _labels(labels: dict[str, str]) -> str:
 
 
 async def test_health_and_readiness_follow_the_master(
-    make_proxy: MakeProxy, master: CallingMaster
+    make_proxy: MakeProxy, master: FakeMaster
 ) -> None:
     await master.stop()
     proxy = await make_proxy()
-    await until(lambda: proxy.app._watch.error, "the master was missed")
+    await until(lambda: proxy.app.master_monitor.error, "the master was missed")
     code, text = await ask(proxy, "/readyz")
     assert code == 503
     assert text.startswith(f"master {master.uri}: ")
     assert await ask(proxy, "/healthz") == (200, "ok\n")
     await master.start()
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     assert await ask(proxy, "/readyz") == (200, "ok\n")
     await master.stop()
-    await until(lambda: not proxy.app._watch.up, "the master was missed again")
+    await until(lambda: not proxy.app.master_monitor.up, "the master was missed again")
     assert (await ask(proxy, "/readyz"))[0] == 503
     assert await ask(proxy, "/healthz") == (200, "ok\n")
 
 
 async def test_not_ready_before_the_master_was_asked(
-    make_proxy: MakeProxy, master: CallingMaster
+    make_proxy: MakeProxy, master: FakeMaster
 ) -> None:
     master.delay = 0.5
     proxy = await make_proxy()
@@ -88,7 +91,7 @@ async def test_paths(proxy: Proxy) -> None:
     assert (await ask(proxy, "/probe"))[0] == 405
 
 
-async def test_status_tells_everything_of_a_node(proxy: Proxy, node: Node) -> None:
+async def test_status_tells_everything_of_a_node(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     await node.subscribe(proxy.master, "/back")
     await node.serve(proxy.master)
@@ -114,7 +117,7 @@ async def test_status_tells_everything_of_a_node(proxy: Proxy, node: Node) -> No
 
 
 async def test_metrics_of_a_proxy_at_work(
-    make_proxy: MakeProxy, make_node: MakeNode, master: CallingMaster
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
     proxy, node, dead = await make_proxy(), await make_node(), await make_node("/dead")
     for one in (node, dead):
@@ -124,7 +127,7 @@ async def test_metrics_of_a_proxy_at_work(
     await _talk(proxy, node)
     await rpc(proxy.lease(node), "getPid", "/outside")
     await until(lambda: not master.holds("publishers", "/dead"), "cleaned up")
-    await until(proxy.app.context.metrics.cleanups._value.get, "counted")
+    await until(lambda: proxy.metric("cleanups_total"), "counted")
     found = await metrics(proxy)
     assert found["rosproxy_leases_used"] in (1, 2)
     assert found["rosproxy_leases_used"] + found["rosproxy_leases_free"] == 8
@@ -145,7 +148,7 @@ async def test_metrics_of_a_proxy_at_work(
     assert any(name.startswith("rosproxy_build_info{version=") for name in found)
 
 
-async def _talk(proxy: Proxy, node: Node) -> None:
+async def _talk(proxy: Proxy, node: FakeNode) -> None:
     """A topic and a service over the relay, and a stranger."""
     for header in (topic_header(), service_header()):
         async with connect(proxy.lease(node)) as wire:
@@ -156,10 +159,10 @@ async def _talk(proxy: Proxy, node: Node) -> None:
     async with connect(proxy.lease(node)) as wire:
         await wire.send(b"\xff\xff\xff\x7fnonsense")
         await wire.outcome()
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await proxy.quiet()
 
 
-async def test_an_open_connection_is_counted(proxy: Proxy, node: Node) -> None:
+async def test_an_open_connection_is_counted(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header())
@@ -167,7 +170,7 @@ async def test_an_open_connection_is_counted(proxy: Proxy, node: Node) -> None:
         assert (await metrics(proxy))["rosproxy_open_connections"] == 1
 
 
-async def test_strangers_cannot_multiply_series(proxy: Proxy, node: Node) -> None:
+async def test_strangers_cannot_multiply_series(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     for number in range(20):
         body = xml(f"method_{number}", "/outside")
@@ -176,7 +179,7 @@ async def test_strangers_cannot_multiply_series(proxy: Proxy, node: Node) -> Non
         async with connect(proxy.lease(node)) as wire:
             await wire.send(topic_header(f"/made_up_{number}", f"/caller_{number}"))
             await read_header(wire)
-    await until(lambda: not proxy.app._tcpros.relays, "the connections have ended")
+    await proxy.quiet()
     found = await metrics(proxy)
     assert not [name for name in found if "made_up" in name or "method_" in name]
     assert not [name for name in found if "caller_" in name]
@@ -202,7 +205,7 @@ async def probe(proxy: Proxy) -> list[dict[str, Any]]:
 
 
 async def test_probe_tries_the_lowest_and_the_highest_free_port(
-    proxy: Proxy, node: Node, master: CallingMaster
+    proxy: Proxy, node: FakeNode, master: FakeMaster
 ) -> None:
     await node.publish(proxy.master)
     ports = proxy.settings.ports.listen
@@ -213,17 +216,17 @@ async def test_probe_tries_the_lowest_and_the_highest_free_port(
     assert found[0]["advertised"] == f"{HOST}:{ports.first + 1}"
     assert proxy.app.context.registry.pool.free == before
     assert not master.params, "a parameter is left behind"
-    assert not [name for name in master.book.nodes if "probe" in name]
+    assert not [name for name in master.nodes if "probe" in name]
 
 
-async def test_probe_while_the_master_is_away(proxy: Proxy, master: CallingMaster) -> None:
+async def test_probe_while_the_master_is_away(proxy: Proxy, master: FakeMaster) -> None:
     master.answers["system.multicall"] = End.RESET
     found = await probe(proxy)
     assert {(p["from_proxy"], p["from_master"]) for p in found} == {("ok", "unknown")}
 
 
 async def test_probe_tells_that_the_master_does_not_get_through(
-    make_proxy: MakeProxy, master: CallingMaster, monkeypatch: pytest.MonkeyPatch
+    make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rosproxy.admin.range_probe.MASTER_WAIT", 0.3)
     master.calls_back = False
@@ -238,7 +241,7 @@ async def test_two_probes_at_once_do_not_meet(proxy: Proxy) -> None:
     assert both[0] == both[1]
 
 
-async def test_probe_of_a_full_range(make_proxy: MakeProxy, node: Node) -> None:
+async def test_probe_of_a_full_range(make_proxy: MakeProxy, node: FakeNode) -> None:
     proxy = await make_proxy(ports=1)
     await node.publish(proxy.master)
     assert await probe(proxy) == []
@@ -288,7 +291,7 @@ async def test_probe_finds_somebody_else(
 
 
 async def test_probe_is_not_deceived_by_who_knows_no_secret(
-    make_proxy: MakeProxy, master: CallingMaster, monkeypatch: pytest.MonkeyPatch
+    make_proxy: MakeProxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stranger that calls the port under test does not count for the master."""
     monkeypatch.setattr("rosproxy.admin.range_probe.MASTER_WAIT", 0.6)

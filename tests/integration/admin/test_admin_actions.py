@@ -4,12 +4,13 @@ import json
 
 import pytest
 
+from rosproxy.demo.fake_http import End, free_ports
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.http_fake import End
-from tests.integration.master import Master
 from tests.integration.net import (
     NODE,
     OTHER_NODE,
@@ -17,11 +18,13 @@ from tests.integration.net import (
     THIRD_NODE,
     connect,
     exchange,
-    free_ports,
+    greet,
+    read_header,
     refuses,
+    service_header,
+    topic_header,
     until,
 )
-from tests.integration.node import Node, greet, read_header, service_header, topic_header
 from tests.integration.proxy import Proxy
 
 TOKEN = "0123456789abcdef"
@@ -84,7 +87,7 @@ async def test_a_page_in_a_browser_on_this_host_may_not(proxy: Proxy) -> None:
 
 
 @pytest.mark.usefixtures("from_afar")
-async def test_commands_send_the_token(make_proxy: MakeProxy, node: Node) -> None:
+async def test_commands_send_the_token(make_proxy: MakeProxy, node: FakeNode) -> None:
     proxy = await make_proxy(admin_token=TOKEN)
     await node.publish(proxy.master)
     words = ("doctor", "--admin", admin_url(proxy), "--json")
@@ -141,7 +144,7 @@ async def test_no_news(proxy: Proxy) -> None:
     assert await news(proxy, arrived=[{"address": NODE, "names": ["c1"]}]) == (0, 0, 0)
 
 
-async def populate(proxy: Proxy, node: Node) -> None:
+async def populate(proxy: Proxy, node: FakeNode) -> None:
     """One of each kind."""
     await node.publish(proxy.master)
     await node.publish(proxy.master, "/rosout")
@@ -150,13 +153,13 @@ async def populate(proxy: Proxy, node: Node) -> None:
     await node.call(proxy.master, "subscribeParam", node.uri, "/rate")
 
 
-def everything(master: Master) -> list[str]:
+def everything(master: FakeMaster) -> list[str]:
     """All names that the master knows of."""
-    return [key for table in master.book.tables.values() for key in table.rows]
+    return [key for table in master.tables.values() for key in table]
 
 
 async def test_a_container_that_is_gone(
-    make_proxy: MakeProxy, make_node: MakeNode, master: Master
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(**PATIENT)
     dead, alive = await make_node(), await make_node("/alive", OTHER_NODE)
@@ -172,7 +175,7 @@ async def test_a_container_that_is_gone(
 
 
 async def test_a_node_that_hangs_is_not_waited_for(
-    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "rosproxy.ros1.upkeep.containers.events.YOUNG", -1.0
@@ -189,7 +192,7 @@ async def test_a_node_that_hangs_is_not_waited_for(
 
 
 async def test_a_node_that_has_just_registered_may_take_its_time(
-    make_proxy: MakeProxy, node: Node, master: Master, monkeypatch: pytest.MonkeyPatch
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A restarted container has its address again before the news that it was gone."""
     monkeypatch.setattr("rosproxy.ros1.upkeep.containers.events.SECOND_CHANCE", 0.6)
@@ -202,7 +205,7 @@ async def test_a_node_that_has_just_registered_may_take_its_time(
     await until(lambda: not everything(master), "it had its chance", 5)
 
 
-async def test_its_open_connections_end(make_proxy: MakeProxy, node: Node) -> None:
+async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -> None:
     proxy = await make_proxy(**PATIENT)
     await node.publish(proxy.master)
     async with connect(proxy.lease(node)) as wire:
@@ -214,7 +217,7 @@ async def test_its_open_connections_end(make_proxy: MakeProxy, node: Node) -> No
 
 
 async def test_another_process_at_an_address_that_is_gone(
-    make_proxy: MakeProxy, node: Node, master: Master
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
     """It answers, but has none of the former one's topics."""
     proxy = await make_proxy(**PATIENT, probe_interval=60.0)
@@ -227,7 +230,7 @@ async def test_another_process_at_an_address_that_is_gone(
 
 
 async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
-    make_proxy: MakeProxy, node: Node
+    make_proxy: MakeProxy, node: FakeNode
 ) -> None:
     proxy = await make_proxy(cleanup_after=0.0, linger=0.2)
     await node.publish(proxy.master)
@@ -237,7 +240,7 @@ async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
 
 
 async def test_a_master_that_is_away_hears_of_it_later(
-    make_proxy: MakeProxy, node: Node, master: Master
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(linger=60.0, cleanup_after=60.0)
     await node.publish(proxy.master)
@@ -256,7 +259,7 @@ async def test_a_master_that_is_away_hears_of_it_later(
 class Container:
     """A node in a container that can get another address."""
 
-    def __init__(self, node: Node, proxy: Proxy) -> None:
+    def __init__(self, node: FakeNode, proxy: Proxy) -> None:
         self.node, self.proxy, self.uri = node, proxy, node.uri
 
     async def move(self, address: str) -> None:
@@ -282,7 +285,7 @@ async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
     return moved
 
 
-async def test_a_container_that_has_moved(container: Container, master: Master) -> None:
+async def test_a_container_that_has_moved(container: Container, master: FakeMaster) -> None:
     proxy, node = container.proxy, container.node
     lease, before = proxy.lease(node), proxy.uri(node)
     await container.move(OTHER_NODE)
@@ -300,7 +303,7 @@ async def test_a_container_that_has_moved(container: Container, master: Master) 
 
 
 async def test_it_goes_on_calling_itself_what_it_did(
-    container: Container, master: Master, make_node: MakeNode
+    container: Container, master: FakeMaster, make_node: MakeNode
 ) -> None:
     proxy, node = container.proxy, container.node
     await container.move(OTHER_NODE)
@@ -323,7 +326,7 @@ async def test_its_subscriptions_are_told_to_connect_again(container: Container)
 
 
 async def test_another_process_at_the_new_address_is_not_the_same(
-    container: Container, master: Master
+    container: Container, master: FakeMaster
 ) -> None:
     before = container.proxy.uri(container.node)
     await container.move(OTHER_NODE)
@@ -338,7 +341,7 @@ async def test_a_new_address_outside_of_all_inside_networks(container: Container
 
 
 async def test_it_has_registered_from_its_new_address_already(
-    container: Container, master: Master
+    container: Container, master: FakeMaster
 ) -> None:
     """So it holds another port, under the same name; its topics are all registered there."""
     proxy, node = container.proxy, container.node
@@ -353,7 +356,7 @@ async def test_it_has_registered_from_its_new_address_already(
 
 
 async def test_a_master_that_is_away_is_told_of_the_move_later(
-    container: Container, master: Master
+    container: Container, master: FakeMaster
 ) -> None:
     proxy, node = container.proxy, container.node
     await container.move(OTHER_NODE)
@@ -365,7 +368,7 @@ async def test_a_master_that_is_away_is_told_of_the_move_later(
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
 
 
-async def test_a_container_that_is_back_elsewhere(container: Container, master: Master) -> None:
+async def test_a_container_that_is_back_elsewhere(container: Container, master: FakeMaster) -> None:
     """Gone at first, as one that is taken off its network, and then at another address."""
     proxy, node = container.proxy, container.node
     await node.stop()
@@ -378,7 +381,7 @@ async def test_a_container_that_is_back_elsewhere(container: Container, master: 
 
 
 async def test_retiring(
-    make_proxy: MakeProxy, node: Node, make_node: MakeNode, master: Master
+    make_proxy: MakeProxy, node: FakeNode, make_node: MakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(**PATIENT)
     await populate(proxy, node)
@@ -391,9 +394,9 @@ async def test_retiring(
         assert triple[0] == -1
         assert "retired" in triple[1]
     assert await tell(proxy, "/retire") == {"unregistered": 0}
-    await proxy.app._watch.look()
-    await proxy.app._watch._restore_lost()
-    await proxy.app._keeper.look()
+    await proxy.app.master_monitor.look()
+    await proxy.app.registrar.register_lost()
+    await proxy.app.prober.look()
     assert not everything(master)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)
     ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
@@ -401,12 +404,12 @@ async def test_retiring(
 
 
 async def test_retiring_waits_for_registrations_under_way(
-    make_proxy: MakeProxy, node: Node, master: Master
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
     import asyncio
 
     proxy = await make_proxy(**PATIENT)
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     master.delay = 0.3
     registering = asyncio.create_task(node.publish(proxy.master))
     await until(lambda: len(proxy.app.context.registry), "it is admitted")
@@ -416,7 +419,7 @@ async def test_retiring_waits_for_registrations_under_way(
 
 
 async def test_a_proxy_that_can_not_retire_yet(
-    make_proxy: MakeProxy, node: Node, master: Master
+    make_proxy: MakeProxy, node: FakeNode, master: FakeMaster
 ) -> None:
     proxy = await make_proxy(**PATIENT)
     await node.publish(proxy.master)

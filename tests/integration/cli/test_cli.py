@@ -16,10 +16,10 @@ from contextlib import contextmanager
 import pytest
 
 from rosproxy.cli.admin_client import AdminClient, default_url
+from rosproxy.demo.fake_http import FakeHttpServer, FakeRequest, ok
+from rosproxy.demo.fake_node import FakeNode
 from tests.integration.commands import admin_url, run
-from tests.integration.http_fake import HttpFake, Request, ok
-from tests.integration.net import HOST, connect, until
-from tests.integration.node import Node, read_header, topic_header
+from tests.integration.net import HOST, connect, read_header, topic_header, until
 from tests.integration.process import clean_environment
 from tests.integration.proxy import Proxy
 
@@ -30,16 +30,16 @@ NOBODY = "http://127.0.0.1:1"
 async def stranger() -> AsyncIterator[str]:
     """A web server that is no rosproxy."""
 
-    async def respond(request: Request) -> bytes:
+    async def respond(request: FakeRequest) -> bytes:
         return ok(b'{"hello": "world"}')
 
-    fake = HttpFake(respond)
+    fake = FakeHttpServer(respond)
     await fake.start("127.0.0.1")
     yield f"http://127.0.0.1:{fake.address[1]}"
     await fake.stop()
 
 
-async def test_status_as_a_table(proxy: Proxy, node: Node) -> None:
+async def test_status_as_a_table(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header())
@@ -60,7 +60,7 @@ async def test_status_as_a_table(proxy: Proxy, node: Node) -> None:
     assert "topic /chatter with /outside at " in result.out
 
 
-async def test_status_as_json(proxy: Proxy, node: Node) -> None:
+async def test_status_as_json(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     result = await run("status", "--json", ROSPROXY_ADMIN=admin_url(proxy))
     assert (result.code, result.err) == (0, "")
@@ -128,10 +128,10 @@ async def test_somebody_else_answers(stranger: str) -> None:
 async def test_health_of_an_endpoint_that_says_no() -> None:
     """An admin endpoint of something else, that has no /healthz."""
 
-    async def respond(request: Request) -> bytes:
+    async def respond(request: FakeRequest) -> bytes:
         return b"HTTP/1.1 404 Not Found\r\nContent-Length: 4\r\n\r\nnope"
 
-    fake = HttpFake(respond)
+    fake = FakeHttpServer(respond)
     await fake.start("127.0.0.1")
     result = await run("health", "--admin", f"http://127.0.0.1:{fake.address[1]}")
     await fake.stop()
@@ -154,7 +154,7 @@ async def test_usage(words: tuple[str, ...]) -> None:
     assert "Traceback" not in result.err
 
 
-async def test_names_cannot_reach_the_terminal(proxy: Proxy, node: Node) -> None:
+async def test_names_cannot_reach_the_terminal(proxy: Proxy, node: FakeNode) -> None:
     node.name = "/evil\u202e\u200b"
     await node.publish(proxy.master)
     for words in (("status",), ("status", "--json")):
@@ -163,7 +163,7 @@ async def test_names_cannot_reach_the_terminal(proxy: Proxy, node: Node) -> None
         assert "u202e" in result.out
 
 
-async def test_a_terminal_without_unicode(proxy: Proxy, node: Node) -> None:
+async def test_a_terminal_without_unicode(proxy: Proxy, node: FakeNode) -> None:
     node.name = "/名"
     await node.publish(proxy.master)
     result = await run(
@@ -222,7 +222,7 @@ def terminal(*words: str) -> Iterator[Terminal]:
         started.close()
 
 
-async def test_watch_draws_until_interrupted(proxy: Proxy, node: Node) -> None:
+async def test_watch_draws_until_interrupted(proxy: Proxy, node: FakeNode) -> None:
     with terminal("status", "--watch", "--admin", admin_url(proxy)) as screen:
         await until(lambda: "No node has registered" in screen.read(), "the first drawing")
         await node.publish(proxy.master)

@@ -13,22 +13,21 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import End, Where, where
 from rosproxy.settings import SettingError
-from tests.integration.http_fake import End
 from tests.integration.net import (
     HOST,
     MASTER,
     NODE,
-    Where,
     connect,
     exchange,
     post,
+    read_header,
     rpc,
+    topic_header,
     until,
-    where,
     xml,
 )
-from tests.integration.node import read_header, topic_header
 from tests.integration.process import Process, clean_environment, command_line
 from tests.integration.proxy import Proxy, options_for, settings_for
 
@@ -44,10 +43,10 @@ BAD = {
     "advertise_host": ["", "a b", "http://host", "host:80", "a/b"],
     "master_port": ["0", "65536", "abc", "-1"],
     "port_range": ["", "5", "5-", "5-4", "0-5", "65000-70000", "a-b", "1-2-3"],
-    "advertise_port_range": ["5-4", "45000-45009", "x"],
+    "advertise_port_range": ["5-4", "11000-11009", "x"],
     "publish_master": ["0", "65536", "abc", "11311"],
     "bind": ["host", "1.2.3", "127.0.0.1:80"],
-    "admin_bind": ["11312", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":80", "127.0.0.1:45005"],
+    "admin_bind": ["11312", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":80", "127.0.0.1:11005"],
     "inside_network": ["10.0.0.1/8", "10.0.0.0/33", "net"],
     "probe_interval": ["0", "-1", "x", "nan", "inf", "1e9"],
     "probe_timeout": ["0", "-1", "x"],
@@ -161,7 +160,7 @@ def test_the_command_line_wins_over_the_environment():
     [("master_port", "port_range"), ("admin_bind", "port_range"), ("publish_master", "port_range")],
 )
 def test_ports_that_overlap_are_told(option, clash):
-    value = "127.0.0.1:45005" if option == "admin_bind" else "45005"
+    value = "127.0.0.1:11005" if option == "admin_bind" else "11005"
     code, text = command(arguments({**GOOD, option: value}))
     assert (code, text.count("\n")) == (2, 1)
     assert "--" + option.replace("_", "-") in text
@@ -243,7 +242,7 @@ async def test_a_signal_ends_it_in_2_seconds_with_connections_open(
     await node.publish(process.master)
     await hung.publish(process.master)
     lease = where(master.holds("publishers", "/chatter")[0])
-    stuck = where(master.book.nodes["/hung"])
+    stuck = where(master.nodes["/hung"])
     hung.hang, master.answers["getParam"] = True, End.HANG
     get = b"GET /healthz HTTP/1.1\r\nHost: h\r\n\r\n"
     async with AsyncExitStack() as stack:

@@ -2,37 +2,38 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from copy import deepcopy
 from typing import Any
 
 import pytest
 
 from rosproxy.cli.admin_client import AdminClient
+from rosproxy.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode, Header
 from rosproxy.doctor.collect import DoctorOptions, collect
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import diagnose
 from rosproxy.ros1.protocol.tcpros import encode_header
-from tests.integration.calling_master import CallingMaster
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.http_fake import End, HttpFake, Request, ok, value
-from tests.integration.net import HOST, MASTER, OUTSIDE, Wire, connect, free_ports, rpc, until
-from tests.integration.node import Header, Node, read_header, topic_header
+from tests.integration.net import (
+    HOST,
+    MASTER,
+    OUTSIDE,
+    connect,
+    read_header,
+    rpc,
+    topic_header,
+    until,
+)
 from tests.integration.proxy import Proxy
 
 NOBODY = "http://127.0.0.1:1"
 
 
 @pytest.fixture
-async def master() -> AsyncIterator[CallingMaster]:
-    made = CallingMaster()
-    await made.start()
-    yield made
-    await made.stop()
-
-
-@pytest.fixture
-async def listener(make_node: MakeNode, master: CallingMaster) -> Node:
+async def listener(make_node: MakeNode, master: FakeMaster) -> FakeNode:
     """A node outside that subscribes to /chatter."""
     node = await make_node("/listener", OUTSIDE)
     await register(master, node, "registerSubscriber")
@@ -40,7 +41,9 @@ async def listener(make_node: MakeNode, master: CallingMaster) -> Node:
     return node
 
 
-async def register(master: CallingMaster, node: Node, method: str, topic: str = "/chatter") -> None:
+async def register(
+    master: FakeMaster, node: FakeNode, method: str, topic: str = "/chatter"
+) -> None:
     """Register a node outside, at the real master."""
     await rpc(master.uri, method, node.name, topic, "std_msgs/String", node.uri)
 
@@ -70,7 +73,7 @@ def bus(*rows: tuple[str, str, str]) -> bytes:
 
 
 async def test_a_sound_system(
-    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+    proxy: Proxy, node: FakeNode, listener: FakeNode, master: FakeMaster
 ) -> None:
     await node.publish(proxy.master)
     await until(lambda: proxy.endpoint(node).health.state == "ok", "the node was probed")
@@ -83,15 +86,15 @@ async def test_a_sound_system(
     assert "2 registered, none with faults" in texts
 
 
-async def test_it_leaves_nothing_behind(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+async def test_it_leaves_nothing_behind(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
     await node.publish(proxy.master)
-    before = master.book.tables["publishers"].state(), dict(master.book.nodes)
+    before = deepcopy(master.tables["publishers"]), dict(master.nodes)
     await examine(proxy, "/chatter")
-    assert (master.book.tables["publishers"].state(), dict(master.book.nodes)) == before
+    assert (deepcopy(master.tables["publishers"]), dict(master.nodes)) == before
     assert not master.params
 
 
-async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: Node) -> None:
+async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: FakeNode) -> None:
     proxy = await make_proxy(cleanup_after=60)
     await node.publish(proxy.master)
     await node.stop()
@@ -101,7 +104,7 @@ async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: Node) -> None:
     assert "has ended without unregistering" in found.text
 
 
-async def test_a_node_that_hangs(make_proxy: MakeProxy, node: Node) -> None:
+async def test_a_node_that_hangs(make_proxy: MakeProxy, node: FakeNode) -> None:
     proxy = await make_proxy(cleanup_after=60)
     await node.publish(proxy.master)
     node.hang = True
@@ -110,7 +113,7 @@ async def test_a_node_that_hangs(make_proxy: MakeProxy, node: Node) -> None:
 
 
 async def test_an_outside_node_that_is_gone(
-    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+    proxy: Proxy, node: FakeNode, listener: FakeNode, master: FakeMaster
 ) -> None:
     await node.publish(proxy.master)
     await listener.stop()
@@ -118,13 +121,13 @@ async def test_an_outside_node_that_is_gone(
     assert (await only(proxy)).subject == "/listener"
 
 
-async def test_an_outside_node_of_an_unknown_host(proxy: Proxy, master: CallingMaster) -> None:
+async def test_an_outside_node_of_an_unknown_host(proxy: Proxy, master: FakeMaster) -> None:
     await rpc(master.uri, "registerPublisher", "/far", "/t", "a/B", "http://nobody.invalid:4/")
     found = [f for f in await faults(proxy) if f.subject == "/far"]
     assert "the host name nobody.invalid can't be resolved" in found[0].text
 
 
-async def test_a_stale_registration(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+async def test_a_stale_registration(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
     await node.publish(proxy.master)
     port = proxy.settings.ports.listen.last
     uri = f"http://{HOST}:{port}/127.0.2.99:4/"
@@ -135,7 +138,7 @@ async def test_a_stale_registration(proxy: Proxy, node: Node, master: CallingMas
     assert {f.check for f in found} == {"stale registration"}
 
 
-async def test_the_master_is_away(proxy: Proxy, master: CallingMaster) -> None:
+async def test_the_master_is_away(proxy: Proxy, master: FakeMaster) -> None:
     await master.stop()
     found = [f for f in await faults(proxy) if f.severity is Severity.ERROR]
     assert [f.check for f in found] == ["master"]
@@ -143,12 +146,12 @@ async def test_the_master_is_away(proxy: Proxy, master: CallingMaster) -> None:
 
 
 async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
-    async def respond(request: Request) -> bytes:
+    async def respond(request: FakeRequest) -> bytes:
         if request.verb == "POST" and request.path == "/":
             return value([1, "", 7])
         return b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
 
-    fake = HttpFake(respond)
+    fake = FakeHttpServer(respond)
     await fake.start(MASTER)
     proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/ros")
     found = [f for f in await faults(proxy) if f.check == "master"]
@@ -158,10 +161,10 @@ async def test_the_masters_path_is_wrong(make_proxy: MakeProxy) -> None:
 
 
 async def test_something_else_answers_for_the_master(make_proxy: MakeProxy) -> None:
-    async def respond(request: Request) -> bytes:
+    async def respond(request: FakeRequest) -> bytes:
         return ok(b"<html>It works!</html>")
 
-    fake = HttpFake(respond)
+    fake = FakeHttpServer(respond)
     await fake.start(MASTER)
     proxy = await make_proxy(master_uri=f"http://{MASTER}:{fake.address[1]}/")
     found = [f for f in await faults(proxy) if f.check == "master"]
@@ -183,12 +186,14 @@ async def test_the_published_master(make_proxy: MakeProxy) -> None:
     assert found.severity is Severity.OK
 
 
-async def connected_pair(proxy: Proxy, node: Node) -> None:
+async def connected_pair(proxy: Proxy, node: FakeNode) -> None:
     await node.publish(proxy.master)
     node.answers["getBusInfo"] = bus(("/listener", "o", "/chatter"))
 
 
-async def test_a_topic_whose_pair_is_connected(proxy: Proxy, node: Node, listener: Node) -> None:
+async def test_a_topic_whose_pair_is_connected(
+    proxy: Proxy, node: FakeNode, listener: FakeNode
+) -> None:
     await connected_pair(proxy, node)
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header(caller="/listener"))
@@ -200,20 +205,22 @@ async def test_a_topic_whose_pair_is_connected(proxy: Proxy, node: Node, listene
     assert pair.text.endswith(" just now")
 
 
-async def test_types_that_differ(proxy: Proxy, node: Node, listener: Node) -> None:
+async def test_types_that_differ(proxy: Proxy, node: FakeNode, listener: FakeNode) -> None:
     await node.publish(proxy.master)
     listener.subscribed["/chatter"] = "std_msgs/Int32"
     found = await only(proxy, "/talker", "/listener")
     assert "types differ, std_msgs/String and std_msgs/Int32" in found.text
 
 
-async def test_a_subscriber_that_did_not_come(proxy: Proxy, node: Node, listener: Node) -> None:
+async def test_a_subscriber_that_did_not_come(
+    proxy: Proxy, node: FakeNode, listener: FakeNode
+) -> None:
     await node.publish(proxy.master)
     found = await only(proxy, "/chatter")
     assert "/listener has not come" in found.text
 
 
-async def outside_publisher(master: CallingMaster, make_node: MakeNode) -> Node:
+async def outside_publisher(master: FakeMaster, make_node: MakeNode) -> FakeNode:
     """A node outside that publishes /chatter, to a subscriber that is there already."""
     node = await make_node("/robot", OUTSIDE)
     await register(master, node, "registerPublisher")
@@ -221,13 +228,15 @@ async def outside_publisher(master: CallingMaster, make_node: MakeNode) -> Node:
     return node
 
 
-async def refuse(node: Node, wire: Wire, header: Header) -> None:
+async def refuse(
+    node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Header
+) -> None:
     """Answer a subscriber as a publisher does whose message definition is another."""
-    await wire.send(encode_header({"error": "md5sums do not match"}))
+    writer.write(encode_header({"error": "md5sums do not match"}))
 
 
 async def test_data_ports_of_a_publisher_outside(
-    proxy: Proxy, node: Node, master: CallingMaster, make_node: MakeNode
+    proxy: Proxy, node: FakeNode, master: FakeMaster, make_node: MakeNode
 ) -> None:
     await node.subscribe(proxy.master)
     robot = await outside_publisher(master, make_node)
@@ -249,7 +258,7 @@ async def test_data_ports_of_a_publisher_outside(
 
 @pytest.mark.parametrize("answer", [value(7), value([1, "", "x"]), ok(b"no xml"), End.RESET])
 async def test_nodes_that_talk_nonsense_do_no_harm(
-    proxy: Proxy, node: Node, listener: Node, answer: Any
+    proxy: Proxy, node: FakeNode, listener: FakeNode, answer: Any
 ) -> None:
     await connected_pair(proxy, node)
     for method in ("getBusInfo", "getPublications", "requestTopic", "getSubscriptions"):
@@ -257,7 +266,7 @@ async def test_nodes_that_talk_nonsense_do_no_harm(
     assert await examine(proxy, "/chatter")
 
 
-async def test_services(proxy: Proxy, node: Node) -> None:
+async def test_services(proxy: Proxy, node: FakeNode) -> None:
     await node.serve(proxy.master)
     (found,) = [f for f in await examine(proxy, "/add") if f.check == "pair"]
     assert found.severity is Severity.OK
@@ -268,7 +277,7 @@ async def test_services(proxy: Proxy, node: Node) -> None:
 
 
 async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
-    listener: Node, master: CallingMaster
+    listener: FakeNode, master: FakeMaster
 ) -> None:
     found = diagnose(
         await collect(DoctorOptions(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
@@ -278,7 +287,7 @@ async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
 
 
 async def test_the_look_from_outside(
-    proxy: Proxy, node: Node, listener: Node, master: CallingMaster
+    proxy: Proxy, node: FakeNode, listener: FakeNode, master: FakeMaster
 ) -> None:
     await connected_pair(proxy, node)
     assert not await faults(None, master_uri=master.uri)
@@ -291,7 +300,7 @@ async def test_the_look_from_outside(
     assert "registered through a rosproxy" in found.text
 
 
-async def test_the_command(proxy: Proxy, node: Node, master: CallingMaster) -> None:
+async def test_the_command(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
     await node.publish(proxy.master)
     sound = await run("doctor", "--admin", admin_url(proxy))
     assert (sound.code, sound.err) == (0, "")
@@ -318,11 +327,11 @@ async def test_usage() -> None:
 
 
 async def test_many_nodes_are_looked_at_together(
-    proxy: Proxy, master: CallingMaster, monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A hundred nodes that do not answer must not take a hundred time-outs."""
     monkeypatch.setattr("rosproxy.doctor.collect.WITHIN", 0.3)
-    silent = HttpFake(hang)
+    silent = FakeHttpServer(hang)
     await silent.start(OUTSIDE)
     for number in range(100):
         uri = f"http://{OUTSIDE}:{silent.address[1]}/"
@@ -334,5 +343,5 @@ async def test_many_nodes_are_looked_at_together(
     assert asyncio.get_running_loop().time() - started < 5
 
 
-async def hang(_request: Request) -> End:
+async def hang(_request: FakeRequest) -> End:
     return End.HANG

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import Where
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
 from rosproxy.forwarding.kernel import targets as kernel_targets
@@ -12,8 +13,16 @@ from rosproxy.forwarding.kernel.targets import KernelTargets
 from rosproxy.forwarding.kernel.tools import Tools
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
-from tests.integration.net import NODE, OTHER_NODE, THIRD_NODE, Where, refuses, rpc, until
-from tests.integration.node import greet, topic_header
+from tests.integration.net import (
+    NODE,
+    OTHER_NODE,
+    THIRD_NODE,
+    greet,
+    refuses,
+    rpc,
+    topic_header,
+    until,
+)
 
 TCPROS = [["TCPROS"]]
 
@@ -152,8 +161,8 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     host, lease = proxy.lease(node)
     assert await refuses((host, lease + 2))
     await proxy.restart()
-    leases, registry = proxy.app._leases, proxy.app.context.registry
-    await until(lambda: any(map(leases.is_open, registry)), "the node is recovered")
+    await until(lambda: len(proxy.app.context.registry), "the node is found")
+    await until(lambda: proxy.serves(node), "the node is served")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
     assert proxy.app.status()["ports"]["free"] == 3
     others = [await make_node(f"/n{number}", OTHER_NODE) for number in range(3)]

@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from rosproxy.forwarding import relay, relay_set
-from tests.integration.net import Wire, connect, refuses, until
-from tests.integration.node import read_header, topic_header
+from tests.integration.net import Wire, connect, read_header, refuses, topic_header, until
 
 BOTH_LOOPS = True
 THRESHOLDS = [relay.COPY_SIZE, 4 * relay.COPY_SIZE, relay.BLOCK_SIZE, relay.PIPE_SIZE]
@@ -41,8 +40,10 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
     arrived: asyncio.Future[Wire] = asyncio.get_running_loop().create_future()
     over = asyncio.Event()
 
-    async def hold(node: Any, wire: Wire, header: Any) -> None:
-        arrived.set_result(wire)
+    async def hold(
+        node: Any, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Any
+    ) -> None:
+        arrived.set_result(Wire(reader, writer))
         await over.wait()
 
     before, node.stream = node.stream, hold
@@ -55,11 +56,6 @@ async def relayed(node: Any, lease: Any) -> AsyncIterator[Ends]:
             over.set()
 
 
-async def quiet(proxy: Any) -> None:
-    """Wait until all relays have ended."""
-    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
-
-
 async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lease):
     async with relayed(node, lease) as ends:
         for one, other in ((ends.outside, ends.inside), (ends.inside, ends.outside)):
@@ -70,7 +66,7 @@ async def test_a_half_close_passes_and_the_other_way_stays_open(proxy, node, lea
             if one is ends.outside:
                 await ends.inside.send(b"still here")
                 assert await ends.outside.exactly(10) == b"still here"
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 @pytest.mark.parametrize("who", ["outside", "inside"])
@@ -87,7 +83,7 @@ async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
             await asyncio.sleep(0.05)
         one.reset()
         assert await other.end() == "reset"
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 @pytest.mark.parametrize("who", ["outside", "inside"])
@@ -102,7 +98,7 @@ async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, w
         await asyncio.gather(flood, return_exceptions=True)
         with pytest.raises(ConnectionResetError):
             await digest(other)
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 @pytest.mark.parametrize("stalled", ["outside", "inside"])
@@ -115,7 +111,7 @@ async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, leas
         reader.reset()
         with pytest.raises(ConnectionError):
             await flood
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 def slices(data: bytes, seed: int) -> list[bytes]:
@@ -160,10 +156,10 @@ async def test_bytes_arrive_intact_both_ways_at_once(
         )
     assert got_outside == hashlib.sha256(outward).hexdigest()
     assert got_inside == hashlib.sha256(inward).hexdigest()
-    await quiet(proxy)
-    traffic = proxy.app._tcpros.traffic()
-    assert traffic.sent[("topic", "/chatter")] == len(outward)
-    assert traffic.received[("topic", "/chatter")] == len(inward)
+    await proxy.quiet()
+    for direction, size in (("outward", len(outward)), ("inward", len(inward))):
+        series = {"kind": "topic", "name": "/chatter", "direction": direction}
+        assert proxy.metric("relayed_bytes_total", **series) == size
 
 
 async def test_without_a_descriptor_for_a_pipe_bytes_are_copied(node, lease, monkeypatch):
@@ -198,9 +194,13 @@ async def test_the_status_tells_of_open_connections(proxy, node, lease):
     async with relayed(node, lease) as ends:
         await ends.inside.send(b"x" * 1000)
         await ends.outside.exactly(1000)
-        await until(lambda: proxy.app._tcpros.relays[0].sent, "the bytes are counted")
-        (shown,) = proxy.app.status()["nodes"][0]["connections"]
-        assert {**shown, "sent_rate": 0, "received_rate": 0} == {
+
+        def shown() -> dict[str, Any]:
+            (one,) = proxy.app.status()["nodes"][0]["connections"]
+            return dict(one)
+
+        await until(lambda: shown()["sent"], "the bytes are counted")
+        assert {**shown(), "sent_rate": 0, "received_rate": 0} == {
             "kind": "topic",
             "name": "/chatter",
             "caller_id": "/outside",
@@ -223,11 +223,11 @@ async def test_connections_leave_neither_descriptors_nor_threads(proxy, node, le
                 wire.reset()
 
     for round_ in range(2):
-        await quiet(proxy)
+        await proxy.quiet()
         before = len(os.listdir("/proc/self/fd")), threading.active_count()
         for _ in range(4):
             await asyncio.gather(*(once(i) for i in range(30 * (1 + round_))))
-        await quiet(proxy)
+        await proxy.quiet()
     await asyncio.sleep(0.1)
     assert len(os.listdir("/proc/self/fd")) <= before[0] + 2
     assert threading.active_count() <= before[1]
@@ -240,7 +240,7 @@ async def test_without_a_thread_left_a_connection_is_reset(
 ):
     async with relayed(node, lease):
         pass
-    await quiet(proxy)
+    await proxy.quiet()
     real, budget = threading.Thread.start, [started]
 
     def start(thread: threading.Thread) -> None:
@@ -255,7 +255,7 @@ async def test_without_a_thread_left_a_connection_is_reset(
     async with connect(lease) as wire:
         await wire.send(topic_header() + b"says more")
         assert await wire.end() == "reset"
-    await quiet(proxy)
+    await proxy.quiet()
     assert proxy.endpoint(node).connections == 0
     await until(lambda: len(os.listdir("/proc/self/fd")) <= before, "all is closed")
 
@@ -307,7 +307,7 @@ async def test_a_subscriber_that_says_nothing_costs_one_thread(proxy, node, leas
         await ends.outside.send(b"says something")
         assert await ends.inside.exactly(14) == b"says something"
         assert threading.active_count() == before + 2
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, lease, monkeypatch):
@@ -315,8 +315,8 @@ async def test_many_subscribers_that_leave_at_once_are_all_noticed(proxy, node, 
     async with AsyncExitStack() as stack:
         for _ in range(10):
             await stack.enter_async_context(relayed(node, lease))
-        assert len(proxy.app._tcpros.relays) == 10
-    await quiet(proxy)
+        assert proxy.metric("open_connections") == 10
+    await proxy.quiet()
 
 
 async def test_many_streams_at_once_share_small_pipes(node, lease, monkeypatch):
@@ -360,7 +360,7 @@ async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
         floods.append(asyncio.create_task(flood(streams[1])))
         await until(lambda: buffers(proxy) == {SHARED}, "both share")
         assert await asyncio.gather(*floods) == [FLOOD, FLOOD]
-    await quiet(proxy)
+    await proxy.quiet()
 
 
 SHARED = (2 * relay.SHARED_RECEIVE, 2 * relay.SHARED_SEND)

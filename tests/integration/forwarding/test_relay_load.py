@@ -14,9 +14,9 @@ from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from time import monotonic
 from typing import Any
 
+from rosproxy.demo.fake_http import Where, where
 from rosproxy.ros1.protocol.tcpros import encode_header
-from tests.integration.net import OUTSIDE, Where, connect, exchange, post, until, where
-from tests.integration.node import read_header, topic_header
+from tests.integration.net import OUTSIDE, connect, exchange, post, read_header, topic_header, until
 
 STALL = float(os.environ.get("ROSPROXY_TEST_STALL", "1"))
 OFFERED = 1 << 30

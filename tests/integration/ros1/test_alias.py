@@ -8,28 +8,30 @@ from typing import Any
 
 import pytest
 
+from rosproxy.demo.fake_http import End, Where, ok, value, where
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
 from tests.integration.admin.test_admin import metrics
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.http_fake import End, ok
-from tests.integration.master import Master
 from tests.integration.net import (
     MASTER,
     NODE,
     OTHER_NODE,
     OUTSIDE,
     PROXY,
-    Where,
+    Wire,
     connect,
     exchange,
     knock,
     post,
+    read_header,
     refuses,
     rpc,
+    service_header,
+    topic_header,
     until,
-    where,
     xml,
 )
-from tests.integration.node import Node, read_header, service_header, topic_header
 from tests.integration.proxy import Proxy
 
 BOTH_LOOPS = True
@@ -37,7 +39,7 @@ MOVED = "127.0.1.2"
 """Another address of the master's host."""
 
 
-def behind_its_name(master: Master, **options: Any) -> dict[str, Any]:
+def behind_its_name(master: FakeMaster, **options: Any) -> dict[str, Any]:
     """Options of a proxy that stands in for the master's host; nodes there have its ports."""
     port = where(master.uri)[1]
     named = {"master_uri": f"http://robot:{port}", "master_address": MASTER}
@@ -45,12 +47,12 @@ def behind_its_name(master: Master, **options: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-async def proxy(make_proxy: MakeProxy, master: Master) -> Proxy:
+async def proxy(make_proxy: MakeProxy, master: FakeMaster) -> Proxy:
     return await make_proxy(**behind_its_name(master))
 
 
 @pytest.fixture
-async def robot(make_node: MakeNode, master: Master) -> Node:
+async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
     """A node on the master's host that publishes and serves."""
     made = await make_node("/robot", MASTER, host="robot")
     await made.publish(where(master.uri))
@@ -58,12 +60,12 @@ async def robot(make_node: MakeNode, master: Master) -> Node:
     return made
 
 
-def slave(node: Node, address: str = PROXY) -> Where:
+def slave(node: FakeNode, address: str = PROXY) -> Where:
     """Where inside finds a node's slave API."""
     return address, node.slave.address[1]
 
 
-def service(node: Node, address: str = PROXY) -> Where:
+def service(node: FakeNode, address: str = PROXY) -> Where:
     """Where inside finds a node's services."""
     return address, node.tcpros_port
 
@@ -77,7 +79,7 @@ def problems(proxy: Proxy) -> dict[str, str]:
     return {row["subject"]: row["text"] for row in proxy.app.status()["problems"]}
 
 
-async def look_up(proxy: Proxy, node: Node) -> Any:
+async def look_up(proxy: Proxy, node: FakeNode) -> Any:
     """A node's slave URI as inside is given it."""
     return (await rpc(proxy.master, "lookupNode", "/tool", node.name, source=NODE))[2]
 
@@ -90,20 +92,20 @@ def real_master(proxy: Proxy) -> Where:
     return MASTER, where(proxy.settings.master_uri)[1]
 
 
-async def by_subscribing(proxy: Proxy, robot: Node, node: Node) -> Any:
+async def by_subscribing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
     return (await node.subscribe(proxy.master))[2][0]
 
 
-async def by_publishing(proxy: Proxy, robot: Node, node: Node) -> Any:
+async def by_publishing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
     await robot.subscribe(real_master(proxy))
     return (await node.publish(proxy.master))[2][0]
 
 
-async def by_lookup(proxy: Proxy, robot: Node, node: Node) -> Any:
+async def by_lookup(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
     return await look_up(proxy, robot)
 
 
-async def by_multicall(proxy: Proxy, robot: Node, node: Node) -> Any:
+async def by_multicall(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
     calls = [
         {"methodName": "getPid", "params": ["/tool"]},
         {"methodName": "lookupNode", "params": ["/tool", "/robot"]},
@@ -111,7 +113,7 @@ async def by_multicall(proxy: Proxy, robot: Node, node: Node) -> Any:
     return (await rpc(proxy.master, "system.multicall", calls, source=NODE))[1][0][2]
 
 
-async def by_update(proxy: Proxy, robot: Node, node: Node) -> Any:
+async def by_update(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
     await node.subscribe(proxy.master, "/later")
     await robot.publish(real_master(proxy), "/later")
     await until(lambda: node.updates("/later"), "a publisherUpdate")
@@ -123,7 +125,7 @@ WAYS = [by_subscribing, by_publishing, by_lookup, by_multicall, by_update]
 
 @pytest.mark.parametrize("way", WAYS)
 async def test_whatever_way_a_uri_is_given_it_is_unchanged_and_its_port_is_open(
-    proxy: Proxy, robot: Node, node: Node, way: Callable[..., Awaitable[Any]]
+    proxy: Proxy, robot: FakeNode, node: FakeNode, way: Callable[..., Awaitable[Any]]
 ) -> None:
     assert mirrored(proxy) == {}
     assert await refuses(slave(robot), NODE)
@@ -133,25 +135,23 @@ async def test_whatever_way_a_uri_is_given_it_is_unchanged_and_its_port_is_open(
 
 
 async def test_the_port_is_open_before_the_update_arrives(
-    proxy: Proxy, robot: Node, node: Node, master: Master
+    proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
 ) -> None:
     refused: list[bool] = []
-    run = node._run
 
-    def look(method: str, params: tuple[Any, ...]) -> list[Any]:
-        if method == "publisherUpdate":
-            with socket.socket() as probe:
-                refused.append(probe.connect_ex(slave(robot)) != 0)
-        return run(method, params)
+    def look(*_: Any) -> bytes:
+        with socket.socket() as probe:
+            refused.append(probe.connect_ex(slave(robot)) != 0)
+        return value([1, "", 0])
 
-    node._run = look  # type: ignore[method-assign]
+    node.answers["publisherUpdate"] = look
     await node.subscribe(proxy.master, "/later")
     await robot.publish(where(master.uri), "/later")
     await until(lambda: refused, "a publisherUpdate")
     assert refused == [False]
 
 
-async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: Node) -> None:
+async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: FakeNode) -> None:
     assert await look_up_service(proxy) == robot.service_api
     assert mirrored(proxy) == {robot.tcpros_port: 0}
     async with connect(service(robot), NODE) as wire:
@@ -165,7 +165,7 @@ async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: Node) -> 
 
 
 async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
-    proxy: Proxy, robot: Node
+    proxy: Proxy, robot: FakeNode
 ) -> None:
     await look_up(proxy, robot)
     asked = await rpc(slave(robot), "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
@@ -176,7 +176,7 @@ async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
     assert asked == [-1, "Not a publisher of [/no]", []]
 
 
-async def test_calls_pass_byte_for_byte_with_their_path(proxy: Proxy, robot: Node) -> None:
+async def test_calls_pass_byte_for_byte_with_their_path(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     body = xml("anything", "/tool", {"a": [1, 2.5]}).replace(b"\n", b" ")
     robot.answers["anything"] = ok(b"<methodResponse>whatever")
@@ -187,7 +187,7 @@ async def test_calls_pass_byte_for_byte_with_their_path(proxy: Proxy, robot: Nod
     assert sent.headers["host"] == f"robot:{slave(robot)[1]}"
 
 
-async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot: Node) -> None:
+async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     for request in (b"GET / HTTP/1.1\r\nHost: x\r\n\r\n", b"PUT / HTTP/1.1\r\nHost: x\r\n\r\n"):
         assert (await exchange(slave(robot), request, NODE)).status in (200, 405)
@@ -196,7 +196,7 @@ async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot
 
 
 async def test_a_body_beyond_the_bound_is_refused(
-    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await look_up(proxy, robot)
     monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
@@ -205,12 +205,14 @@ async def test_a_body_beyond_the_bound_is_refused(
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
 
 
-async def test_ends_and_resets_pass(proxy: Proxy, robot: Node) -> None:
+async def test_ends_and_resets_pass(proxy: Proxy, robot: FakeNode) -> None:
     ends: asyncio.Queue[Any] = asyncio.Queue()
     over = asyncio.Event()
 
-    async def hold(node: Node, wire: Any, header: Any) -> None:
-        ends.put_nowait(wire)
+    async def hold(
+        node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Any
+    ) -> None:
+        ends.put_nowait(Wire(reader, writer))
         await over.wait()
 
     robot.stream = hold
@@ -232,7 +234,7 @@ async def test_ends_and_resets_pass(proxy: Proxy, robot: Node) -> None:
     over.set()
 
 
-async def test_only_inside_is_let_in(proxy: Proxy, robot: Node) -> None:
+async def test_only_inside_is_let_in(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
     for source in (OUTSIDE, MASTER, "127.0.0.1"):
@@ -252,8 +254,8 @@ _CLOSED = ("closed", "reset")
 )
 async def test_nothing_happens_without_need(
     make_proxy: MakeProxy,
-    master: Master,
-    robot: Node,
+    master: FakeMaster,
+    robot: FakeNode,
     options: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -271,7 +273,7 @@ async def test_nothing_happens_without_need(
 
 
 async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
-    proxy: Proxy, master: Master, make_node: MakeNode
+    proxy: Proxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     for name, host in (("/one", MASTER), ("/two", "laptop")):
         node = await make_node(name, MASTER, host=host)
@@ -280,14 +282,14 @@ async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
     assert mirrored(proxy) == {}
 
 
-async def gone(proxy: Proxy, robot: Node) -> None:
+async def gone(proxy: Proxy, robot: FakeNode) -> None:
     """End a node whose ports are mirrored, and let inside find out."""
     await robot.stop()
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
     assert await knock(service(robot), service_header(), NODE) == "reset"
 
 
-async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot: Node) -> None:
+async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
     await gone(proxy, robot)
@@ -303,13 +305,12 @@ async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot:
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == robot.pid
 
 
-async def test_open_relays_outlive_the_port(proxy: Proxy, robot: Node) -> None:
+async def test_open_relays_outlive_the_port(proxy: Proxy, robot: FakeNode) -> None:
     await look_up_service(proxy)
     async with connect(service(robot), NODE) as wire:
         await wire.send(service_header())
         await read_header(wire)
-        assert robot._tcpros
-        robot._tcpros.close()
+        robot.tcpros.stop_listening()
         assert await knock(service(robot), service_header(), NODE) == "reset"
         assert await refuses(service(robot), NODE)
         await wire.send(b"hello")
@@ -317,7 +318,7 @@ async def test_open_relays_outlive_the_port(proxy: Proxy, robot: Node) -> None:
 
 
 async def test_a_node_that_does_not_answer_is_no_node_that_is_gone(
-    proxy: Proxy, robot: Node
+    proxy: Proxy, robot: FakeNode
 ) -> None:
     await look_up(proxy, robot)
     robot.answers["getPid"] = End.RESET
@@ -326,7 +327,7 @@ async def test_a_node_that_does_not_answer_is_no_node_that_is_gone(
 
 
 async def test_ports_that_the_proxy_needs_itself_are_a_problem(
-    proxy: Proxy, master: Master
+    proxy: Proxy, master: FakeMaster
 ) -> None:
     settings = proxy.settings
     own = [settings.ports.listen.last, settings.master_port, settings.admin.port]
@@ -345,7 +346,7 @@ async def test_ports_that_the_proxy_needs_itself_are_a_problem(
 
 
 async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(
-    proxy: Proxy, robot: Node, caplog: pytest.LogCaptureFixture
+    proxy: Proxy, robot: FakeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
     with socket.socket() as other:
         other.bind(slave(robot))
@@ -361,7 +362,7 @@ async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(
 
 
 async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
-    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with socket.socket() as one, socket.socket() as other:
         for taken, where_ in ((one, slave(robot)), (other, service(robot))):
@@ -369,18 +370,18 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
             taken.listen()
         await look_up(proxy, robot)
         await look_up_service(proxy)
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert set(problems(proxy)) == {robot.uri, robot.service_api}
         await robot.stop()
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert set(problems(proxy)) == {robot.service_api}
         monkeypatch.setattr("rosproxy.ros1.alias.alias.SERVICE_PROBLEM", 0.0)
-        await proxy.app._mirror.tidy()
+        await proxy.app.alias.tidy()
         assert problems(proxy) == {}
 
 
 async def test_the_proxys_own_ports_are_not_mirrored_where_it_shares_the_name(
-    make_proxy: MakeProxy, master: Master, node: Node
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(**behind_its_name(master, advertise_host="robot"))
     await node.publish(proxy.master)
@@ -390,7 +391,7 @@ async def test_the_proxys_own_ports_are_not_mirrored_where_it_shares_the_name(
 
 
 @pytest.fixture
-async def crowd(make_node: MakeNode, master: Master) -> list[Node]:
+async def crowd(make_node: MakeNode, master: FakeMaster) -> list[FakeNode]:
     """Three nodes on the master's host."""
     made = [await make_node(f"/r{i}", MASTER, host="robot") for i in range(3)]
     for node in made:
@@ -400,7 +401,7 @@ async def crowd(make_node: MakeNode, master: Master) -> list[Node]:
 
 
 async def test_ports_are_bounded_and_the_least_used_goes_first(
-    proxy: Proxy, crowd: list[Node], monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, crowd: list[FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
     first, second, third = crowd
@@ -413,7 +414,7 @@ async def test_ports_are_bounded_and_the_least_used_goes_first(
 
 
 async def test_ports_in_use_are_kept(
-    proxy: Proxy, crowd: list[Node], monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, crowd: list[FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
     async with AsyncExitStack() as stack:
@@ -431,10 +432,10 @@ async def test_ports_in_use_are_kept(
     assert slave(crowd[2])[1] in mirrored(proxy)
 
 
-async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: Node) -> None:
+async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
-    moved = Node("/moved", MOVED, host="robot")
+    moved = FakeNode("/moved", MOVED, host="robot")
     moved.slave.address = MOVED, slave(robot)[1]
     await moved.start()
     moved.pid = 77
@@ -450,7 +451,7 @@ async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: N
 
 
 async def test_an_address_that_leads_back_makes_no_loop(
-    proxy: Proxy, robot: Node, monkeypatch: pytest.MonkeyPatch
+    proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
@@ -463,7 +464,7 @@ async def test_an_address_that_leads_back_makes_no_loop(
 
 
 async def test_a_recovered_subscriber_is_given_open_ports(
-    proxy: Proxy, robot: Node, node: Node
+    proxy: Proxy, robot: FakeNode, node: FakeNode
 ) -> None:
     await node.subscribe(proxy.master)
     node.calls.clear()
@@ -475,7 +476,7 @@ async def test_a_recovered_subscriber_is_given_open_ports(
 
 
 async def test_nodes_on_the_masters_host_are_told_at_its_address(
-    proxy: Proxy, robot: Node, node: Node, master: Master
+    proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
 ) -> None:
     """What the proxy itself tells outside subscribers goes to the master's address as well."""
     await robot.subscribe(where(master.uri))
@@ -487,7 +488,7 @@ async def test_nodes_on_the_masters_host_are_told_at_its_address(
     assert mirrored(proxy) == {}
 
 
-async def test_mirrored_ports_are_measured(proxy: Proxy, robot: Node) -> None:
+async def test_mirrored_ports_are_measured(proxy: Proxy, robot: FakeNode) -> None:
     assert (await metrics(proxy))["rosproxy_mirrored_ports"] == 0
     await look_up(proxy, robot)
     await rpc(slave(robot), "getPid", "/tool", source=NODE)
@@ -497,7 +498,7 @@ async def test_mirrored_ports_are_measured(proxy: Proxy, robot: Node) -> None:
     assert found[f"rosproxy_xmlrpc_calls_total{label}"] == 1
 
 
-async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot: Node) -> None:
+async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
     async with connect(service(robot), NODE) as relayed, connect(slave(robot), NODE) as caller:
@@ -510,5 +511,5 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
         assert await caller.outcome() in _CLOSED
     assert await refuses(slave(robot), NODE)
     assert await refuses(service(robot), OTHER_NODE)
-    await proxy.app._mirror.hand_over([robot.uri])
+    await proxy.app.alias.listen_for([robot.uri])
     assert await refuses(slave(robot), NODE)

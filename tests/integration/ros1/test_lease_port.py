@@ -5,8 +5,9 @@ import socket
 
 import pytest
 
+from rosproxy.demo.fake_http import End, free_ports, ok, value
+from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.protocol.tcpros import encode_header
-from tests.integration.http_fake import End, ok, value
 from tests.integration.net import (
     HOST,
     MASTER,
@@ -14,16 +15,19 @@ from tests.integration.net import (
     OTHER_NODE,
     OUTSIDE,
     PROXY,
+    Wire,
     connect,
     exchange,
-    free_ports,
+    greet,
     post,
+    read_header,
     refuses,
     rpc,
+    service_header,
+    topic_header,
     until,
     xml,
 )
-from tests.integration.node import Node, greet, read_header, service_header, topic_header
 
 BOTH_LOOPS = True
 
@@ -57,8 +61,8 @@ async def test_a_neighbour_is_led_to_the_address_that_it_used(proxy, node):
 
 
 async def test_an_unknown_topic_or_service_is_the_nodes_to_answer(proxy, node):
-    async def refuse(node, wire, header):
-        await wire.send(encode_header({"error": f"no {header}"}))
+    async def refuse(node, reader, writer, header):
+        writer.write(encode_header({"error": f"no {header}"}))
 
     node.stream = refuse
     await node.publish(proxy.master)
@@ -116,11 +120,11 @@ async def test_a_client_that_leaves_inside_its_header_is_survived(proxy, node):
                 if reset:
                     wire.reset()
     assert (await greet(proxy.lease(node), header))["callerid"] == "/talker"
-    await until(lambda: not proxy.app._tcpros.relays, "all relays end")
+    await proxy.quiet()
 
 
 async def test_a_service_on_a_port_of_its_own_is_found(proxy, make_node):
-    node, other_port = await make_node(), Node("/talker")
+    node, other_port = await make_node(), FakeNode("/talker", NODE)
     await node.publish(proxy.master)
     await other_port.start_tcpros()
     try:
@@ -159,8 +163,8 @@ async def test_a_node_without_tcpros_is_a_reset(proxy, node):
 
 
 async def test_a_node_that_drops_the_connection_at_once_is_a_reset(proxy, node):
-    async def drop(node, wire, header):
-        wire.reset()
+    async def drop(node, reader, writer, header):
+        Wire(reader, writer).reset()
 
     node.stream = drop
     await node.publish(proxy.master)
@@ -251,7 +255,7 @@ async def test_a_registration_never_gets_a_port_outside_the_range(make_proxy, ma
     for part in (str(proxy.settings.ports.listen), "2 leases held", "--port-range"):
         assert part in text
     assert text in caplog.text
-    assert proxy.app.context.metrics.exhausted._value.get() == 1
+    assert proxy.metric("range_exhausted_total") == 1
     # The others go on, and in a multicall each call has its own answer.
     calls = [
         {"methodName": "getPid", "params": ["/n2"]},

@@ -5,21 +5,22 @@ import json
 import pytest
 
 from rosproxy.cli.admin_client import AdminClient
+from rosproxy.demo.fake_http import where
+from rosproxy.demo.fake_master import FakeMaster
+from rosproxy.demo.fake_node import FakeNode
 from rosproxy.doctor.collect import DoctorOptions, collect
 from rosproxy.doctor.facts import Reach
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
-from tests.integration.master import Master
-from tests.integration.net import MASTER, OUTSIDE, exchange, rpc, until, where
-from tests.integration.node import Node
+from tests.integration.net import MASTER, OUTSIDE, exchange, rpc, until
 from tests.integration.proxy import Proxy
 
 ELSEWHERE = "127.0.1.2"
 NAME = "robot.invalid"
 
 
-def uri_by_name(master: Master) -> str:
+def uri_by_name(master: FakeMaster) -> str:
     return f"http://{NAME}:{where(master.uri)[1]}"
 
 
@@ -31,7 +32,7 @@ async def master_status(proxy: Proxy) -> dict[str, object]:
 
 
 async def test_the_name_is_not_resolved_but_told(
-    make_proxy: MakeProxy, master: Master, node: Node
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
     assert (await node.publish(proxy.master))[0] == 1
@@ -43,30 +44,30 @@ async def test_the_name_is_not_resolved_but_told(
 
 
 async def test_without_it_the_status_tells_where_the_name_led(proxy: Proxy) -> None:
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     found = await master_status(proxy)
     assert (found["address"], found["pinned"]) == (MASTER, False)
 
 
-async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: Master) -> None:
+async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: FakeMaster) -> None:
     await master.stop()
     port = where(master.uri)[1]
     await master.start("127.0.0.1")
     proxy = await make_proxy(master_uri=f"http://localhost:{port}")
-    await until(lambda: proxy.app._watch.up, "the master is seen")
+    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
     assert (await master_status(proxy))["address"] in ("127.0.0.1", "::1")
 
 
 async def test_the_master_moves(
-    make_proxy: MakeProxy, master: Master, node: Node, make_node: MakeNode
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
     await node.publish(proxy.master)
     await master.stop()
     await master.start(ELSEWHERE)
-    await until(lambda: not proxy.app._watch.up, "the master is missed")
+    await until(lambda: not proxy.app.master_monitor.up, "the master is missed")
     assert await tell(proxy, "/master-address", address=ELSEWHERE) == {"address": ELSEWHERE}
-    await until(lambda: proxy.app._watch.up, "the master is found again")
+    await until(lambda: proxy.app.master_monitor.up, "the master is found again")
     assert (await master_status(proxy))["address"] == ELSEWHERE
     late = await make_node("/late")
     assert (await late.publish(proxy.master))[0] == 1
@@ -74,12 +75,11 @@ async def test_the_master_moves(
 
 
 async def test_two_masters_and_the_one_that_is_named_is_asked(
-    make_proxy: MakeProxy, master: Master, make_node: MakeNode
+    make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     """The connections that are kept to the former one are not used for the next."""
-    other = Master()
-    other._http.address = ("", where(master.uri)[1])
-    await other.start(ELSEWHERE)
+    other = FakeMaster(ELSEWHERE, where(master.uri)[1])
+    await other.start()
     try:
         proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
         await (await make_node("/one")).publish(proxy.master, "/a")
@@ -103,7 +103,7 @@ async def test_no_address(proxy: Proxy, body: str) -> None:
 
 
 async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(
-    make_proxy: MakeProxy, master: Master, node: Node
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(
         master_uri=uri_by_name(master), master_address=MASTER, slave_control="master"
@@ -114,7 +114,7 @@ async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(
 
 
 async def test_an_outside_subscriber_on_the_masters_host_is_told_at_its_address(
-    make_proxy: MakeProxy, master: Master, node: Node, make_node: MakeNode
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
 ) -> None:
     """Its URI names the master's host: as the proxy starts again, it is told of the publisher."""
     listener = await make_node("/listener", MASTER, NAME)
@@ -126,7 +126,7 @@ async def test_an_outside_subscriber_on_the_masters_host_is_told_at_its_address(
 
 
 async def test_the_doctor_asks_the_master_at_its_address(
-    make_proxy: MakeProxy, master: Master, make_node: MakeNode
+    make_proxy: MakeProxy, master: FakeMaster, make_node: MakeNode
 ) -> None:
     on_its_host = await make_node("/on_robot", MASTER, NAME)
     await on_its_host.publish(where(master.uri))
@@ -138,7 +138,7 @@ async def test_the_doctor_asks_the_master_at_its_address(
     assert facts.nodes["/on_robot"].attempt.reach is Reach.ANSWERED
 
 
-async def test_the_doctor_without_a_proxy_is_told_the_address(master: Master) -> None:
+async def test_the_doctor_without_a_proxy_is_told_the_address(master: FakeMaster) -> None:
     options = DoctorOptions(AdminClient("127.0.0.1:9"), uri_by_name(master), master_address=MASTER)
     facts = await collect(options)
     assert facts.admin_error
@@ -146,7 +146,7 @@ async def test_the_doctor_without_a_proxy_is_told_the_address(master: Master) ->
     assert facts.master.attempt.reach is Reach.ANSWERED
 
 
-async def test_the_doctors_option(master: Master) -> None:
+async def test_the_doctors_option(master: FakeMaster) -> None:
     words = ("doctor", "--admin", "127.0.0.1:9", "--master-uri", uri_by_name(master))
     found = await run(*words, ROSPROXY_MASTER_ADDRESS=MASTER)
     assert "resolve" not in found.out

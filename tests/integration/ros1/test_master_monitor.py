@@ -6,18 +6,8 @@ from contextlib import AsyncExitStack
 
 import pytest
 
-from tests.integration.http_fake import End, value
-from tests.integration.net import (
-    NODE,
-    OUTSIDE,
-    connect,
-    free_ports,
-    post,
-    refuses,
-    rpc,
-    until,
-    xml,
-)
+from rosproxy.demo.fake_http import End, free_ports, value
+from tests.integration.net import NODE, OUTSIDE, connect, post, refuses, rpc, until, xml
 
 ODD = [5, "x", [], ["ab", "cd", "ef"], [[["/t", [5]]], [], []], [["/t"], [], []], {"a": 1}]
 

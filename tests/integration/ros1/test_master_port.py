@@ -5,7 +5,7 @@ import xmlrpc.client
 
 import pytest
 
-from tests.integration.http_fake import End, ok
+from rosproxy.demo.fake_http import End, ok
 from tests.integration.net import (
     HOST,
     NODE,
@@ -22,7 +22,11 @@ BOTH_LOOPS = True
 
 
 async def test_a_registration_reaches_the_master_with_the_advertised_address(proxy, master, node):
-    assert await node.publish(proxy.master) == [1, "registered", []]
+    assert await node.publish(proxy.master) == [
+        1,
+        "Registered [/talker] as publisher of [/chatter]",
+        [],
+    ]
     ((name, topic, type_, uri),) = master.named("registerPublisher")
     assert (name, topic, type_) == ("/talker", "/chatter", "std_msgs/String")
     port = proxy.endpoint(node).port
@@ -33,7 +37,7 @@ async def test_a_registration_reaches_the_master_with_the_advertised_address(pro
 async def test_the_outside_publishers_come_back_unchanged(proxy, master, node):
     outside = f"http://{OUTSIDE}:4000/"
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", outside)
-    assert await node.subscribe(proxy.master) == [1, "subscribed", [outside]]
+    assert await node.subscribe(proxy.master) == [1, "Subscribed to [/chatter]", [outside]]
 
 
 async def test_a_node_sees_its_own_uri_literally(proxy, node):
@@ -86,7 +90,7 @@ async def test_every_unregistration_names_exactly_what_was_registered(
     unregister = undo.get(method, [params[0], node.uri] if params else [])
     name = method.replace("register", "unregister").replace("subscribeP", "unsubscribeP")
     assert (await node.call(proxy.master, name, *unregister))[2] == 1
-    assert not any(table.rows for table in master.book.tables.values())
+    assert not any(master.tables.values())
     assert proxy.endpoint(node).idle
 
 
@@ -139,7 +143,7 @@ async def test_a_multicall_is_rewritten_call_by_call(proxy, master, node):
         {"methodName": "unregisterPublisher", "params": ["/talker", "/chatter", node.uri]},
     ]
     results = await rpc(proxy.master, "system.multicall", calls, source=NODE)
-    assert results[0] == [[1, "subscribed", []]]
+    assert results[0] == [[1, "Subscribed to [/a]", []]]
     assert results[1]["faultCode"] == 1
     assert results[2] == [[1, "node api", node.uri]]
     assert results[3][0][2] == 1

@@ -5,7 +5,8 @@ from ipaddress import ip_network
 
 import pytest
 
-from tests.integration.http_fake import HttpFake, value
+from rosproxy.demo.fake_http import value
+from rosproxy.demo.fake_node import FakeNode
 from tests.integration.net import (
     HOST,
     NODE,
@@ -14,21 +15,23 @@ from tests.integration.net import (
     PROXY,
     THIRD_NODE,
     connect,
+    greet,
     knock,
     post,
     refuses,
     rpc,
+    service_header,
+    topic_header,
     until,
     xml,
 )
-from tests.integration.node import Node, greet, service_header, topic_header
 
 
 @pytest.fixture
 async def twins(make_node):
     """Two nodes in containers of their own that give the very same URI."""
     first = await make_node("/first", NODE, host="localhost")
-    second = Node("/second", OTHER_NODE, host="localhost")
+    second = FakeNode("/second", OTHER_NODE, host="localhost")
     second.slave.address = OTHER_NODE, first.slave.address[1]
     await second.start()
     yield first, second
@@ -94,7 +97,7 @@ async def test_a_tool_inside_can_unregister_whatever_it_was_told_of(proxy, maste
             proxy.master, "unregisterService", name, f"{name}/add", api, source=tool.address
         )
         assert gone[2] == 1, (name, api)
-    assert master.book.nodes == {}
+    assert master.nodes == {}
     assert not any(e.registrations for e in proxy.app.context.registry)
 
 
@@ -129,7 +132,7 @@ async def test_an_update_does_not_overtake_the_registration_before_it(proxy, mas
     far = f"http://{OUTSIDE}:4000/"
     await rpc(uri, "publisherUpdate", "/master", "/chatter", [far])
     assert registering.done()
-    assert await registering == [1, "subscribed", []]
+    assert await registering == [1, "Subscribed to [/chatter]", []]
     assert node.updates() == [[far]]
 
 
@@ -153,11 +156,10 @@ async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_p
     assert (await rpc(lease, "getPid", "/outside"))[2] == next_.pid
 
 
-async def test_outside_nodes_are_never_touched(proxy, master, node):
+async def test_outside_nodes_are_never_touched(proxy, master, node, make_node):
     """What has nothing to do with the proxy passes as it is: URIs, services, other hosts."""
-    stranger = HttpFake(node._respond)
-    await stranger.start(OUTSIDE)
-    far = f"http://{OUTSIDE}:{stranger.address[1]}/"
+    stranger = await make_node("/far", OUTSIDE)
+    far = stranger.uri
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
     await rpc(master.uri, "registerService", "/far", "/far/add", f"rosrpc://{OUTSIDE}:5", far)
     near_miss = f"http://{HOST}:{proxy.settings.ports.listen.first}/elsewhere/"
@@ -168,8 +170,7 @@ async def test_outside_nodes_are_never_touched(proxy, master, node):
         2
     ] == f"rosrpc://{OUTSIDE}:5"
     assert await knock((HOST, proxy.settings.ports.listen.last), b"x") == "refused"
-    assert stranger.connections == 0
-    await stranger.stop()
+    assert stranger.slave.connections == 0
 
 
 async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(

@@ -5,33 +5,22 @@ from typing import Any
 
 import pytest
 
-from tests.integration.http_fake import Answer, Request
-from tests.integration.net import refuses, until, where
-from tests.integration.node import Node
+from rosproxy.demo.fake_http import where
+from rosproxy.demo.fake_node import FakeNode
+from tests.integration.net import refuses, until
 from tests.integration.proxy import Proxy
 
 NODES = 7
 
 
 @pytest.fixture
-async def nodes(make_node: Any) -> list[Node]:
+async def nodes(make_node: Any) -> list[FakeNode]:
     return [await make_node(f"/n{number}") for number in range(NODES)]
 
 
-async def populate(proxy: Proxy, nodes: list[Node]) -> None:
+async def populate(proxy: Proxy, nodes: list[FakeNode]) -> None:
     for node in nodes:
         await node.publish(proxy.master, f"{node.name}/out")
-
-
-def slow_down(node: Node, seconds: float) -> None:
-    """Have all answers of a node take so long."""
-    respond = node.slave._respond
-
-    async def slowly(request: Request) -> Answer:
-        await asyncio.sleep(seconds)
-        return await respond(request)
-
-    node.slave._respond = slowly
 
 
 def all_served(proxy: Proxy) -> bool:
@@ -44,7 +33,7 @@ async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
     await populate(proxy, nodes)
     for node in nodes:
         node.calls.clear()
-        slow_down(node, 0.6)  # the keeper looks at them meanwhile
+        node.delay = 0.6  # the keeper looks at them meanwhile
     await proxy.restart()
     await until(lambda: all_served(proxy), "all are served")
     await asyncio.sleep(0.5)  # two looks of the keeper
@@ -60,7 +49,7 @@ async def test_nodes_that_answer_late_are_announced_together(make_proxy, master,
         node.hang = True
     await proxy.restart()
     for node in nodes:
-        uri = master.book.nodes[node.name]
+        uri = master.nodes[node.name]
         assert await refuses(where(uri))
     await asyncio.sleep(0.5)
     master.delay, before = 0.1, len(master.named("getSystemState"))

@@ -9,9 +9,10 @@ import time
 
 import click
 
+from tests.docker.images import build_image
 from tests.kubernetes.cluster import layout, lifetime
 from tests.kubernetes.cluster.control_plane import restart_api_server
-from tests.kubernetes.cluster.images import IMAGES, build_image, load_images
+from tests.kubernetes.cluster.images import IMAGES, load_images
 from tests.kubernetes.cluster.layout import NODES, node_named
 from tests.kubernetes.cluster.node import stop_node
 from tests.kubernetes.cluster.robot import exec_on_robot

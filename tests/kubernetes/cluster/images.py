@@ -1,31 +1,17 @@
-"""Container images: built by Docker from this tree, and given to the nodes."""
+"""Container images: those of the Docker tests, given to the nodes."""
 
-import hashlib
 import json
 import tarfile
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tests.docker.engine import ROOT, build, docker, run
+from tests.docker.engine import docker, run
+from tests.docker.images import OPERATOR, PROXY, ROS
 from tests.kubernetes.cluster.layout import BIN, NODES, Node
 from tests.kubernetes.cluster.node import PAUSE_IMAGE
 
-PROXY_IMAGE, OPERATOR_IMAGE = "rosproxy:test", "rosproxy-operator:test"
-ROS_IMAGE = "rosproxy-test-ros:latest"
-IMAGES = (PROXY_IMAGE, OPERATOR_IMAGE, ROS_IMAGE)
-
-
-def build_image(image: str) -> None:
-    """Build one of the images as the Docker tests do; Docker knows what has not changed."""
-    base = ("--build-arg", f"BASE_IMAGE={_base_image()}")
-    if image == ROS_IMAGE:
-        build(
-            image, *base, "--file", ROOT / "tests/docker/ros.Dockerfile", ROOT / "tests/ros/nodes"
-        )
-    else:
-        target = "proxy" if image == PROXY_IMAGE else "operator"
-        build(image, *base, "--target", target, ROOT)
+IMAGES = (PROXY, OPERATOR, ROS)
 
 
 def load_images(*images: str) -> dict[str, list[str]]:
@@ -61,14 +47,6 @@ def _loaded(node: Node) -> dict[str, str]:
 
 def _id(image: str) -> str:
     return docker("image", "inspect", "--format", "{{.Id}}", image)
-
-
-def _base_image() -> str:
-    """The image of the Docker tests: Debian without a registry."""
-    script = ROOT / "scripts/base-image.sh"
-    name = f"rosproxy-test-base:{hashlib.sha256(script.read_bytes()).hexdigest()[:12]}"
-    run(script, name, seconds=600)
-    return name
 
 
 def _make_pause_image() -> None:

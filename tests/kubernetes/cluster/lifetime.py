@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 from tests.docker.engine import answers, run, wait_until
+from tests.docker.images import build_image
 from tests.kubernetes.cluster import mounts
 from tests.kubernetes.cluster.certificates import make_certificates
 from tests.kubernetes.cluster.control_plane import (
@@ -10,7 +11,7 @@ from tests.kubernetes.cluster.control_plane import (
     start_control_plane,
     stop_control_plane,
 )
-from tests.kubernetes.cluster.images import IMAGES, build_image, load_images
+from tests.kubernetes.cluster.images import IMAGES, load_images
 from tests.kubernetes.cluster.layout import NODES, STATE, Node
 from tests.kubernetes.cluster.network import make_bridge, remove_bridge
 from tests.kubernetes.cluster.node import (

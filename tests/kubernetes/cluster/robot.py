@@ -4,7 +4,7 @@ import os
 import subprocess
 
 from tests.docker.engine import docker, inspect
-from tests.kubernetes.cluster.images import ROS_IMAGE
+from tests.docker.images import ROS
 from tests.kubernetes.cluster.layout import ROBOT, ROBOT_ADDRESS
 from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
 
@@ -12,14 +12,14 @@ from tests.kubernetes.cluster.network import plug_in_robot, unplug_robot
 def start_robot() -> None:
     """Start it, unless it runs the image that there is now."""
     found = inspect(ROBOT, check=False)
-    wanted = docker("image", "inspect", "--format", "{{.Id}}", ROS_IMAGE)
+    wanted = docker("image", "inspect", "--format", "{{.Id}}", ROS)
     if found and found["State"]["Running"] and found["Image"] == wanted:
         return
     docker("rm", "--force", ROBOT, check=False)
     docker(
         "run", "--detach", "--init", "--network", "none", "--name", ROBOT,
         "--env", f"ROS_MASTER_URI=http://{ROBOT_ADDRESS}:11311", "--env", f"ROS_IP={ROBOT_ADDRESS}",
-        ROS_IMAGE, "sleep", "infinity",
+        ROS, "sleep", "infinity",
     )  # fmt: skip
     plug_in_robot(str(inspect(ROBOT)["State"]["Pid"]))
 

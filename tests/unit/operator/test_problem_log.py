@@ -4,8 +4,7 @@ import logging
 
 import pytest
 
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 
 FATAL = Problem("container talker", "no master is known")
 WARNING = Problem("container talker", "label x is unknown", fatal=False)

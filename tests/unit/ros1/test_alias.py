@@ -1,4 +1,4 @@
-"""The mirror: which ports it takes, which it gives up, and what it changes in replies."""
+"""The alias: which ports it takes, which it gives up, and what it changes in replies."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ def settings(**options: Any) -> Settings:
     ],
 )
 def test_only_a_host_name_can_lead_to_the_proxy(master_uri: str, host: str | None) -> None:
-    assert policy.mirrored_host(master_uri) == host
+    assert policy.aliased_host(master_uri) == host
 
 
 def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = False) -> list[str]:
@@ -44,7 +44,7 @@ def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = F
     text = py_call("system.multicall", body) if multicall else py_call(method, *params)
     request = master_api.read_request(text, make_asker("10.0.0.5"))
     request.admissions = [None] * len(request.calls)
-    return list(policy.answered(master_api.read_answer(request, reply)))
+    return list(policy.uris_in_answer(master_api.read_answer(request, reply)))
 
 
 NAMED = [
@@ -92,10 +92,10 @@ def test_uris_that_a_publisher_update_names(
     method: str, params: list[Any], expected: list[str]
 ) -> None:
     call = xmlrpc.parse_call(py_call(method, *params))
-    assert list(policy.announced(call)) == expected
+    assert list(policy.announced_publishers(call)) == expected
 
 
-def test_only_ports_of_the_masters_host_are_mirrored() -> None:
+def test_only_ports_of_the_masters_host_need_a_port() -> None:
     uris = [
         URI,
         SERVICE,
@@ -109,11 +109,11 @@ def test_only_ports_of_the_masters_host_are_mirrored() -> None:
         "http://robot/",
         "",
     ]
-    found = policy.to_mirror(uris, ROBOT, make_addressing("robot"))
+    found = policy.ports_needed(uris, ROBOT, make_addressing("robot"))
     assert found == {40001: URI, 40003: SERVICE, 40004: "http://ROBOT:40004/"}
 
 
-def test_ports_that_the_proxy_needs_itself_are_no_mirrors() -> None:
+def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
     own = settings(publish_master=11411, admin=HostPort("0.0.0.0", 11312))
     assert {port: policy.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
         45000: "lies in --port-range 45000-45009",

@@ -11,7 +11,7 @@ from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.masters import ALIAS
-from rosproxy_operator.docker.planner.model import Container, Desired, Key, Observed, Sandbox
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Sandbox
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 
 Aliases = Mapping[tuple[Key, str], tuple[str, ...]]
@@ -31,9 +31,11 @@ class _Claim:
 
     @property
     def owner(self) -> Key | None:
-        """Whose it is: his who has it, else his whose containers need it; nobody's if taken.
+        """The proxy that gets the name; None if another container on the network has it.
 
-        Who has a name that others have as well keeps it only until it joins the network anew.
+        A proxy that already has the name keeps it, so that no connection is cut. Otherwise it goes
+        to the first one whose containers look for it, else to the first that would have it. One
+        that shares its name with another container loses it when it joins the network anew.
         """
         if self.others:
             return None
@@ -43,7 +45,7 @@ class _Claim:
         return (needed or [one.key for one in self.claimants])[0]
 
 
-def assign(desired: Iterable[Desired], observed: Observed) -> tuple[Aliases, tuple[Problem, ...]]:
+def assign(desired: Iterable[Desired], observed: HostState) -> tuple[Aliases, tuple[Problem, ...]]:
     """The names of the proxies that are wanted, and the containers that won't find theirs."""
     claims = [*_claims(sorted(desired, key=lambda one: one.key), observed)]
     given: dict[tuple[Key, str], tuple[str, ...]] = {}
@@ -57,9 +59,9 @@ def assign(desired: Iterable[Desired], observed: Observed) -> tuple[Aliases, tup
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
     """The containers of a proxy on a network that look for it by this name."""
     return tuple(
-        wish.container
-        for wish in desired.wishes
-        if network in wish.networks and wish.needs == alias
+        member.container
+        for member in desired.members
+        if network in member.networks and member.needs == alias
     )
 
 
@@ -78,7 +80,7 @@ def _names(key: Key) -> tuple[str, ...]:
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
 
 
-def _claims(desired: list[Desired], observed: Observed) -> Iterator[_Claim]:
+def _claims(desired: list[Desired], observed: HostState) -> Iterator[_Claim]:
     live = [one for one in desired if one.live]
     for network in sorted({name for one in live for name in one.networks}):
         there = [one for one in desired if network in one.networks]
@@ -86,7 +88,7 @@ def _claims(desired: list[Desired], observed: Observed) -> Iterator[_Claim]:
             yield _claim(network, alias, there, observed)
 
 
-def _claim(network: str, alias: str, there: list[Desired], observed: Observed) -> _Claim:
+def _claim(network: str, alias: str, there: list[Desired], observed: HostState) -> _Claim:
     others = [
         container.name
         for container in observed.containers
@@ -112,10 +114,10 @@ def _problems(claim: _Claim) -> Iterator[Problem]:
     for one in claim.claimants:
         if one.key != claim.owner or claim.others or len(claim.holders) > 1:
             for container in needed_by(one, claim.network, claim.alias):
-                yield Problem(f"container {container}", _astray(claim, one.key), fatal=False)
+                yield Problem(f"container {container}", _misled_text(claim, one.key), fatal=False)
 
 
-def _astray(claim: _Claim, key: Key) -> str:
+def _misled_text(claim: _Claim, key: Key) -> str:
     """What a container is told that looks for its proxy by a name that others have."""
     proxies = {*claim.holders, claim.owner or key} - {key}
     others = [f"container {name}" for name in claim.others]

@@ -4,16 +4,31 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import PortsExhausted, extended, is_free, negotiate, within
-from rosproxy_operator.common.moves import RETRY_FOR, Move
+from rosproxy_operator.common.allocation import (
+    RETRY_FOR,
+    Move,
+    PortsExhausted,
+    extended,
+    is_free,
+    negotiate,
+    within,
+)
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.model import STARTED, Desired, Key, Observed, Sandbox
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    STARTED,
+    Desired,
+    HostState,
+    Key,
+    PlanSettings,
+    Sandbox,
+)
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
-from rosproxy_operator.docker.planner.state import SERVING, Memory, Refusal
+from rosproxy_operator.docker.planner.state import SERVING, DockerMemory, PortRefusal
 
 
-def refused(observed: Observed, live: Iterable[Key], memory: Memory, now: float) -> Memory:
+def refused(
+    observed: HostState, live: Iterable[Key], memory: DockerMemory, now: float
+) -> DockerMemory:
     """Draw the conclusions from the engine's refusals to start sandboxes.
 
     A range that has never served is given up at once: its refused ports become ``taken``. One that
@@ -27,7 +42,9 @@ def refused(observed: Observed, live: Iterable[Key], memory: Memory, now: float)
     return memory
 
 
-def _concluded(memory: Memory, sandbox: Sandbox, refusal: Refusal, now: float) -> Memory:
+def _concluded(
+    memory: DockerMemory, sandbox: Sandbox, refusal: PortRefusal, now: float
+) -> DockerMemory:
     name, served = sandbox.container.name, memory.served.get(sandbox.key)
     hit = _hit(sandbox.range, refusal)
     fresh = {port for port in hit if served is None or port not in served}
@@ -39,31 +56,31 @@ def _concluded(memory: Memory, sandbox: Sandbox, refusal: Refusal, now: float) -
     return replace(_settled(memory, name, hit, now), moved=moved)
 
 
-def _hit(ports: PortRange, refusal: Refusal) -> set[int]:
+def _hit(ports: PortRange, refusal: PortRefusal) -> set[int]:
     """The ports that a refusal is about: those that the engine named, else all of the range."""
     named = {port for port in refusal.ports or () if port in ports}
     return named or set(ports.ports())
 
 
-def _settled(memory: Memory, name: str, taken: Iterable[int], now: float) -> Memory:
+def _settled(memory: DockerMemory, name: str, taken: Iterable[int], now: float) -> DockerMemory:
     refusals = {other: said for other, said in memory.refusals.items() if other != name}
     return replace(memory, refusals=refusals, taken={**memory.taken, **dict.fromkeys(taken, now)})
 
 
 @dataclass(frozen=True, slots=True)
-class Ranges:
+class GivenRanges:
     """The range of each live proxy that can have one, and what is to be told and remembered."""
 
     given: Mapping[Key, PortRange]
-    memory: Memory
+    memory: DockerMemory
     problems: tuple[Problem, ...]
 
 
 class _Allocation:
-    """Ranges being given out, one key after the other."""
+    """GivenRanges being given out, one key after the other."""
 
     def __init__(
-        self, observed: Observed, settings: PlanSettings, memory: Memory, live: set[Key]
+        self, observed: HostState, settings: PlanSettings, memory: DockerMemory, live: set[Key]
     ) -> None:
         self.observed = observed
         self.settings = settings
@@ -138,13 +155,13 @@ class _Allocation:
 
 
 def allocate(
-    observed: Observed,
+    observed: HostState,
     settings: PlanSettings,
     desired: Iterable[Desired],
-    memory: Memory,
+    memory: DockerMemory,
     now: float,
     frozen: bool = False,
-) -> Ranges:
+) -> GivenRanges:
     """A range for each live proxy: the one that it has or had, else the first that is free.
 
     A proxy that serves is never moved. One that has served and does not is only moved if
@@ -168,7 +185,7 @@ def allocate(
     ]
     served = {key: ports for key, ports in served.items() if key not in left}
     memory = replace(memory, served=served, planned=given, moved=moved)
-    return Ranges(given, memory, (*allocation.problems, *told))
+    return GivenRanges(given, memory, (*allocation.problems, *told))
 
 
 def _exhausted(key: Key, error: PortsExhausted) -> Problem:

@@ -6,19 +6,26 @@ from dataclasses import dataclass
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.actions import Action, Remove, Rename
 from rosproxy_operator.docker.planner.aliases import Aliases
-from rosproxy_operator.docker.planner.model import Container, Desired, Key, Observed, Proxy, Sandbox
+from rosproxy_operator.docker.planner.model import (
+    Container,
+    Desired,
+    HostState,
+    Key,
+    PlanSettings,
+    Proxy,
+    Sandbox,
+)
 from rosproxy_operator.docker.planner.selection import free_name
-from rosproxy_operator.docker.planner.settings import PlanSettings
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class PlanContext:
     """One key that is wanted, what there is for it, and what it gets.
 
     ``creatable``: the image and the uplink are there or can be made.
     """
 
-    observed: Observed
+    observed: HostState
     settings: PlanSettings
     desired: Desired
     ports: PortRange
@@ -74,10 +81,10 @@ def lives_in(container: Container, sandbox_id: str) -> bool:
     return bool(sandbox_id) and container.network_mode == f"container:{sandbox_id}"
 
 
-def inhabitants(case: Case, sandbox_id: str) -> tuple[Container, ...]:
+def inhabitants(context: PlanContext, sandbox_id: str) -> tuple[Container, ...]:
     """The key's proxies that are in a sandbox and not being removed already."""
     return tuple(
         one.container
-        for one in case.proxies
+        for one in context.proxies
         if lives_in(one.container, sandbox_id) and one.container.state != "removing"
     )

@@ -13,12 +13,18 @@ from rosproxy_operator.docker.planner.label_values import (
     ENABLE,
     LABELS,
     PORTS,
-    Unusable,
+    UnusableLabel,
 )
 from rosproxy_operator.docker.planner.masters import looks_for, master_uri
 from rosproxy_operator.docker.planner.membership import networks
-from rosproxy_operator.docker.planner.model import ALIVE, Container, Key, Observed, Wish
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    ALIVE,
+    Container,
+    HostState,
+    Key,
+    Member,
+    PlanSettings,
+)
 from rosproxy_operator.docker.planner.specs import MANAGED, master
 
 _PREFIX = "rosproxy"
@@ -26,84 +32,113 @@ _COUNTED = ALIVE | {"exited"}
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """What one container is judged by besides itself."""
+class ProxyRequest:
+    """What one container's labels ask for, before it is known where its master is.
 
-    observed: Observed
-    settings: PlanSettings
-    proxies: frozenset[str]
+    ``advertise_host`` is empty if neither a label nor an option names it, ``ports`` 0 and
+    ``data_plane`` None without a label.
+    """
+
+    container: Container
+    master_uri: str
+    advertise_host: str
+    ports: int
+    networks: frozenset[str]
+    data_plane: DataPlane | None
 
 
-def read_wishes(
-    observed: Observed, settings: PlanSettings
-) -> tuple[tuple[Wish, ...], tuple[Problem, ...]]:
-    """What the containers want, and what is wrong with what they say, in order of their names.
+@dataclass(frozen=True, slots=True)
+class LabelReading:
+    """What all labels ask for, in order of the containers' names, and what is wrong with them."""
+
+    requests: tuple[ProxyRequest, ...] = ()
+    problems: tuple[Problem, ...] = ()
+
+
+def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
+    """Read the labels of all containers.
 
     A container that can't have what it wants is left out and has a problem, and no other is
     touched by it. Containers that do not run have no problems.
     """
-    seen = _seen(observed, settings)
-    wishes: list[Wish] = []
+    proxies = frozenset(one.container.name for one in observed.own)
+    requests: list[ProxyRequest] = []
     problems: list[Problem] = []
     for container in sorted(observed.containers, key=lambda one: (one.name, one.id)):
         if container.state not in _COUNTED:
             continue
-        wish, wrong = _read(container, seen)
-        wishes += [wish] if wish else []
-        problems += wrong if container.alive else []
-    return tuple(wishes), tuple(problems)
-
-
-def masters(observed: Observed, settings: PlanSettings) -> tuple[str, ...]:
-    """The URIs of all masters that a proxy is wanted for or there for, sorted."""
-    seen = _seen(observed, settings)
-    found = {key.master_uri for key in observed.keys}
-    for container in observed.containers:
+        wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if container.alive and _counts(container, settings):
-                found.add(_master(container, seen))
-        except Unusable:
-            continue  # is told by read_wishes
-    return tuple(sorted(found))
+            if _counts(container, settings):
+                requests.append(_request(container, observed, settings, proxies))
+        except UnusableLabel as error:
+            wrong.append(_unusable(container, str(error)))
+        problems += wrong if container.alive else []
+    return LabelReading(tuple(requests), tuple(problems))
 
 
-def _seen(observed: Observed, settings: PlanSettings) -> _Seen:
-    names = frozenset(one.container.name for one in observed.own)
-    return _Seen(observed, settings, names)
+def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
+    """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
+    found = {key.master_uri for key in observed.keys}
+    found |= {each.master_uri for each in reading.requests if each.container.alive}
+    return tuple(sorted({master(Key(uri, "")).host.lower() for uri in found}))
 
 
-def _read(container: Container, seen: _Seen) -> tuple[Wish | None, list[Problem]]:
-    subject = f"container {container.name}"
-    wrong = [Problem(subject, text, fatal=False) for text in _warnings(container, seen.settings)]
-    try:
-        if not _counts(container, seen.settings):
-            return None, wrong
-        wish, text = _wish(container, seen)
-    except Unusable as error:
-        # Nobody has asked for a container that merely has a variable: that is no failure.
-        wrong.append(Problem(subject, str(error), fatal=bool(_own(container))))
-        return None, wrong
-    return wish, wrong + ([Problem(subject, text, fatal=False)] if text else [])
+def find_members(
+    reading: LabelReading, observed: HostState
+) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
+    """The containers that belong to a proxy, and those of which it is not known to which."""
+    members: list[Member] = []
+    problems: list[Problem] = []
+    for request in reading.requests:
+        container, uri = request.container, request.master_uri
+        host = request.advertise_host or _advertised(container, uri, observed)
+        if not host:
+            text = (
+                f"this host's address towards the master {uri} is not known: add the label "
+                f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host"
+            )
+            problems += [_unusable(container, text)] if container.alive else []
+            continue
+        key = Key(uri, host)
+        needs, text = looks_for(container, key)
+        problems += [_problem(container, text, False)] if text and container.alive else []
+        members.append(
+            Member(
+                container=container.name,
+                id=container.id,
+                key=key,
+                ports=request.ports,
+                networks=request.networks,
+                needs=needs,
+                alive=container.alive,
+                data_plane=request.data_plane,
+            )
+        )
+    return tuple(members), tuple(problems)
 
 
-def _wish(container: Container, seen: _Seen) -> tuple[Wish, str]:
+def _request(
+    container: Container, observed: HostState, settings: PlanSettings, proxies: frozenset[str]
+) -> ProxyRequest:
     labels = container.labels
-    uri = _master(container, seen)
-    key = Key(uri, _advertise_host(container, uri, seen))
-    needs, text = looks_for(container, key)
-    wish = Wish(
-        container=container.name,
-        id=container.id,
-        key=key,
+    return ProxyRequest(
+        container=container,
+        master_uri=master_uri(container, labels.get(label_values.MASTER_URI), settings, proxies),
+        advertise_host=_advertise_host(container, settings),
         ports=label_values.count(PORTS, labels[PORTS]) if PORTS in labels else 0,
-        networks=networks(
-            container, seen.observed, seen.settings.uplink, labels.get(label_values.NETWORK)
-        ),
-        needs=needs,
-        alive=container.alive,
+        networks=networks(container, observed, settings.uplink, labels.get(label_values.NETWORK)),
         data_plane=_data_plane(container),
     )
-    return wish, text
+
+
+def _problem(container: Container, text: str, fatal: bool) -> Problem:
+    return Problem(f"container {container.name}", text, fatal)
+
+
+def _unusable(container: Container, text: str) -> Problem:
+    """Nobody has asked for a container that merely has a variable: that is no failure."""
+    return _problem(container, text, fatal=bool(_own(container)))
 
 
 def _data_plane(container: Container) -> DataPlane | None:
@@ -112,14 +147,14 @@ def _data_plane(container: Container) -> DataPlane | None:
 
 
 def _counts(container: Container, settings: PlanSettings) -> bool:
-    """Whether a container wants a proxy. Raises Unusable if its label says neither."""
+    """Whether a container wants a proxy. Raises UnusableLabel if its label says neither."""
     if ENABLE in container.labels:
         return label_values.boolean(ENABLE, container.labels[ENABLE])
     return settings.expose_by_default and bool(_own(container) or container.master_uri)
 
 
 def _own(container: Container) -> list[str]:
-    """The labels that are meant for this controller, misspelt ones too."""
+    """The labels that are meant for this operator, misspelt ones too."""
     return sorted(
         name
         for name in container.labels
@@ -131,7 +166,7 @@ def _own(container: Container) -> list[str]:
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     if container.labels.get(MANAGED) == "true":
         yield (
-            f"has the label {MANAGED}, which is for proxies made by this controller, but not the "
+            f"has the label {MANAGED}, which is for proxies made by this operator, but not the "
             f"others that go with it, so it is left alone: docker rm -f {container.name}, or take "
             "the label off"
         )
@@ -154,38 +189,24 @@ def _near(name: str, cutoff: float) -> list[str]:
     return difflib.get_close_matches(name.lower(), LABELS, n=1, cutoff=cutoff)
 
 
-def _master(container: Container, seen: _Seen) -> str:
-    label = container.labels.get(label_values.MASTER_URI)
-    return master_uri(container, label, seen.settings, seen.proxies)
-
-
-def _advertise_host(container: Container, uri: str, seen: _Seen) -> str:
-    label = container.labels.get(ADVERTISE_HOST)
+def _advertise_host(container: Container, settings: PlanSettings) -> str:
+    """What the label says, else the option; empty without both. Raises UnusableLabel."""
+    label, option = container.labels.get(ADVERTISE_HOST), settings.advertise_host
     if label is not None:
         return label_values.host(f"label {ADVERTISE_HOST}={label_values.quoted(label)}", label)
-    option = seen.settings.advertise_host
-    if option:
-        return label_values.host(
-            f"the controller's --advertise-host {label_values.quoted(option)}", option
-        )
-    where = master(Key(uri, ""))
-    found = seen.observed.advertise.get(where.host) or _advertised(container, uri, seen.observed)
-    if not found:
-        raise Unusable(
-            f"this host's address towards the master {uri} is not known: add the label "
-            f"{ADVERTISE_HOST}=ADDRESS, or start the controller with --advertise-host"
-        )
-    return found
+    source = f"the operator's --advertise-host {label_values.quoted(option)}"
+    return label_values.host(source, option) if option else ""
 
 
-def _advertised(container: Container, uri: str, observed: Observed) -> str:
-    """What a proxy for this master advertises already.
+def _advertised(container: Container, uri: str, observed: HostState) -> str:
+    """This host's address towards a master, else what a proxy for it advertises already.
 
     A name that can't be resolved for a moment must not take a proxy away.
     """
+    towards = observed.advertise.get(master(Key(uri, "")).host)
     there = [sandbox for sandbox in observed.sandboxes if sandbox.key.master_uri == uri]
-    if not there:
-        return ""
+    if towards or not there:
+        return towards or ""
 
     def rank(key: Key) -> tuple[bool, Key]:
         joined = {n for s in there if s.key == key for n in s.container.networks}

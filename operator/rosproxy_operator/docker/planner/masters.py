@@ -1,14 +1,14 @@
 """Which master a container means, and whether its nodes will find their proxy."""
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from urllib.parse import urlsplit
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy_operator.docker.planner.label_values import MASTER_URI, Unusable, quoted
-from rosproxy_operator.docker.planner.model import Container, Key
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.label_values import MASTER_URI, UnusableLabel, quoted
+from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 
 ALIAS = "rosproxy"
@@ -26,7 +26,7 @@ def master_uri(
 ) -> str:
     """The URI of the real master: from the label, else the environment, else the settings.
 
-    Raises Unusable if there is none or it can't be one.
+    Raises UnusableLabel if there is none or it can't be one.
     """
     if label is not None:
         return parse_master(f"label {MASTER_URI}={quoted(label)}", label, proxies)
@@ -35,35 +35,46 @@ def master_uri(
         source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
         return parse_master(source, container.master_uri, proxies)
     if settings.master_uri:
-        source = f"the controller's --master-uri {quoted(settings.master_uri)}"
+        source = f"the operator's --master-uri {quoted(settings.master_uri)}"
         return parse_master(source, settings.master_uri, proxies)
-    raise Unusable(
+    raise UnusableLabel(
         f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
-        "or start the controller with --master-uri"
+        "or start the operator with --master-uri"
     )
 
 
 def parse_master(source: str, uri: str, proxies: Collection[str] = ()) -> str:
     """A master's URI in its one form: host in lower case, no slash at the end.
 
-    Raises Unusable, which names ``source``, for what can't be the URI of a real master.
+    Raises UnusableLabel, which names ``source``, for what can't be the URI of a real master.
     """
     where = parse_slave_uri(uri.strip())
     path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
     if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
-        raise Unusable(f"{source} is not of the form http://HOST:11311")
+        raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
     host = where.host.lower()
     if is_loopback(host):
-        raise Unusable(
+        raise UnusableLabel(
             f"{source} is the container itself, where no master runs: give the name of the "
             f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
             f"{MASTER_URI}"
         )
     if names_proxy(host, proxies):
-        raise Unusable(
+        raise UnusableLabel(
             f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
         )
     return slave_uri(HostPort(host, where.port), path)
+
+
+def unresolved(hosts: Iterable[str]) -> Iterator[Problem]:
+    """The problems of masters whose hosts have no known address."""
+    for host in sorted(hosts):
+        yield Problem(
+            f"master {host}",
+            f"the name {host} can't be resolved where the operator runs: give the master's "
+            f"address instead, or the operator that name (/etc/hosts; in a container: "
+            f"--add-host {host}:ADDRESS)",
+        )
 
 
 def looks_for(container: Container, key: Key) -> tuple[str, str]:
@@ -84,10 +95,10 @@ def looks_for(container: Container, key: Key) -> tuple[str, str]:
         if where.port == right.port:
             return host, ""
         return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
-    return "", _astray(variable, host, key, fix)
+    return "", _wrong_master(variable, host, key, fix)
 
 
-def _astray(variable: str, host: str, key: Key, fix: str) -> str:
+def _wrong_master(variable: str, host: str, key: Key, fix: str) -> str:
     if is_proxy_name(host):
         return f"{variable} names another master's proxy, its own is {proxy_name(key)}: {fix}"
     if is_loopback(host):

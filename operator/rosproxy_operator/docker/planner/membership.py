@@ -1,7 +1,7 @@
 """On which networks a container meets its proxy."""
 
-from rosproxy_operator.docker.planner.label_values import NETWORK, Unusable, quoted
-from rosproxy_operator.docker.planner.model import Container, Observed
+from rosproxy_operator.docker.planner.label_values import NETWORK, UnusableLabel, quoted
+from rosproxy_operator.docker.planner.model import Container, HostState
 
 BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""
@@ -10,22 +10,22 @@ _WITH = "container:"
 
 
 def networks(
-    container: Container, observed: Observed, uplink: str, label: str | None
+    container: Container, observed: HostState, uplink: str, label: str | None
 ) -> frozenset[str]:
     """The container's user-defined networks but the uplink, or the one that its label names.
 
-    Raises Unusable if it has none, or not that one.
+    Raises UnusableLabel if it has none, or not that one.
     """
     owner = _owner(container, observed)
     own = (owner.networks or _soon(owner, observed)) - BUILT_IN - {uplink}
     if label is not None:
         return frozenset({_named(label, container, own)})
     if not own:
-        raise Unusable(_why_none(owner))
+        raise UnusableLabel(_why_none(owner))
     return own
 
 
-def _soon(container: Container, observed: Observed) -> frozenset[str]:
+def _soon(container: Container, observed: HostState) -> frozenset[str]:
     """The network of a container that the engine is just creating, and lists without any."""
     if container.state != "created":
         return frozenset()
@@ -40,22 +40,22 @@ def _named(label: str, container: Container, own: frozenset[str]) -> str:
         if name in own:
             return name
     there = ", ".join(sorted(own)) or "none that is user-defined"
-    raise Unusable(
+    raise UnusableLabel(
         f"label {NETWORK}={quoted(label)} names no network of the container; it has: {there}"
     )
 
 
-def _owner(container: Container, observed: Observed) -> Container:
+def _owner(container: Container, observed: HostState) -> Container:
     """The container whose networks it has: its own, or those of the one that it shares them with.
 
-    Raises Unusable if that one is not there.
+    Raises UnusableLabel if that one is not there.
     """
     met = {container.id}
     while container.network_mode.startswith(_WITH):
         wanted = container.network_mode.removeprefix(_WITH)
         found = next((one for one in observed.containers if wanted in (one.id, one.name)), None)
         if found is None or found.id in met:
-            raise Unusable(
+            raise UnusableLabel(
                 f"shares the network of a container ({quoted(wanted)}) that is not there: start "
                 "that one, then create this one anew"
             )

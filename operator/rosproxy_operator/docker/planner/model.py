@@ -1,7 +1,8 @@
-"""What a controller sees on a Docker host, and what it wants there."""
+"""What is seen on a Docker host, and what is wanted there."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from ipaddress import IPv4Network
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
@@ -9,6 +10,33 @@ from rosproxy.settings import DataPlane
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which it is or may soon be somebody's node."""
 STARTED = frozenset({"running", "paused"})
+MOST_PORTS = 1000
+"""Ports that one proxy may ask for: each costs rules and, by default, a process of the engine."""
+WINDOW = PortRange(11400, 65535)
+"""Where ports are looked for: above the master's and the admin endpoint's."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanSettings:
+    """The operator's options that decide what is planned.
+
+    ``master_uri`` and ``advertise_host`` are for containers without a label of their own and may
+    be empty. ``ports`` is the least number of ports that a proxy gets, ``window`` where they are
+    looked for, ``publish`` the host's addresses on which they are published. ``grace`` is in
+    seconds: how long a proxy outlives its last container. ``data_plane`` is that of proxies whose
+    containers ask for none.
+    """
+
+    master_uri: str = ""
+    advertise_host: str = ""
+    ports: int = 32
+    window: PortRange = WINDOW
+    publish: tuple[str, ...] = ("0.0.0.0",)
+    image: str = "rosproxy:latest"
+    expose_by_default: bool = False
+    grace: float = 60.0
+    uplink: str = "0-rosproxy"
+    data_plane: DataPlane = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,13 +45,15 @@ class Attachment:
 
     ``address`` is its IPv4 address there, empty while it does not run. ``names`` are those by
     which the engine's name server knows it on that network: aliases, name, short id.
-    ``network_id`` is empty where the engine does not tell (a container never started).
+    ``network_id`` and ``endpoint``, the engine's id of the connection, are empty where it does not
+    tell (a container never started). The endpoint changes with each start.
     """
 
     network: str
     address: str = ""
     names: frozenset[str] = frozenset()
     network_id: str = ""
+    endpoint: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +97,7 @@ class Network:
     driver: str = "bridge"
     internal: bool = False
     gateway: str = ""
+    subnets: tuple[IPv4Network, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -79,7 +110,7 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Sandbox:
-    """A container of this controller that holds a proxy's network namespace, as found on the host.
+    """A container of this operator that holds a proxy's network namespace, as found on the host.
 
     The published ports, the networks and the names on them are its own; the proxy itself runs in
     another container in the same namespace. So a proxy can be replaced in no time, while taking
@@ -95,7 +126,7 @@ class Sandbox:
 
 @dataclass(frozen=True, slots=True)
 class Proxy:
-    """A container of this controller in which a proxy runs, as found on the host.
+    """A container of this operator in which a proxy runs, as found on the host.
 
     It listens on ``range``, in the namespace of the container that its ``network_mode`` names by
     its id.
@@ -108,10 +139,10 @@ class Proxy:
 
 
 @dataclass(frozen=True, slots=True)
-class Host:
-    """What a controller knows of the host's ports.
+class HostPorts:
+    """What the operator knows of the host's ports.
 
-    ``listening`` are TCP ports on which something listens, in the controller's own network
+    ``listening`` are TCP ports on which something listens, in the operator's own network
     namespace; ``ephemeral`` is the range from which the kernel takes ports for connections.
     """
 
@@ -120,37 +151,52 @@ class Host:
 
 
 @dataclass(frozen=True, slots=True)
-class Observed:
+class HostState:
     """A Docker host at one moment.
 
-    ``containers`` are all but the controller's own: the proxies and their sandboxes.
+    ``containers`` are all but the operator's own: the proxies and their sandboxes.
     ``image_id`` is the id of the proxy's image, empty if the host does not have it. ``advertise``
     gives, for a master's host name, this host's address towards it; without an entry it is not
-    known.
+    known. ``unresolved`` are the masters' hosts without a known address, ``busy`` the names of own
+    containers of which not everything is known yet, so that nothing can be done to them, and
+    ``addresses`` those of all containers.
     """
 
     containers: tuple[Container, ...]
     networks: tuple[Network, ...]
     proxies: tuple[Proxy, ...]
-    host: Host
+    host: HostPorts
     image_id: str = ""
     advertise: Mapping[str, str] = field(default_factory=dict)
     sandboxes: tuple[Sandbox, ...] = ()
+    unresolved: frozenset[str] = frozenset()
+    busy: frozenset[str] = frozenset()
+    addresses: frozenset[str] = frozenset()
 
     @property
     def own(self) -> tuple[Sandbox | Proxy, ...]:
-        """All that is the controller's own."""
+        """All that is the operator's own."""
         return (*self.sandboxes, *self.proxies)
 
     @property
     def keys(self) -> frozenset[Key]:
-        """The keys of all that is the controller's own."""
+        """The keys of all that is the operator's own."""
         return frozenset(one.key for one in self.own)
+
+    @property
+    def busy_keys(self) -> frozenset[Key]:
+        """The keys of those to which nothing can be done now."""
+        return frozenset(one.key for one in self.own if one.container.name in self.busy)
+
+    def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
+        """The sandbox in whose network namespace a proxy is; None if it is there no more."""
+        home = proxy.container.network_mode.removeprefix("container:")
+        return next((box for box in self.sandboxes if box.container.id == home), None)
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
-    """What a labelled container wants, its labels and settings put together.
+class Member:
+    """A labelled container, and what it wants of its proxy: labels and settings put together.
 
     ``ports`` is 0 and ``data_plane`` None without a label. ``networks`` are the names of those on
     which it wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which
@@ -180,5 +226,5 @@ class Desired:
     live: bool
     ports: int
     networks: frozenset[str] = frozenset()
-    wishes: tuple[Wish, ...] = ()
+    members: tuple[Member, ...] = ()
     data_plane: DataPlane = "auto"

@@ -7,20 +7,30 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
+    Create,
     CreateNetwork,
     CreateSandbox,
     Remove,
 )
 from rosproxy_operator.docker.planner.aliases import Aliases, assign
-from rosproxy_operator.docker.planner.allocation import Ranges, allocate, refused
-from rosproxy_operator.docker.planner.context import Case
+from rosproxy_operator.docker.planner.allocation import GivenRanges, allocate, refused
+from rosproxy_operator.docker.planner.context import PlanContext
 from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.labels import read_wishes
-from rosproxy_operator.docker.planner.model import Desired, Key, Observed, Proxy, Sandbox, Wish
+from rosproxy_operator.docker.planner.labels import LabelReading, find_members
+from rosproxy_operator.docker.planner.masters import unresolved
+from rosproxy_operator.docker.planner.model import (
+    Desired,
+    HostState,
+    Key,
+    Member,
+    PlanSettings,
+    Proxy,
+    Sandbox,
+)
 from rosproxy_operator.docker.planner.process import process_steps, retired
 from rosproxy_operator.docker.planner.sandbox import leave, sandbox_steps
-from rosproxy_operator.docker.planner.settings import PlanSettings
-from rosproxy_operator.docker.planner.state import Memory, looked, noticed
+from rosproxy_operator.docker.planner.specs import master
+from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
 
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""
@@ -39,52 +49,65 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class DockerPlan:
     """What to do, group after group, and what to remember.
 
-    ``again_in`` is in how many seconds to look again even if nothing happens; None: no need.
+    ``deferred`` are groups that have to wait until the address of their master is known: without
+    it a proxy would find itself by its master's name. ``again_in`` is in how many seconds to look
+    again even if nothing happens; None: no need.
     """
 
     groups: tuple[Group, ...]
-    memory: Memory
+    memory: DockerMemory
     problems: tuple[Problem, ...]
-    wishes: tuple[Wish, ...]
+    members: tuple[Member, ...]
     desired: tuple[Desired, ...]
     again_in: float | None = None
+    deferred: tuple[Group, ...] = ()
 
     @property
     def actions(self) -> tuple[Action, ...]:
-        """All actions, in order."""
+        """All actions that can be carried out now, in order."""
         return tuple(action for group in self.groups for action in group.actions)
 
 
-def plan(observed: Observed, settings: PlanSettings, memory: Memory, now: float) -> Plan:
+def plan(
+    observed: HostState,
+    labels: LabelReading,
+    settings: PlanSettings,
+    memory: DockerMemory,
+    now: float,
+) -> DockerPlan:
     """The next actions, from everything that is seen; none if all is as it ought to be.
 
-    ``memory`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
-    clock that goes on as long as the memory does.
+    For a key of which a container is busy nothing is done. ``labels`` are those that were read from
+    ``observed``. ``memory`` is that of the plan before, or an empty one. ``now`` is in seconds of a
+    monotonic clock that goes on as long as the memory does.
     """
-    wishes, wrong = read_wishes(observed, settings)
-    memory = noticed(memory, wishes, now)
-    desired, bad_networks = desire(observed, settings, wishes, memory, now)
+    members, unplaced = find_members(labels, observed)
+    memory = noticed(memory, members, now)
+    desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = looked(memory, observed, desired, settings.grace, now)
-    aliases, astray = assign(desired, observed)
+    aliases, missed = assign(desired, observed)
     live = [one.key for one in desired if one.live]
     memory = refused(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
     ranges = allocate(observed, settings, desired, memory, now, frozen=obstacle is not None)
     view = _View(observed, settings, aliases, ranges, obstacle is None, now)
     planned = {one.key: _main(view, one) for one in desired}
-    problems = [*wrong, *bad_networks, *astray, *ranges.problems, *_restarting(view, live)]
+    problems = [*labels.problems, *unplaced, *bad_networks, *missed, *ranges.problems]
+    problems += [*_restarting(view, live), *unresolved(observed.unresolved)]
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    return Plan(
-        groups=tuple(_groups(view, desired, planned)),
+    groups = [g for g in _groups(view, desired, planned) if g.key not in observed.busy_keys]
+    return DockerPlan(
+        groups=tuple(group for group in groups if not _waits(group, observed)),
+        deferred=tuple(group for group in groups if _waits(group, observed)),
         memory=ranges.memory,
         problems=tuple(dict.fromkeys(problems)),
-        wishes=wishes,
+        members=members,
         desired=desired,
-        again_in=min(_ends(view, desired, wishes), default=None),
+        again_in=min(_ends(view, desired, members), default=None),
     )
 
 
@@ -92,15 +115,15 @@ def plan(observed: Observed, settings: PlanSettings, memory: Memory, now: float)
 class _View:
     """What the plans of all keys are made from."""
 
-    observed: Observed
+    observed: HostState
     settings: PlanSettings
     aliases: Aliases
-    ranges: Ranges
+    ranges: GivenRanges
     creatable: bool
     now: float
 
     @property
-    def memory(self) -> Memory:
+    def memory(self) -> DockerMemory:
         """What is going to be remembered."""
         return self.ranges.memory
 
@@ -124,7 +147,7 @@ class _View:
         return self.settings.grace - (self.now - since)
 
 
-def _obstacle(observed: Observed, settings: PlanSettings) -> Problem | None:
+def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     """What keeps proxies from being created."""
     if not observed.image_id:
         return Problem(
@@ -137,7 +160,7 @@ def _obstacle(observed: Observed, settings: PlanSettings) -> Problem | None:
             return Problem(
                 f"network {network.name}",
                 "can't be the proxies' uplink: it must be an ordinary bridge, not internal: remove "
-                "it (the controller creates it anew) or name another one with --uplink",
+                "it (the operator creates it anew) or name another one with --uplink",
             )
     return None
 
@@ -151,12 +174,14 @@ def _main(view: _View, desired: Desired) -> tuple[Action, ...] | None:
     ports = view.ranges.given.get(key)
     if ports is None:
         return ()  # its problem is told already
-    case = Case(view.observed, view.settings, desired, ports, view.aliases, view.creatable)
-    first = sandbox_steps(case)
+    context = PlanContext(
+        view.observed, view.settings, desired, ports, view.aliases, view.creatable
+    )
+    first = sandbox_steps(context)
     if first.stuck or first.home is None:
         return None if first.stuck else first.actions
     gone = {action.name for action in first.actions if isinstance(action, Remove)}
-    then = process_steps(case, first.home, gone)
+    then = process_steps(context, first.home, gone)
     return None if then is None else first.actions + then
 
 
@@ -187,6 +212,14 @@ def _groups(
             yield Group(key, actions)
 
 
+def _waits(group: Group, observed: HostState) -> bool:
+    """Whether a group makes a proxy whose master has no known address."""
+    return any(
+        isinstance(action, Create) and master(action.proxy.key).host in observed.unresolved
+        for action in group.actions
+    )
+
+
 def _needs(action: Action, uplink: str) -> bool:
     return isinstance(action, CreateSandbox) or (
         isinstance(action, Connect) and action.network == uplink
@@ -200,7 +233,7 @@ def _restarting(view: _View, live: Collection[Key]) -> Iterator[Problem]:
             yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
 
 
-def _ends(view: _View, desired: Iterable[Desired], wishes: Iterable[Wish]) -> Iterator[float]:
+def _ends(view: _View, desired: Iterable[Desired], members: Iterable[Member]) -> Iterator[float]:
     """In how many seconds something comes to its end that no event tells."""
     memory = view.memory
     for one in desired:
@@ -211,8 +244,8 @@ def _ends(view: _View, desired: Iterable[Desired], wishes: Iterable[Wish]) -> It
         there = sandboxes or view.proxies(one.key)
         if not one.live and there and view.left(memory.absent[one.key]) > 0:
             yield view.left(memory.absent[one.key])
-    for wish in wishes:
-        left = 0.0 if wish.alive else view.left(memory.exited[wish.id])
-        joined = any(s.container.networks & wish.networks for s in view.sandboxes(wish.key))
-        if left > 0 and (joined or wish.data_plane):
+    for member in members:
+        left = 0.0 if member.alive else view.left(memory.exited[member.id])
+        joined = any(s.container.networks & member.networks for s in view.sandboxes(member.key))
+        if left > 0 and (joined or member.data_plane):
             yield left

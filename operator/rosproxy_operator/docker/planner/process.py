@@ -12,46 +12,54 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.context import Case, former_name, lives_in, named, removed
+from rosproxy_operator.docker.planner.context import (
+    PlanContext,
+    former_name,
+    lives_in,
+    named,
+    removed,
+)
 from rosproxy_operator.docker.planner.model import STARTED, Container, Proxy, Sandbox
 from rosproxy_operator.docker.planner.sandbox import Home
-from rosproxy_operator.docker.planner.selection import Succession, free_name, succession
-from rosproxy_operator.docker.planner.specs import fingerprint, proxy_name
+from rosproxy_operator.docker.planner.selection import Selection, free_name, select
+from rosproxy_operator.docker.planner.specs import proxy_fingerprint, proxy_name
 from rosproxy_operator.docker.planner.state import SERVING
 
 
-def process_steps(case: Case, home: Home, gone: Collection[str]) -> tuple[Action, ...] | None:
+def process_steps(
+    context: PlanContext, home: Home, gone: Collection[str]
+) -> tuple[Action, ...] | None:
     """The next actions for the proxy of a key that is wanted.
 
     ``gone`` are the names of containers that are removed before. None if one ought to be created
     but can't.
     """
-    image, plane = case.observed.image_id, case.desired.data_plane
-    print_ = fingerprint(case.key, case.ports, case.settings, image, plane)
-    there = [one for one in case.proxies if one.container.name not in gone]
+    image, plane = context.observed.image_id, context.desired.data_plane
+    expected = proxy_fingerprint(context.key, context.ports, context.settings, image, plane)
+    there = [one for one in context.proxies if one.container.name not in gone]
     right = {
         one.container.id
         for one in there
         if lives_in(one.container, home.id)
-        and one.range == case.ports
-        and (not case.creatable or one.fingerprint == print_)
+        and one.range == context.ports
+        and (not context.creatable or one.fingerprint == expected)
     }
-    found = succession(
+    found = select(
         (one.container for one in there),
-        proxy_name(case.key),
+        proxy_name(context.key),
         right=lambda container: container.id in right,
         usable=lambda container: True,
-        creatable=case.creatable,
+        creatable=context.creatable,
     )
-    astray = found.kept and not lives_in(found.kept, home.id)
-    if found.waiting and (astray or not found.kept):
+    misplaced = found.kept and not lives_in(found.kept, home.id)
+    if found.waiting and (misplaced or not found.kept):
         return ()
-    if found.stuck or astray:
+    if found.stuck or misplaced:
         return None
     if found.kept:
-        return tuple(_tended(case, found, found.kept, home))
-    before = [one.container.name for one in case.proxies if one.container.name in gone]
-    return tuple(_created(case, found, home, print_, before[0] if before else ""))
+        return tuple(_tended(context, found, found.kept, home))
+    before = [one.container.name for one in context.proxies if one.container.name in gone]
+    return tuple(_created(context, found, home, expected, before[0] if before else ""))
 
 
 def retired(sandboxes: Collection[Sandbox], proxies: Collection[Proxy]) -> Iterator[Action]:
@@ -70,7 +78,9 @@ def instant(text: str) -> tuple[str, str]:
     return seconds, fraction.ljust(9, "0")
 
 
-def _tended(case: Case, found: Succession, kept: Container, home: Home) -> Iterator[Action]:
+def _tended(
+    context: PlanContext, found: Selection, kept: Container, home: Home
+) -> Iterator[Action]:
     if found.waiting:
         if kept.state == "paused":
             yield Unpause(kept.name)
@@ -84,7 +94,7 @@ def _tended(case: Case, found: Succession, kept: Container, home: Home) -> Itera
         yield Unpause(kept.name)
     if kept.state in SERVING and _lost(kept, home):
         yield Restart(kept.name)
-    yield from named(kept, proxy_name(case.key), _others(case))
+    yield from named(kept, proxy_name(context.key), _others(context))
 
 
 def _lost(kept: Container, home: Home) -> bool:
@@ -97,22 +107,22 @@ def _lost(kept: Container, home: Home) -> bool:
 
 
 def _created(
-    case: Case, found: Succession, home: Home, print_: str, before: str
+    context: PlanContext, found: Selection, home: Home, expected: str, before: str
 ) -> Iterator[Action]:
     """Create a proxy, in the place of an old one, if any; or of one that is removed ``before``."""
     yield from removed(found.others, "left over")
-    name = free_name(proxy_name(case.key), _others(case))
+    name = free_name(proxy_name(context.key), _others(context))
     old = found.old
-    former = former_name(old.name, name, _others(case)) if old else ""
+    former = former_name(old.name, name, _others(context)) if old else ""
     if old and former != old.name:
         yield Rename(old.name, former)
     replaces = former or before
-    plane = case.desired.data_plane
-    yield Create(ProxySpec(name, case.key, case.ports, print_, home.name, replaces, plane))
+    plane = context.desired.data_plane
+    yield Create(ProxySpec(name, context.key, context.ports, expected, home.name, replaces, plane))
     if old:
         yield Remove(former, "made anew")
     yield Start(name)
 
 
-def _others(case: Case) -> frozenset[str]:
-    return case.taken(tuple(one.container for one in case.proxies))
+def _others(context: PlanContext) -> frozenset[str]:
+    return context.taken(tuple(one.container for one in context.proxies))

@@ -1,6 +1,6 @@
 """What is to be done for a sandbox: the container that holds a proxy's ports and networks.
 
-The order is such that a controller may be killed after any step: what it leaves is recognised and
+The order is such that the operator may be killed after any step: what it leaves is recognised and
 finished, and nothing that runs goes before what takes over has been created.
 
 Networks are joined after the start: an engine that starts a container with several networks joins
@@ -23,15 +23,15 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.aliases import holds, needed_by
 from rosproxy_operator.docker.planner.context import (
-    Case,
+    PlanContext,
     former_name,
     inhabitants,
     named,
     removed,
     stopped,
 )
-from rosproxy_operator.docker.planner.model import Attachment, Container, Desired, Observed
-from rosproxy_operator.docker.planner.selection import Succession, free_name, succession
+from rosproxy_operator.docker.planner.model import Attachment, Container, Desired, HostState
+from rosproxy_operator.docker.planner.selection import Selection, free_name, select
 from rosproxy_operator.docker.planner.specs import sandbox_fingerprint, sandbox_name
 from rosproxy_operator.docker.planner.state import SERVING
 
@@ -64,46 +64,48 @@ class SandboxSteps:
     stuck: bool = False
 
 
-def sandbox_steps(case: Case) -> SandboxSteps:
+def sandbox_steps(context: PlanContext) -> SandboxSteps:
     """The next actions for the sandbox of a key that is wanted."""
-    forwards = _forwards(case)
-    print_ = sandbox_fingerprint(case.key, case.ports, case.settings, forwards)
+    forwards = _forwards(context)
+    expected = sandbox_fingerprint(context.key, context.ports, context.settings, forwards)
     right = {
         one.container.id
-        for one in case.sandboxes
-        if one.range == case.ports and (not case.creatable or one.fingerprint == print_)
+        for one in context.sandboxes
+        if one.range == context.ports and (not context.creatable or one.fingerprint == expected)
     }
-    found = succession(
-        (one.container for one in case.sandboxes),
-        sandbox_name(case.key),
+    found = select(
+        (one.container for one in context.sandboxes),
+        sandbox_name(context.key),
         right=lambda container: container.id in right,
-        usable=lambda container: startable(case.observed, container),
-        creatable=case.creatable,
+        usable=lambda container: startable(context.observed, container),
+        creatable=context.creatable,
     )
     kept = found.kept
     if kept and kept.state in SERVING:
-        return _running(case, found, kept)
+        return _running(context, found, kept)
     if kept:
-        home = Home(_name_after(case, kept), kept.id, starts=True)
-        return SandboxSteps(tuple(_started(case, found, kept)), home)
+        home = Home(_name_after(context, kept), kept.id, starts=True)
+        return SandboxSteps(tuple(_started(context, found, kept)), home)
     if found.waiting or found.stuck:
         return SandboxSteps(stuck=found.stuck)
-    name = free_name(sandbox_name(case.key), _others(case))
-    spec = SandboxSpec(name, case.key, case.ports, print_, case.settings.uplink, forwards)
-    return SandboxSteps(tuple(_created(case, found, spec)), Home(name, starts=True))
+    name = free_name(sandbox_name(context.key), _others(context))
+    spec = SandboxSpec(
+        name, context.key, context.ports, expected, context.settings.uplink, forwards
+    )
+    return SandboxSteps(tuple(_created(context, found, spec)), Home(name, starts=True))
 
 
-def _forwards(case: Case) -> bool:
+def _forwards(context: PlanContext) -> bool:
     """Whether the kernel is to forward in the sandbox.
 
     One where it did is not used without: a proxy that was killed has left its rules there, and one
     without the capability can't take them away.
     """
-    return case.desired.data_plane == "kernel"
+    return context.desired.data_plane == "kernel"
 
 
 def leave(
-    observed: Observed, desired: Desired, containers: tuple[Container, ...], uplink: str
+    observed: HostState, desired: Desired, containers: tuple[Container, ...], uplink: str
 ) -> tuple[Disconnect, ...]:
     """Take sandboxes off the networks on which nobody wants them any more."""
     return tuple(
@@ -115,12 +117,12 @@ def leave(
     )
 
 
-def startable(observed: Observed, container: Container) -> bool:
+def startable(observed: HostState, container: Container) -> bool:
     """Whether the engine can start a container that has stopped: not when a network is gone."""
     return all(_there(observed, place) for place in container.attachments)
 
 
-def _there(observed: Observed, place: Attachment) -> bool:
+def _there(observed: HostState, place: Attachment) -> bool:
     """Whether the network is still the one that was joined, and not a new one of its name."""
     return any(
         network.name == place.network and place.network_id in ("", network.id)
@@ -128,91 +130,91 @@ def _there(observed: Observed, place: Attachment) -> bool:
     )
 
 
-def _joined(observed: Observed, container: Container) -> list[str]:
+def _joined(observed: HostState, container: Container) -> list[str]:
     """The networks that a container is on, those aside that are gone."""
     return sorted(place.network for place in container.attachments if _there(observed, place))
 
 
-def _running(case: Case, found: Succession, kept: Container) -> SandboxSteps:
+def _running(context: PlanContext, found: Selection, kept: Container) -> SandboxSteps:
     if kept.state == "restarting":
         return SandboxSteps(tuple(removed(found.others, "left over")))
-    actions: list[Action] = [*removed(found.others, "left over"), *_join(case, kept)]
+    actions: list[Action] = [*removed(found.others, "left over"), *_join(context, kept)]
     if not found.waiting:
-        actions += named(kept, sandbox_name(case.key), _others(case))
-    home = Home(_name_after(case, kept), kept.id, started_at=kept.started_at)
+        actions += named(kept, sandbox_name(context.key), _others(context))
+    home = Home(_name_after(context, kept), kept.id, started_at=kept.started_at)
     return SandboxSteps(tuple(actions), home)
 
 
-def _started(case: Case, found: Succession, kept: Container) -> Iterator[Action]:
+def _started(context: PlanContext, found: Selection, kept: Container) -> Iterator[Action]:
     yield from removed(found.others, "left over")
-    for network in _joined(case.observed, kept):
-        if network != case.settings.uplink:
+    for network in _joined(context.observed, kept):
+        if network != context.settings.uplink:
             yield Disconnect(kept.name, network)
-    if case.settings.uplink not in kept.networks:
-        yield Connect(kept.name, case.settings.uplink, ())
+    if context.settings.uplink not in kept.networks:
+        yield Connect(kept.name, context.settings.uplink, ())
     if found.old:
-        yield from stopped(inhabitants(case, found.old.id), "its sandbox is made anew")
+        yield from stopped(inhabitants(context, found.old.id), "its sandbox is made anew")
         yield from removed((found.old,), "another one takes over")
     yield Start(kept.name)
-    yield from _connect(case, kept.name)
-    yield from named(kept, sandbox_name(case.key), _others(case))
+    yield from _connect(context, kept.name)
+    yield from named(kept, sandbox_name(context.key), _others(context))
 
 
-def _created(case: Case, found: Succession, spec: SandboxSpec) -> Iterator[Action]:
+def _created(context: PlanContext, found: Selection, spec: SandboxSpec) -> Iterator[Action]:
     """Create a sandbox, in the place of an old one if there is one."""
     yield from removed(found.others, "left over")
     old = found.old
-    former = former_name(old.name, spec.name, _others(case)) if old else ""
+    former = former_name(old.name, spec.name, _others(context)) if old else ""
     if old and former != old.name:
         yield Rename(old.name, former)
     yield CreateSandbox(spec)
     if old:
-        yield from stopped(inhabitants(case, old.id), "its sandbox is made anew")
+        yield from stopped(inhabitants(context, old.id), "its sandbox is made anew")
         yield Remove(former, "made anew")
     yield Start(spec.name)
-    yield from _connect(case, spec.name)
+    yield from _connect(context, spec.name)
 
 
-def _join(case: Case, kept: Container) -> Iterator[Action]:
+def _join(context: PlanContext, kept: Container) -> Iterator[Action]:
     """Resume a sandbox that is paused, and join the networks that it is not on."""
     if kept.state == "paused":
         yield Unpause(kept.name)
-    if case.settings.uplink not in kept.networks:
-        yield Connect(kept.name, case.settings.uplink, ())
-    for network in sorted(case.desired.networks):
-        if network in kept.networks and not _lacks_alias(case, kept, network):
+    if context.settings.uplink not in kept.networks:
+        yield Connect(kept.name, context.settings.uplink, ())
+    for network in sorted(context.desired.networks):
+        if network in kept.networks and not _lacks_alias(context, kept, network):
             continue
         if network in kept.networks:
             yield Disconnect(kept.name, network)
-        yield Connect(kept.name, network, _aliases(case, network))
+        yield Connect(kept.name, network, _aliases(context, network))
 
 
-def _lacks_alias(case: Case, kept: Container, network: str) -> bool:
+def _lacks_alias(context: PlanContext, kept: Container, network: str) -> bool:
     """Whether to join a network anew for a name that is missing.
 
     That cuts the connections there, so it is done only where somebody looks for that name.
     """
     return any(
-        needed_by(case.desired, network, alias)
-        for alias in _aliases(case, network)
+        needed_by(context.desired, network, alias)
+        for alias in _aliases(context, network)
         if not holds(kept, network, alias)
     )
 
 
-def _connect(case: Case, name: str) -> Iterator[Action]:
-    for network in sorted(case.desired.networks):
-        yield Connect(name, network, _aliases(case, network))
+def _connect(context: PlanContext, name: str) -> Iterator[Action]:
+    for network in sorted(context.desired.networks):
+        yield Connect(name, network, _aliases(context, network))
 
 
-def _aliases(case: Case, network: str) -> tuple[str, ...]:
-    return case.aliases.get((case.key, network), ())
+def _aliases(context: PlanContext, network: str) -> tuple[str, ...]:
+    return context.aliases.get((context.key, network), ())
 
 
-def _others(case: Case) -> frozenset[str]:
-    return case.taken(tuple(one.container for one in case.sandboxes))
+def _others(context: PlanContext) -> frozenset[str]:
+    return context.taken(tuple(one.container for one in context.sandboxes))
 
 
-def _name_after(case: Case, kept: Container) -> str:
+def _name_after(context: PlanContext, kept: Container) -> str:
     """What a sandbox is called when the steps are done."""
-    name = sandbox_name(case.key)
-    return kept.name if name in _others(case) else name
+    name = sandbox_name(context.key)
+    return kept.name if name in _others(context) else name

@@ -1,7 +1,7 @@
 """Which of several containers for one thing stays, and which goes.
 
 There are several when settings have changed and one is to take over from another, when a
-controller was killed in between, or when somebody has meddled.
+operator was killed in between, or when somebody has meddled.
 """
 
 from collections.abc import Callable, Collection, Iterable
@@ -15,7 +15,7 @@ IDLE = frozenset({"created", "exited"})
 
 
 @dataclass(frozen=True, slots=True)
-class Succession:
+class Selection:
     """What is to become of the containers for one thing.
 
     ``kept`` is as it ought to be, running or not; None if one is to be created. ``old`` serves, or
@@ -31,13 +31,13 @@ class Succession:
     stuck: bool = False
 
 
-def succession(
+def select(
     containers: Iterable[Container],
     name: str,
     right: Callable[[Container], bool],
     usable: Callable[[Container], bool],
     creatable: bool,
-) -> Succession:
+) -> Selection:
     """Decide who stays.
 
     Args:
@@ -54,14 +54,14 @@ def succession(
     ready = [one for one in idle if right(one) and usable(one)]
     best = serving[0] if serving else None
     if len(there) < len(every):
-        return Succession(kept=best, waiting=True)
+        return Selection(kept=best, waiting=True)
     if best and (right(best) or not creatable):
         return _with(there, best, None)
     if ready:
         return _with(there, ready[0], best)
     if creatable:
         return _with(there, None, best or (idle[0] if idle else None))
-    return Succession(stuck=True)
+    return Selection(stuck=True)
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
@@ -72,5 +72,5 @@ def free_name(name: str, taken: Collection[str]) -> str:
     return found
 
 
-def _with(there: Iterable[Container], kept: Container | None, old: Container | None) -> Succession:
-    return Succession(kept, old, tuple(one for one in there if one not in (kept, old)))
+def _with(there: Iterable[Container], kept: Container | None, old: Container | None) -> Selection:
+    return Selection(kept, old, tuple(one for one in there if one not in (kept, old)))

@@ -12,8 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import DataPlane, SettingError, parse_range
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.docker.planner.model import Key
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
@@ -41,8 +40,8 @@ _SLUG = 30
 
 
 @dataclass(frozen=True, slots=True)
-class Own:
-    """What a container's labels say that this controller made. ``role`` is one of ``ROLE_…``."""
+class OwnLabels:
+    """What a container's labels say that this operator made. ``role`` is one of ``ROLE_…``."""
 
     role: str
     key: Key
@@ -85,8 +84,8 @@ def reserved_ports(key: Key) -> frozenset[int]:
     return frozenset({master(key).port, admin_port(key)})
 
 
-def read_own(labels: Mapping[str, str]) -> Own | None:
-    """What the labels of a container of this controller say.
+def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
+    """What the labels of a container of this operator say.
 
     None if they are not those of one, or not whole.
     """
@@ -100,7 +99,7 @@ def read_own(labels: Mapping[str, str]) -> Own | None:
         return None
     if parse_slave_uri(key.master_uri) is None or not key.advertise_host:
         return None
-    return Own(role, key, ports, labels.get(FINGERPRINT, ""))
+    return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
 
 
 def own_labels(spec: SandboxSpec | ProxySpec) -> dict[str, str]:
@@ -123,7 +122,7 @@ def sandbox_fingerprint(
     return _digest({**body, "Image": ""})
 
 
-def fingerprint(
+def proxy_fingerprint(
     key: Key,
     ports: PortRange,
     settings: PlanSettings,

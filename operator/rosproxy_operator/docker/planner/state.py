@@ -1,16 +1,15 @@
-"""What a controller remembers from look to look. Losing it costs time, never correctness."""
+"""What the operator remembers from look to look. Losing it costs time, never correctness."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.allocation import within
-from rosproxy_operator.common.moves import MOVED_FOR, TAKEN_FOR, Move
-from rosproxy_operator.docker.planner.model import Desired, Key, Observed, Wish
+from rosproxy_operator.common.allocation import MOVED_FOR, TAKEN_FOR, Move, within
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class PortRefusal:
     """The engine didn't start a sandbox because of its ports.
 
     ``since`` is when it first said so. ``ports`` are those that it named; None if it named none.
@@ -21,8 +20,8 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
-    """Times are in seconds of the controller's monotonic clock.
+class DockerMemory:
+    """Times are in seconds of the operator's monotonic clock.
 
     ``exited`` are containers, by id, since when they are seen not to run; ``absent`` proxies since
     when nobody wants them. ``served`` is the range on which a proxy was last seen to serve,
@@ -34,17 +33,17 @@ class Memory:
     absent: Mapping[Key, float] = field(default_factory=dict)
     served: Mapping[Key, PortRange] = field(default_factory=dict)
     planned: Mapping[Key, PortRange] = field(default_factory=dict)
-    refusals: Mapping[str, Refusal] = field(default_factory=dict)
+    refusals: Mapping[str, PortRefusal] = field(default_factory=dict)
     taken: Mapping[int, float] = field(default_factory=dict)
     moved: Mapping[Key, Move] = field(default_factory=dict)
 
-    def port_taken(self, name: str, ports: Iterable[int] | None, now: float) -> "Memory":
+    def port_taken(self, name: str, ports: Iterable[int] | None, now: float) -> "DockerMemory":
         """Note that the engine could not start the sandbox ``name``: ports are taken.
 
         ``ports`` are those that it named; None or nothing if it is not known which.
         """
         known = self.refusals.get(name)
-        refusal = Refusal(known.since if known else now, frozenset(ports or ()) or None)
+        refusal = PortRefusal(known.since if known else now, frozenset(ports or ()) or None)
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
@@ -53,22 +52,22 @@ SERVING = frozenset({"running", "paused", "restarting"})
 _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 
 
-def noticed(memory: Memory, wishes: Iterable[Wish], now: float) -> Memory:
+def noticed(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
     """The memory with who has exited, and since when."""
-    gone = (wish.id for wish in wishes if not wish.alive)
+    gone = (member.id for member in members if not member.alive)
     return replace(memory, exited={each: memory.exited.get(each, now) for each in gone})
 
 
 def looked(
-    memory: Memory, observed: Observed, desired: Iterable[Desired], grace: float, now: float
-) -> Memory:
+    memory: DockerMemory, observed: HostState, desired: Iterable[Desired], grace: float, now: float
+) -> DockerMemory:
     """What is remembered after a look at the host, before anything is decided."""
     live = {one.key for one in desired if one.live}
     idle = {s.container.name for s in observed.sandboxes if s.container.state not in SERVING}
     known = (observed.keys | set(memory.served)) - live
     absent = {key: memory.absent.get(key, now) for key in sorted(known)}
     wanted = live | {key for key, since in absent.items() if now - since < grace}
-    return Memory(
+    return DockerMemory(
         exited=memory.exited,
         absent={k: since for k, since in absent.items() if k in wanted | observed.keys},
         served={key: ports for key, ports in _served(memory, observed).items() if key in wanted},
@@ -79,7 +78,7 @@ def looked(
     )
 
 
-def _served(memory: Memory, observed: Observed) -> dict[Key, PortRange]:
+def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
     """Where each proxy has served: a sandbox that runs knows best.
 
     What has stopped may be older than what is remembered, unless it has more ports.

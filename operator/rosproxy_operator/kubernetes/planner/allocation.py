@@ -1,7 +1,7 @@
 """Which range of ports each proxy gets on its node, and when it must leave it."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
@@ -12,109 +12,61 @@ from rosproxy_operator.common.allocation import (
     overlap,
     within,
 )
-from rosproxy_operator.common.moves import RETRY_FOR
-from rosproxy_operator.kubernetes.planner.model import Pod, ProxyPod, Stuck
+from rosproxy_operator.kubernetes.planner.model import ProxyPlace, ProxyPod
 from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT, MASTER_PORT
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import Memory, Place
+from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
 from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves, short
 
 
 @dataclass(frozen=True, slots=True)
-class Ranges:
+class ClusterRanges:
     """The range of each wanted proxy that can have one.
 
     ``published`` are the places whose port for the master in the cluster is free. ``exhausted``
     says of the others why there is none, ``flaws`` what is not as asked for: reason and text.
     """
 
-    given: Mapping[Place, PortRange]
-    published: frozenset[Place]
-    exhausted: Mapping[Place, str]
-    flaws: Mapping[Place, tuple[tuple[str, str], ...]]
+    given: Mapping[ProxyPlace, PortRange]
+    published: frozenset[ProxyPlace]
+    exhausted: Mapping[ProxyPlace, str]
+    flaws: Mapping[ProxyPlace, tuple[tuple[str, str], ...]]
 
 
-def refused(view: View, memory: Memory, now: float) -> Memory:
-    """Draw the conclusions from proxies that do not get their ports.
-
-    A range that has never served is given up at once. One that has served is given up after
-    `RETRY_FOR` seconds, since its ports may only be slow to be let go. A proxy whose ports another
-    one of the controller's still holds, while it ends, has only to wait.
-    """
-    stuck = {
-        place_of(one): one
-        for one in view.observed.proxies
-        if one.stuck is Stuck.PORTS and not one.pod.deleting
-    }
-    since = {place: at for place, at in memory.refused.items() if not _is_back(view, place)}
-    memory = replace(memory, refused=since)
-    for place, proxy in stuck.items():
-        if place in view.wanted and not _must_wait(view, proxy):
-            memory = _concluded(view, memory, proxy, now)
-    return memory
-
-
-def _is_back(view: View, place: Place) -> bool:
-    proxy = view.current(place)
-    return place not in view.wanted or (proxy is not None and has_ports(proxy))
-
-
-def _must_wait(view: View, proxy: ProxyPod) -> bool:
-    """Whether it is another proxy, which is being deleted, that holds the ports."""
-    return any(
-        other.pod.deleting and overlap(other.range, proxy.range) for other in view.on(proxy.on)
-    )
-
-
-def _concluded(view: View, memory: Memory, proxy: ProxyPod, now: float) -> Memory:
-    place, served = place_of(proxy), memory.served.get(place_of(proxy))
-    since = memory.refused.get(place, now)
-    if served is not None and overlap(served, proxy.range) and now - since < RETRY_FOR:
-        return replace(memory, refused={**memory.refused, place: since})
-    others = (one.pod for one in view.on(proxy.on) if place_of(one) != place)
-    seen = _ports((*view.strangers.get(proxy.on, ()), *others))
-    hit = seen.intersection(proxy.range.ports())
-    if not seen & proxy.pod.host_ports:
-        hit = set(proxy.range.ports())
-    return replace(
-        memory,
-        refused={key: at for key, at in memory.refused.items() if key != place},
-        taken={**memory.taken, **{(proxy.on, port): now for port in hit}},
-    )
-
-
-def allocate(view: View, settings: ClusterSettings, memory: Memory) -> Ranges:
+def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:
     """A range for each wanted proxy: the one that it has or had, else the first that is free.
 
     A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
     """
-    given: dict[Place, PortRange] = {}
-    published: set[Place] = set()
-    exhausted: dict[Place, str] = {}
-    flaws: dict[Place, tuple[tuple[str, str], ...]] = {}
+    given: dict[ProxyPlace, PortRange] = {}
+    published: set[ProxyPlace] = set()
+    exhausted: dict[ProxyPlace, str] = {}
+    flaws: dict[ProxyPlace, tuple[tuple[str, str], ...]] = {}
     for node in sorted({place.node for place in view.wanted}):
-        one = _Allocation(view, settings, memory, node)
+        one = _Allocation(view, settings, state, node)
         one.run()
         given |= one.given
         published |= one.published
         exhausted |= one.exhausted
         flaws |= {place: tuple(some) for place, some in one.flaws.items()}
-    return Ranges(given, frozenset(published), exhausted, flaws)
+    return ClusterRanges(given, frozenset(published), exhausted, flaws)
 
 
 class _Allocation:
     """The ranges of one node being given out."""
 
-    def __init__(self, view: View, settings: ClusterSettings, memory: Memory, node: str) -> None:
-        self.view, self.settings, self.memory, self.node = view, settings, memory, node
+    def __init__(
+        self, view: View, settings: ClusterSettings, state: ClusterState, node: str
+    ) -> None:
+        self.view, self.settings, self.state, self.node = view, settings, state, node
         self.places = sorted(place for place in view.wanted if place.node == node)
         self.proxies = view.on(node)
         self.strangers = view.strangers.get(node, ())
-        self.refused = {port for where, port in memory.taken if where == node}
-        self.given: dict[Place, PortRange] = {}
-        self.published: set[Place] = set()
-        self.exhausted: dict[Place, str] = {}
-        self.flaws: dict[Place, list[tuple[str, str]]] = {}
+        self.refused = {port for where, port in state.taken if where == node}
+        self.given: dict[ProxyPlace, PortRange] = {}
+        self.published: set[ProxyPlace] = set()
+        self.exhausted: dict[ProxyPlace, str] = {}
+        self.flaws: dict[ProxyPlace, list[tuple[str, str]]] = {}
 
     def run(self) -> None:
         """Who has ports comes before who had some, and that one before who wants some."""
@@ -126,18 +78,18 @@ class _Allocation:
         for place in order:
             self._fill(place)
 
-    def _rank(self, place: Place) -> tuple[int, Place]:
+    def _rank(self, place: ProxyPlace) -> tuple[int, ProxyPlace]:
         proxy = self.view.current(place)
         ranks = (
             proxy is not None and serves(proxy),
             proxy is not None and has_ports(proxy),
-            place in self.memory.served,
+            place in self.state.served,
             proxy is not None,
             self._former(place) is not None,
         )
         return ranks.index(True) if True in ranks else len(ranks), place
 
-    def _keep(self, place: Place) -> None:
+    def _keep(self, place: ProxyPlace) -> None:
         """Give a proxy the range that it has or had, if it can have it."""
         proxy = self.view.current(place)
         for ports in self._candidates(place):
@@ -147,29 +99,29 @@ class _Allocation:
                 self.given[place] = cut
                 return
 
-    def _candidates(self, place: Place) -> Iterator[PortRange]:
+    def _candidates(self, place: ProxyPlace) -> Iterator[PortRange]:
         current = self.view.current(place)
         there = [one for one in self.proxies if place_of(one) == place]
         yield from (one.range for one in sorted(there, key=lambda one: one is not current))
-        known = (self.memory.given.get(place), self.memory.served.get(place), self._former(place))
+        known = (self.state.given.get(place), self.state.served.get(place), self._former(place))
         yield from (ports for ports in known if ports is not None)
 
-    def _lawful(self, place: Place, ports: PortRange) -> bool:
+    def _lawful(self, place: ProxyPlace, ports: PortRange) -> bool:
         window = self.view.rosproxies[place.of].spec.window
         return within(ports, window) and is_free(ports, self._reserved(place), self._kernel())
 
-    def _is_to_be_had(self, place: Place, ports: PortRange) -> bool:
+    def _is_to_be_had(self, place: ProxyPlace, ports: PortRange) -> bool:
         """Whether a range where nothing runs now can be had.
 
         Ports of pods that are about to end are let go in time for one that has served; those of
         the controller's own also for one that waits for them already.
         """
-        served = place in self.memory.served
+        served = place in self.state.served
         waits = served or self.view.current(place) is not None
         strangers = [pod for pod in self.strangers if not (served and pod.deleting)]
         others = [one for one in self._others(place) if self._is_fixed(one)]
         others = [one for one in others if not (waits and one.pod.deleting)]
-        blocked = _ports(strangers)
+        blocked = ports_held(strangers)
         held = [*_held(others), *self._given_to_others(place)]
         return is_free(ports, blocked | self.refused, held)
 
@@ -177,7 +129,7 @@ class _Allocation:
         """Whether others must heed a proxy's range, even if its place is given another one."""
         return has_ports(proxy) or place_of(proxy) not in self.view.wanted
 
-    def _publish(self, place: Place) -> None:
+    def _publish(self, place: ProxyPlace) -> None:
         port = self._wants_published(place)
         if not port:
             return
@@ -192,10 +144,10 @@ class _Allocation:
                 return
         self.published.add(place)
 
-    def _fill(self, place: Place) -> None:
+    def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
         spec = self.view.rosproxies[place.of].spec
-        blocked = _ports(self.strangers) | self.refused | self._reserved(place)
+        blocked = ports_held(self.strangers) | self.refused | self._reserved(place)
         held = [*self._kernel(), *_held(self._others(place)), *self._given_to_others(place)]
         held += self._published_by_others(place)
         kept = self.given.get(place)
@@ -209,7 +161,9 @@ class _Allocation:
         except PortsExhausted as error:
             self.exhausted[place] = self._exhausted(place, error)
 
-    def _found(self, place: Place, blocked: Collection[int], held: list[PortRange]) -> PortRange:
+    def _found(
+        self, place: ProxyPlace, blocked: Collection[int], held: list[PortRange]
+    ) -> PortRange:
         """A new range, if possible none that another RosProxy has had here."""
         spec = self.view.rosproxies[place.of].spec
         had = [one.former.get(self.node) for one in self.view.rosproxies.values()]
@@ -219,35 +173,35 @@ class _Allocation:
         except PortsExhausted:
             return negotiate(spec.ports, spec.window, blocked, held)
 
-    def _others(self, place: Place) -> list[ProxyPod]:
+    def _others(self, place: ProxyPlace) -> list[ProxyPod]:
         return [one for one in self.proxies if place_of(one) != place]
 
-    def _given_to_others(self, place: Place) -> list[PortRange]:
+    def _given_to_others(self, place: ProxyPlace) -> list[PortRange]:
         return [ports for other, ports in self.given.items() if other != place]
 
-    def _published_by_others(self, place: Place) -> list[PortRange]:
+    def _published_by_others(self, place: ProxyPlace) -> list[PortRange]:
         ports = (self._wants_published(other) for other in self.published if other != place)
         return [PortRange(port, port) for port in ports]
 
     def _kernel(self) -> list[PortRange]:
         return [self.settings.node_ports, self.settings.ephemeral]
 
-    def _reserved(self, place: Place) -> set[int]:
+    def _reserved(self, place: ProxyPlace) -> set[int]:
         return {MASTER_PORT, ADMIN_PORT, self._wants_published(place)}
 
-    def _wants_published(self, place: Place) -> int:
+    def _wants_published(self, place: ProxyPlace) -> int:
         return self.view.rosproxies[place.of].spec.master.publish
 
-    def _count(self, place: Place) -> int:
+    def _count(self, place: ProxyPlace) -> int:
         return self.view.rosproxies[place.of].spec.ports
 
-    def _former(self, place: Place) -> PortRange | None:
+    def _former(self, place: ProxyPlace) -> PortRange | None:
         return self.view.rosproxies[place.of].former.get(self.node)
 
-    def _flaw(self, place: Place, reason: str, text: str) -> None:
+    def _flaw(self, place: ProxyPlace, reason: str, text: str) -> None:
         self.flaws.setdefault(place, []).append((reason, text))
 
-    def _exhausted(self, place: Place, error: PortsExhausted) -> str:
+    def _exhausted(self, place: ProxyPlace, error: PortsExhausted) -> str:
         holders = {
             str(pod.id)
             for pod in (*self.strangers, *(one.pod for one in self._others(place)))
@@ -264,10 +218,6 @@ class _Allocation:
             f"{error}; {by}: enlarge spec.portWindow ({error.window}), lower spec.ports "
             f"({error.count}), or let one of those pods go"
         )
-
-
-def _ports(pods: Iterable[Pod]) -> set[int]:
-    return {port for pod in pods for port in pod.host_ports}
 
 
 def _held(proxies: Iterable[ProxyPod]) -> list[PortRange]:

@@ -5,10 +5,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from rosproxy.telemetry.text import plural
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.kubernetes.planner.findings import CONFLICT, EXHAUSTED, NO_MASTER
-from rosproxy_operator.kubernetes.planner.model import Finding, Json, NodeState, RosProxy, Stuck
+from rosproxy_operator.kubernetes.planner.model import (
+    ClusterFinding,
+    Json,
+    NodeState,
+    RosProxy,
+    Stuck,
+)
 from rosproxy_operator.kubernetes.planner.names import INJECT
 from rosproxy_operator.kubernetes.planner.values import parts, word
 
@@ -20,7 +25,7 @@ _NO_PODS = "NoPods"
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Condition:
     """A condition without its times. ``status`` is True, False or Unknown."""
 
     type: str
@@ -46,7 +51,7 @@ def verdicts(
     problems: Sequence[Problem],
     nodes: int,
     former: Json,
-) -> tuple[Verdict, ...]:
+) -> tuple[Condition, ...]:
     """All conditions of a RosProxy that can be read.
 
     ``nodes`` is how many ROS nodes there are; ``former`` is the status as it was.
@@ -61,7 +66,7 @@ def verdicts(
 
 
 def conditions(
-    judged: Iterable[Verdict], former: Json, generation: int, stamp: str
+    judged: Iterable[Condition], former: Json, generation: int, stamp: str
 ) -> list[dict[str, object]]:
     """Conditions as the API server takes them.
 
@@ -97,28 +102,28 @@ def told(problem: Problem) -> str:
 
 def reason_of(problem: Problem) -> str:
     """A problem's reason."""
-    return problem.reason if isinstance(problem, Finding) else "Problem"
+    return problem.reason if isinstance(problem, ClusterFinding) else "Problem"
 
 
-def _since(former: Json, verdict: Verdict, stamp: str) -> str:
+def _since(former: Json, verdict: Condition, stamp: str) -> str:
     was = condition(former, verdict.type)
     return (word(was, "lastTransitionTime") if was.get("status") == verdict.status else "") or stamp
 
 
 def _ready(
     rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[Problem], nodes: int
-) -> Verdict:
+) -> Condition:
     if not wanted:
-        return Verdict(READY, "True", _NO_PODS, _no_pods(rosproxy))
+        return Condition(READY, "True", _NO_PODS, _no_pods(rosproxy))
     waiting = [state for state in wanted if not serving(state)]
     if not waiting:
         proxies = f"{len(wanted)} of {len(wanted)} proxies"
         text = f"{proxies} serve {plural(nodes, 'ROS node')}"
-        return Verdict(READY, "True", "Serving", text)
+        return Condition(READY, "True", "Serving", text)
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:
-        return Verdict(READY, "False", reason_of(blocking[0]), told(blocking[0]))
-    return Verdict(READY, "False", "ProxiesStarting", _starting(waiting[0]))
+        return Condition(READY, "False", reason_of(blocking[0]), told(blocking[0]))
+    return Condition(READY, "False", "ProxiesStarting", _starting(waiting[0]))
 
 
 def _no_pods(rosproxy: RosProxy) -> str:
@@ -130,7 +135,9 @@ def _no_pods(rosproxy: RosProxy) -> str:
 def _of_pod(problem: Problem) -> bool:
     """Whether it concerns one of the users' pods, without which the others are served."""
     return (
-        isinstance(problem, Finding) and problem.about is not None and problem.about.kind == "Pod"
+        isinstance(problem, ClusterFinding)
+        and problem.about is not None
+        and problem.about.kind == "Pod"
     )
 
 
@@ -140,39 +147,39 @@ def _starting(state: NodeState) -> str:
     return f"node {state.name}: its proxy {state.proxy.pod.id.name} is starting"
 
 
-def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Verdict:
+def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Condition:
     if not wanted:
-        return Verdict(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
+        return Condition(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
     lacking = [state for state in wanted if state.range is None]
     refused = [one for one in wanted if one.proxy is not None and one.proxy.stuck is Stuck.PORTS]
     if not lacking and not refused:
-        return Verdict(PORTS, "True", "Allocated", "every node with selected pods has its ports")
+        return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
     reason = CONFLICT if refused else EXHAUSTED
     lines = [told(one) for one in problems if reason_of(one) in (CONFLICT, EXHAUSTED)]
     names = ", ".join(state.name for state in (*refused, *lacking))
-    return Verdict(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
+    return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
 
 
-def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Verdict:
+def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Condition:
     """Of proxies that are not asked yet nothing is known: what was so far holds on."""
     proxies = [state for state in states if state.proxy is not None]
     answers = [state.answer for state in proxies]
     heard = [answer for answer in answers if answer is not None and answer.answered]
     if any(not answer.master_up for answer in heard):
         lines = [told(one) for one in problems if reason_of(one) == NO_MASTER]
-        return Verdict(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
+        return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
     was = condition(former, MASTER)
     if len(heard) == len(proxies) and proxies:
-        return Verdict(MASTER, "True", "Reached", "every proxy reaches the master")
+        return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
     if proxies and was:
-        return Verdict(MASTER, word(was, "status"), word(was, "reason"), word(was, "message"))
+        return Condition(MASTER, word(was, "status"), word(was, "reason"), word(was, "message"))
     if proxies:
-        return Verdict(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
-    return Verdict(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
+        return Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
 
 
-def _degraded(problems: Sequence[Problem]) -> Verdict:
+def _degraded(problems: Sequence[Problem]) -> Condition:
     if not problems:
-        return Verdict(DEGRADED, "False", "AsExpected", "nothing is wrong")
+        return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
     lines = "; ".join(map(told, problems))
-    return Verdict(DEGRADED, "True", reason_of(problems[0]), lines)
+    return Condition(DEGRADED, "True", reason_of(problems[0]), lines)

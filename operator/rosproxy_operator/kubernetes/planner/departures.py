@@ -4,8 +4,14 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from ipaddress import ip_address, ip_network
 
-from rosproxy_operator.kubernetes.planner.model import Answer, Node, Observed, Pod, ProxyPod
-from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.planner.model import (
+    ClusterNode,
+    ClusterSnapshot,
+    Pod,
+    ProxyPod,
+    ProxyReport,
+)
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 
 UNSEEN = 15.0
 """Seconds after which an address in a node's pod network is nobody's that no pod was seen with.
@@ -24,14 +30,14 @@ AGAIN = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class Departures:
     """The addresses that are gone, by the uid of the proxy's pod, and what is remembered."""
 
     gone: Mapping[str, tuple[str, ...]]
-    memory: Memory
+    state: ClusterState
 
 
-def gone(observed: Observed, memory: Memory, now: float) -> News:
+def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departures:
     """Compare where the proxies' ROS nodes are with the pods that there are.
 
     An address counts as gone if a pod was seen with it and none has it now; or if it belongs to
@@ -39,18 +45,18 @@ def gone(observed: Observed, memory: Memory, now: float) -> News:
     """
     pods = _by_node(observed)
     known = {
-        node: {**memory.addresses.get(node, {}), **_own_addresses(pods.get(node, ()), now)}
+        node: {**state.addresses.get(node, {}), **_own_addresses(pods.get(node, ()), now)}
         for node in {one.on for one in observed.proxies}
     }
     found: dict[str, tuple[str, ...]] = {}
     strange: dict[tuple[str, str], float] = {}
     for proxy in observed.proxies:
-        answer, node = observed.answers.get(proxy.pod.uid), observed.nodes.get(proxy.on)
+        answer, node = observed.reports.get(proxy.pod.uid), observed.nodes.get(proxy.on)
         if answer is None or not answer.answered or node is None or not node.ready:
             continue
-        place = _Place(node, proxy, pods.get(proxy.on, ()), frozenset(known[proxy.on]))
+        place = _Site(node, proxy, pods.get(proxy.on, ()), frozenset(known[proxy.on]))
         strange |= {
-            (node.name, address): memory.strange.get((node.name, address), now)
+            (node.name, address): state.strange.get((node.name, address), now)
             for address in place.unknown(answer)
         }
         since = {address: at for (where, address), at in strange.items() if where == node.name}
@@ -58,25 +64,25 @@ def gone(observed: Observed, memory: Memory, now: float) -> News:
         if addresses := place.gone(answer, late):
             found[proxy.pod.uid] = addresses
     kept = {node: _kept(observed, node, some, now) for node, some in known.items()}
-    return News(found, replace(memory, addresses=kept, strange=strange))
+    return Departures(found, replace(state, addresses=kept, strange=strange))
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _Site:
     """A proxy on its node, the pods there, and the addresses that pods there have or had."""
 
-    node: Node
+    node: ClusterNode
     proxy: ProxyPod
     pods: tuple[Pod, ...]
     known: frozenset[str]
 
-    def gone(self, answer: Answer, late: Collection[str]) -> tuple[str, ...]:
+    def gone(self, answer: ProxyReport, late: Collection[str]) -> tuple[str, ...]:
         """The addresses of ROS nodes whose pods are gone."""
         missing = set(answer.nodes) - _addresses(self.pods)
         unnamed = any(not pod.ip and not pod.host_network for pod in _living(self.pods))
         return tuple(sorted(missing & (self.known if unnamed else self.known | set(late))))
 
-    def unknown(self, answer: Answer) -> set[str]:
+    def unknown(self, answer: ProxyReport) -> set[str]:
         """Addresses of ROS nodes that could only be a pod's, but no pod was seen with them."""
         missing = set(answer.nodes) - self.known - _addresses(self.pods)
         return {address for address in missing if self._is_pods(address)}
@@ -92,7 +98,7 @@ class _Place:
         )
 
 
-def _by_node(observed: Observed) -> dict[str, tuple[Pod, ...]]:
+def _by_node(observed: ClusterSnapshot) -> dict[str, tuple[Pod, ...]]:
     every = {pod.uid: pod for pod in (*(one.pod for one in observed.proxies), *observed.pods)}
     found: dict[str, list[Pod]] = {}
     for pod in every.values():
@@ -113,22 +119,22 @@ def _own_addresses(pods: Iterable[Pod], now: float) -> dict[str, float]:
 
 
 def _kept(
-    observed: Observed, node: str, known: Mapping[str, float], now: float
+    observed: ClusterSnapshot, node: str, known: Mapping[str, float], now: float
 ) -> dict[str, float]:
     """Which addresses are worth remembering: those that a proxy names, or may name yet."""
-    answers = [observed.answers.get(one.pod.uid) for one in observed.proxies if one.on == node]
+    answers = [observed.reports.get(one.pod.uid) for one in observed.proxies if one.on == node]
     if not all(answer is not None and answer.answered for answer in answers):
         return {ip: at for ip, at in known.items() if now - at < LONGEST}
     named = {address for answer in answers if answer is not None for address in answer.nodes}
     return {ip: at for ip, at in known.items() if ip in named or now - at < REMEMBERED}
 
 
-def waits(found: News, now: float) -> Iterator[float]:
+def waits(found: Departures, now: float) -> Iterator[float]:
     """In how many seconds there may be something to be told."""
-    recent = (at for some in found.memory.addresses.values() for at in some.values() if at != now)
+    recent = (at for some in found.state.addresses.values() for at in some.values() if at != now)
     if found.gone or any(now - at < REMEMBERED for at in recent):
         yield AGAIN
-    strange = (at + UNSEEN - now for at in found.memory.strange.values())
+    strange = (at + UNSEEN - now for at in found.state.strange.values())
     yield from (left for left in strange if left > 0)
 
 

@@ -11,7 +11,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Emit,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.model import Finding, Json, Reference, RosProxy
+from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Json, Reference, RosProxy
 from rosproxy_operator.kubernetes.planner.names import API_VERSION, KIND, PORT_RANGE
 from rosproxy_operator.kubernetes.planner.values import part, word
 
@@ -24,14 +24,16 @@ LONGEST = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class NewEvents:
     """Events to make, and when which problem was seen last, on a monotonic clock in seconds."""
 
     emits: tuple[Emit, ...] = ()
-    seen: Mapping[Finding, float] = field(default_factory=dict)
+    reported: Mapping[ClusterFinding, float] = field(default_factory=dict)
 
 
-def news(problems: Iterable[Problem], seen: Mapping[Finding, float], now: float) -> Told:
+def warnings(
+    problems: Iterable[Problem], reported: Mapping[ClusterFinding, float], now: float
+) -> NewEvents:
     """Warning Events for problems that were not there before.
 
     One that comes and goes all the time is told once. After a restart of the controller all are
@@ -39,25 +41,25 @@ def news(problems: Iterable[Problem], seen: Mapping[Finding, float], now: float)
 
     Args:
         problems: Those of all objects; only Findings that are about an object become Events.
-        seen: That of the last look, or nothing.
-        now: The time, on the clock of ``seen``, in seconds.
+        reported: That of the last look, or nothing.
+        now: The time, on the clock of ``reported``, in seconds.
     """
-    found = dict.fromkeys(one for one in problems if isinstance(one, Finding) and one.about)
-    new = [one for one in found if one not in seen]
+    found = dict.fromkeys(one for one in problems if isinstance(one, ClusterFinding) and one.about)
+    new = [one for one in found if one not in reported]
     late = set(new[MOST:])
-    recent = {one: then for one, then in seen.items() if now - then < QUIET}
+    recent = {one: then for one, then in reported.items() if now - then < QUIET}
     current = {one: now for one in found if one not in late}
-    return Told(tuple(_warning(one) for one in new[:MOST]), {**recent, **current})
+    return NewEvents(tuple(_warning(one) for one in new[:MOST]), {**recent, **current})
 
 
-def done(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
+def results(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
     of = about(Reference(KIND, rosproxy.id, rosproxy.uid))
     return tuple(
         Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
         for action in actions
         if action.of == rosproxy.id
-        for reason, text in _news_of(action)
+        for reason, text in _result_of(action)
     )
 
 
@@ -72,16 +74,16 @@ def about(reference: Reference) -> Json:
     }
 
 
-def _warning(finding: Finding) -> Emit:
+def _warning(finding: ClusterFinding) -> Emit:
     """A problem of the object itself needs no name there."""
     reference = finding.about
-    assert reference is not None  # noqa: S101 - `news` takes no others
+    assert reference is not None  # noqa: S101 - `warnings` takes no others
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
     return Emit(finding.of, about(reference), "Warning", finding.reason, _bounded(text))
 
 
-def _news_of(action: Action) -> Iterator[tuple[str, str]]:
+def _result_of(action: Action) -> Iterator[tuple[str, str]]:
     match action:
         case CreateProxy(node=node, body=body):
             meta = part(body, "metadata")

@@ -6,10 +6,10 @@ The texts stay the same as long as the trouble does: an Event is made of each ne
 from collections.abc import Iterable, Iterator
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.planner.model import (
+    ClusterFinding,
     Failure,
-    Finding,
     InvalidRosProxy,
     NodeState,
     ProxyPod,
@@ -34,11 +34,11 @@ _TERMINATING = "because it is being terminated"
 
 def findings(
     rosproxy: RosProxy, states: Iterable[NodeState], failures: Iterable[Failure] = ()
-) -> tuple[Finding, ...]:
+) -> tuple[ClusterFinding, ...]:
     """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
 
     Each has a reason; those that users are to be told by an Event have ``about``, see
-    `happenings.news`. They go, with other problems, into `statuses.status_of`.
+    `events.warnings`. They go, with other problems, into `statuses.status_of`.
     """
     found = [_refused(rosproxy, one) for one in failures if _TERMINATING not in one.text]
     for state in sorted(states, key=lambda one: one.name):
@@ -46,7 +46,7 @@ def findings(
     return tuple(dict.fromkeys(found))
 
 
-def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[Finding]:
+def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
     """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
     node = f"node {state.name}"
     if state.problem:
@@ -61,9 +61,9 @@ def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[Finding]:
         yield from _answered(rosproxy, state, proxy)
 
 
-def invalid_finding(rosproxy: InvalidRosProxy) -> Finding:
+def invalid_finding(rosproxy: InvalidRosProxy) -> ClusterFinding:
     """That a RosProxy can't be read, with an Event."""
-    return Finding(
+    return ClusterFinding(
         f"rosproxy {rosproxy.id}",
         rosproxy.text,
         reason="Invalid",
@@ -72,16 +72,18 @@ def invalid_finding(rosproxy: InvalidRosProxy) -> Finding:
     )
 
 
-def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> Finding:
+def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
     about = Reference(KIND, rosproxy.id, rosproxy.uid)
-    return Finding(subject, bounded(text, _LONGEST), reason=reason, of=rosproxy.id, about=about)
+    return ClusterFinding(
+        subject, bounded(text, _LONGEST), reason=reason, of=rosproxy.id, about=about
+    )
 
 
 def _subject(proxy: ProxyPod) -> str:
     return f"proxy {proxy.pod.id.name} on node {proxy.on}"
 
 
-def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> Finding:
+def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> ClusterFinding:
     id, said = proxy.pod.id, proxy.message
     shown = f"kubectl -n {id.namespace} describe pod {id.name}"
     texts = {
@@ -99,7 +101,7 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> Finding:
     return _finding(rosproxy, _subject(proxy), texts[why], reason)
 
 
-def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[Finding]:
+def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[ClusterFinding]:
     """What follows from a proxy's answer. One that is not asked yet is not to blame."""
     answer = state.answer
     if answer is None:
@@ -112,21 +114,21 @@ def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator
         yield _no_master(rosproxy, proxy, answer.error)
     for problem in answer.problems:
         if answer.master_up or not problem.startswith("master: "):
-            yield Finding(
+            yield ClusterFinding(
                 _subject(proxy), problem, fatal=False, reason=WARNS, of=rosproxy.id, about=None
             )
 
 
-def _silent(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
+def _silent(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> ClusterFinding:
     """No Event: a controller that is cut off would make one for each proxy."""
     text = (
         f"it does not answer the controller ({error}): let the controller's pod connect to port "
         f"{ADMIN_PORT} of this one (NetworkPolicy)"
     )
-    return Finding(_subject(proxy), text, reason=SILENT, of=rosproxy.id, about=None)
+    return ClusterFinding(_subject(proxy), text, reason=SILENT, of=rosproxy.id, about=None)
 
 
-def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
+def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> ClusterFinding:
     master = rosproxy.spec.master
     if master.service is not None:
         fix = f"start roscore behind Service {master.service}, port {master.service_port}"
@@ -136,7 +138,7 @@ def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> Finding:
     return _finding(rosproxy, _subject(proxy), text, NO_MASTER)
 
 
-def _refused(rosproxy: RosProxy, failure: Failure) -> Finding:
+def _refused(rosproxy: RosProxy, failure: Failure) -> ClusterFinding:
     said = clean(" ".join(failure.text.split()))
     remedy = _remedy(said, rosproxy)
     head = "the API server refused it"

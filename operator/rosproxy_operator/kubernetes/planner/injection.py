@@ -8,7 +8,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.kubernetes.planner.model import (
     ELSEWHERE,
-    Finding,
+    ClusterFinding,
     Json,
     Name,
     Pod,
@@ -72,7 +72,7 @@ def wire(pod: Json, uri: str, host_aliases: Iterable[Json] = ()) -> Wiring:
     return Wiring({**spec, **wired} if changed else None, {MASTER_URI: uri} if ours else {})
 
 
-def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> Finding | None:
+def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
     """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
 
     ``cluster_ip`` is that of the RosProxy's Service; without one nothing can be said yet.
@@ -83,7 +83,7 @@ def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> Finding | None:
     about = Reference("Pod", pod.id, pod.uid)
     subject = f"pod {pod.id}"
     return (
-        Finding(subject, text, fatal=False, reason="NotWired", of=rosproxy.id, about=about)
+        ClusterFinding(subject, text, fatal=False, reason="NotWired", of=rosproxy.id, about=about)
         if text
         else None
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.kubernetes.planner.model import Json, Node, RosProxy
+from rosproxy_operator.kubernetes.planner.model import ClusterNode, Json, RosProxy
 from rosproxy_operator.kubernetes.planner.names import (
     ADMIN_PORT,
     ADVERTISE_HOST,
@@ -63,7 +63,7 @@ class Site:
     """A proxy on a node. ``publish`` is the port for a master in the cluster, 0 for none."""
 
     rosproxy: RosProxy
-    node: Node
+    node: ClusterNode
     advertise_host: str
     ports: PortRange
     upstream: Upstream

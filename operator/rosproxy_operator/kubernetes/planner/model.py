@@ -28,6 +28,14 @@ NOBODY = Name("", "")
 """The name of no object."""
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class ProxyPlace:
+    """A node, as one RosProxy (``of``) sees it."""
+
+    of: Name
+    node: str
+
+
 @dataclass(frozen=True, slots=True)
 class Selector:
     """A label selector (``metav1.LabelSelector``): all parts must fit.
@@ -40,7 +48,7 @@ class Selector:
 
 
 @dataclass(frozen=True, slots=True)
-class Master:
+class MasterSpec:
     """Where the real ROS master is: outside at ``uri``, or a Service of the cluster.
 
     ``address`` is the IP address of the host in ``uri``, for names that the cluster's DNS does not
@@ -64,7 +72,7 @@ class Advertise(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Spec:
+class RosProxySpec:
     """What a RosProxy asks for; the fields are those of the CRD.
 
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
@@ -73,7 +81,7 @@ class Spec:
     ``image_pull_secrets`` go into the pods as they are.
     """
 
-    master: Master
+    master: MasterSpec
     ports: int
     window: PortRange
     pod_selector: Selector | None = None
@@ -102,7 +110,7 @@ class RosProxy:
     id: Name
     uid: str
     generation: int
-    spec: Spec
+    spec: RosProxySpec
     former: Mapping[str, PortRange] = field(default_factory=dict)
     cluster_ip: str = ""
     status: Json = field(default_factory=dict)
@@ -110,7 +118,7 @@ class RosProxy:
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class ClusterNode:
     """A node of the cluster. ``addresses`` are by their type, the first of each.
 
     ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
@@ -194,7 +202,7 @@ class ProxyPod:
 
 
 @dataclass(frozen=True, slots=True)
-class Service:
+class ProxyService:
     """A Service of the controller: under its address pods find the proxy on their node."""
 
     of: Name
@@ -206,7 +214,7 @@ class Service:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ProxyReport:
     """What a proxy says of itself (``/status``), as far as it matters here.
 
     ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
@@ -237,7 +245,7 @@ class NodeState:
     range: PortRange | None
     proxy: ProxyPod | None = None
     pods: tuple[Pod, ...] = ()
-    answer: Answer | None = None
+    answer: ProxyReport | None = None
     problem: str = ""
     reason: str = ""
 
@@ -252,7 +260,7 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding(Problem):
+class ClusterFinding(Problem):
     """A problem as conditions and Kubernetes Events tell it.
 
     ``reason`` is one word in CamelCase; ``of`` the RosProxy that it belongs to. ``about`` is the
@@ -284,22 +292,24 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Observed:
+class ClusterSnapshot:
     """A cluster at one moment, as far as it matters.
 
     ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
-    wrong; one of them is empty. ``answers`` are by the uid of the proxy's pod. ``unusable`` are the
-    RosProxies that can't be read at all: what they have is left as it is. ``failures`` are those of
-    the last try to carry something out.
+    wrong; one of them is empty. ``selected`` are the uids of the pods that a RosProxy selects.
+    ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
+    ``reports`` are what the proxies say of themselves, by the uid of the pod, ``failures`` those of
+    the last try to carry something out: neither is listed, the controller puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
-    nodes: Mapping[str, Node] = field(default_factory=dict)
+    nodes: Mapping[str, ClusterNode] = field(default_factory=dict)
     pods: tuple[Pod, ...] = ()
     proxies: tuple[ProxyPod, ...] = ()
-    services: Mapping[Name, Service] = field(default_factory=dict)
+    services: Mapping[Name, ProxyService] = field(default_factory=dict)
     masters: Mapping[Name, tuple[str, str]] = field(default_factory=dict)
-    answers: Mapping[str, Answer] = field(default_factory=dict)
+    selected: frozenset[str] = frozenset()
+    reports: Mapping[str, ProxyReport] = field(default_factory=dict)
     unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
     failures: Mapping[Name, tuple[Failure, ...]] = field(default_factory=dict)

@@ -10,12 +10,12 @@ from rosproxy.settings import SettingError, parse_range
 from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.model import (
     ELSEWHERE,
+    ClusterNode,
     Json,
     Name,
-    Node,
     Pod,
     ProxyPod,
-    Service,
+    ProxyService,
 )
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck
 from rosproxy_operator.kubernetes.planner.values import number, part, parts, word, words
@@ -23,14 +23,14 @@ from rosproxy_operator.kubernetes.planner.values import number, part, parts, wor
 VARIABLE = "ROS_MASTER_URI"
 
 
-def node(obj: Json) -> Node:
+def node(obj: Json) -> ClusterNode:
     """A node."""
     meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
     addresses: dict[str, str] = {}
     for one in parts(status, "addresses"):
         addresses.setdefault(word(one, "type"), word(one, "address"))
     networks = spec.get("podCIDRs") or [spec.get("podCIDR")]
-    return Node(
+    return ClusterNode(
         name=word(meta, "name"),
         labels=words(meta, "labels"),
         addresses=addresses,
@@ -92,7 +92,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     )
 
 
-def service(obj: Json) -> Service | None:
+def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this controller made."""
     meta = part(obj, "metadata")
     labels, owner = words(meta, "labels"), _owner(obj)
@@ -102,7 +102,7 @@ def service(obj: Json) -> Service | None:
     if names.service_id(of) != Name(of.namespace, word(meta, "name")):
         return None
     address = word(part(obj, "spec"), "clusterIP")
-    return Service(
+    return ProxyService(
         of=of,
         owner=owner,
         uid=word(meta, "uid"),

@@ -1,45 +1,52 @@
-"""From what is seen in a cluster to what is to be done there."""
+"""From what is seen in a cluster to what is to be done there: the way of a RosProxy.
+
+`plan` is a function of what is seen, the state before and the time. `view` puts in order what is
+seen: who is wanted where. `state.learn` draws conclusions from it, `allocation.allocate` gives each
+wanted proxy its ports, `reconcile` says what is to be done to Services and proxies, `status` and
+`events` what users are told of it, `departures` what proxies are told.
+"""
 
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from rosproxy_operator.common.moves import RETRY_FOR
+from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.kubernetes.planner import departures, events, transitions
+from rosproxy_operator.kubernetes.planner import departures, events
 from rosproxy_operator.kubernetes.planner import status as statuses
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
-from rosproxy_operator.kubernetes.planner.allocation import allocate, refused
+from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.model import (
-    Finding,
+    ClusterFinding,
+    ClusterSnapshot,
     InvalidRosProxy,
     Json,
     NodeState,
-    Observed,
+    ProxyPlace,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.planner.reconcile import (
-    Case,
+    ClusterContext,
     advertise_host,
     ends,
+    nodes_by_rosproxy,
     obstacle,
-    orphan_steps,
-    proxy_steps,
+    reconcile_orphans,
+    reconcile_proxy,
+    reconcile_service,
     service_of,
-    service_steps,
-    states_by,
     upstream,
 )
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import Memory, Place
+from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.view import finding, view
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ClusterPlan:
     """What to do, in this order, and what to remember.
 
     One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
@@ -49,139 +56,141 @@ class Plan:
 
     actions: tuple[Action, ...] = ()
     problems: tuple[Problem, ...] = ()
-    memory: Memory = field(default_factory=Memory)
+    state: ClusterState = field(default_factory=ClusterState)
     gone: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     again_in: float | None = None
 
 
 def plan(
-    observed: Observed, settings: ClusterSettings, memory: Memory, now: float, stamp: str
-) -> Plan:
+    observed: ClusterSnapshot,
+    settings: ClusterSettings,
+    state: ClusterState,
+    now: float,
+    stamp: str,
+) -> ClusterPlan:
     """The next actions, from everything that is seen; none if all is as it ought to be.
 
-    ``memory`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
-    clock that goes on as long as the memory does; ``stamp`` is the time of day in RFC 3339.
+    ``state`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
+    clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
     """
     seen = view(observed)
-    memory = refused(seen, transitions.looked(seen, memory, now), now)
-    ranges = allocate(seen, settings, memory)
-    memory = transitions.given(memory, ranges.given, now)
-    case = Case(seen, settings, memory, ranges, Retries(memory.tries, observed.failures, now), now)
-    actions = list(orphan_steps(case))
+    learned = learn(seen, state, now)
+    ranges = allocate(seen, settings, learned)
+    decided = decide(learned, ranges.given, now)
+    retries = Retries(decided.attempts, observed.failures, now)
+    context = ClusterContext(seen, settings, decided, ranges, retries, now)
+    actions = list(reconcile_orphans(context))
     problems: list[Problem] = [*seen.findings]
-    nodes = states_by(case)
-    moves = tuple(transitions.moves(seen, memory, ranges.given))
+    moved = tuple(moves(seen, decided, ranges.given))
+    nodes = nodes_by_rosproxy(context)
     for of, rosproxy in sorted(seen.rosproxies.items()):
-        own = _steps(case, rosproxy, nodes[of])
-        told = _told(case, rosproxy, nodes[of], moves)
-        problems += told.problems
-        patch = _patch(case, rosproxy, told.status(stamp))
-        actions += [*own, *patch, *events.done(rosproxy, own)]
+        own = _reconciled(context, rosproxy)
+        states = tuple(_state(context, ProxyPlace(of, node)) for node in nodes[of])
+        found = _problems(context, rosproxy, states, moved)
+        status = _status(context, rosproxy, states, found, stamp)
+        problems += found
+        actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
         problems.append(statuses.invalid_finding(bad))
-        actions += _patch(case, bad, statuses.status_of_invalid(bad, stamp))
-    return _plan(case, actions, tuple(dict.fromkeys(problems)))
-
-
-def _plan(case: Case, actions: list[Action], problems: tuple[Problem, ...]) -> Plan:
-    told = events.news(problems, case.memory.seen, case.now)
-    found = departures.gone(case.observed, case.memory, case.now)
-    memory = replace(found.memory, tries=case.tries.noted, seen=told.seen)
-    return Plan(
-        actions=(*actions, *told.emits),
-        problems=problems,
-        memory=memory,
-        gone=found.gone,
-        again_in=min((*_waits(case, memory), *departures.waits(found, case.now)), default=None),
+        actions += _patch(context, bad, statuses.status_of_invalid(bad, stamp))
+    every = tuple(dict.fromkeys(problems))
+    new = events.warnings(every, decided.reported, now)
+    gone = departures.gone(observed, decided, now)
+    return ClusterPlan(
+        actions=(*actions, *new.emits),
+        problems=every,
+        state=replace(gone.state, attempts=retries.noted, reported=new.reported),
+        gone=gone.gone,
+        again_in=min((*_waits(context), *departures.waits(gone, now)), default=None),
     )
 
 
-def _waits(case: Case, memory: Memory) -> Iterator[float]:
+def _waits(context: ClusterContext) -> Iterator[float]:
     """In how many seconds there is something to be done or decided."""
-    yield from ends(case)
-    yield from case.tries.waits()
-    refused_for = (at + RETRY_FOR - case.now for at in memory.refused.values())
+    yield from ends(context)
+    yield from context.retries.waits()
+    refused_for = (at + RETRY_FOR - context.now for at in context.state.refused.values())
     yield from (left for left in refused_for if left > 0)
 
 
-def _steps(case: Case, rosproxy: RosProxy, nodes: Iterable[str]) -> list[Action]:
-    actions = list(service_steps(case, rosproxy))
-    for place in sorted(case.view.places()):
+def _reconciled(context: ClusterContext, rosproxy: RosProxy) -> list[Action]:
+    actions = list(reconcile_service(context, rosproxy))
+    for place in sorted(context.view.places()):
         if place.of == rosproxy.id:
-            actions += proxy_steps(case, place)
+            actions += reconcile_proxy(context, place)
     return actions
 
 
-@dataclass(frozen=True, slots=True)
-class _Told:
-    """What is told of a RosProxy."""
-
-    case: Case
-    rosproxy: RosProxy
-    states: tuple[NodeState, ...]
-    problems: tuple[Problem, ...]
-
-    def status(self, stamp: str) -> Json:
-        """Its status."""
-        observed = self.case.observed
-        master, _ = upstream(self.rosproxy, observed)
-        there = service_of(observed, self.rosproxy.id)
-        mine = there if there and there.owner == self.rosproxy.uid else None
-        uri = master.uri if master else ""
-        return statuses.status_of(self.rosproxy, self.states, self.problems, mine, uri, stamp)
-
-
-def _told(case: Case, rosproxy: RosProxy, nodes: Iterable[str], moves: Iterable[Finding]) -> _Told:
-    states = tuple(_state(case, Place(rosproxy.id, node)) for node in nodes)
-    failures = case.tries.failures(rosproxy.id)
+def _problems(
+    context: ClusterContext,
+    rosproxy: RosProxy,
+    states: tuple[NodeState, ...],
+    moved: Iterable[ClusterFinding],
+) -> tuple[Problem, ...]:
+    """All that is wrong with a RosProxy."""
     flaws = (
         finding(rosproxy, reason, text)
-        for place, some in sorted(case.ranges.flaws.items())
+        for place, some in sorted(context.ranges.flaws.items())
         if place.of == rosproxy.id
         for reason, text in some
     )
-    problems = (
-        *statuses.findings(rosproxy, states, failures),
-        *(one for one in (*case.view.findings, *moves) if one.of == rosproxy.id),
+    return (
+        *statuses.findings(rosproxy, states, context.retries.failures(rosproxy.id)),
+        *(one for one in (*context.view.findings, *moved) if one.of == rosproxy.id),
         *flaws,
-        *_unwired(case, rosproxy),
+        *_unwired(context, rosproxy),
     )
-    return _Told(case, rosproxy, states, problems)
 
 
-def _state(case: Case, place: Place) -> NodeState:
-    of, node = case.view.rosproxies[place.of], case.observed.nodes[place.node]
-    current, wanted = case.view.current(place), place in case.view.wanted
-    reason, problem = obstacle(case, place) if wanted else ("", "")
-    former = case.memory.given.get(place) or of.former.get(place.node)
+def _status(
+    context: ClusterContext,
+    rosproxy: RosProxy,
+    states: tuple[NodeState, ...],
+    problems: tuple[Problem, ...],
+    stamp: str,
+) -> Json:
+    master, _ = upstream(rosproxy, context.observed)
+    there = service_of(context.observed, rosproxy.id)
+    mine = there if there and there.owner == rosproxy.uid else None
+    uri = master.uri if master else ""
+    return statuses.status_of(rosproxy, states, problems, mine, uri, stamp)
+
+
+def _state(context: ClusterContext, place: ProxyPlace) -> NodeState:
+    of, node = context.view.rosproxies[place.of], context.observed.nodes[place.node]
+    current, wanted = context.view.current(place), place in context.view.wanted
+    reason, problem = obstacle(context, place) if wanted else ("", "")
+    former = context.state.given.get(place) or of.former.get(place.node)
     kept = current.range if current else former
     host, _ = advertise_host(of, node)
     return NodeState(
         name=place.node,
         advertise_host=host,
-        range=case.ranges.given.get(place) if wanted else kept,
+        range=context.ranges.given.get(place) if wanted else kept,
         proxy=current,
-        pods=case.view.wanted.get(place, ()),
-        answer=case.observed.answers.get(current.pod.uid) if current else None,
+        pods=context.view.wanted.get(place, ()),
+        answer=context.observed.reports.get(current.pod.uid) if current else None,
         problem=problem,
         reason=reason,
     )
 
 
-def _unwired(case: Case, rosproxy: RosProxy) -> Iterator[Finding]:
-    there = service_of(case.observed, rosproxy.id)
+def _unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
+    there = service_of(context.observed, rosproxy.id)
     if there is not None and there.owner == rosproxy.uid and there.cluster_ip:
-        for pod in case.view.taken.get(rosproxy.id, ()):
+        for pod in context.view.taken.get(rosproxy.id, ()):
             found = unwired(pod, rosproxy, there.cluster_ip)
             if found is not None:
                 yield found
 
 
-def _patch(case: Case, of: RosProxy | InvalidRosProxy, status: Json) -> Iterator[Action]:
+def _patch(
+    context: ClusterContext, of: RosProxy | InvalidRosProxy, status: Json
+) -> Iterator[Action]:
     """Write a status if it is another one; not over and over again if that does not help."""
     if status != of.status:
         task = Task(of.id, "status", str(of.id), _digest(status))
-        if case.tries.ask(task):
+        if context.retries.ask(task):
             yield PatchStatus(of.id, status)
 
 

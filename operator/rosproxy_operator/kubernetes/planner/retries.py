@@ -29,7 +29,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Try:
+class RetryRecord:
     """How often a task was asked for, and when the last time.
 
     ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the API
@@ -56,7 +56,7 @@ class Retries:
 
     def __init__(
         self,
-        known: Mapping[Task, Try],
+        known: Mapping[Task, RetryRecord],
         failures: Mapping[Name, Iterable[Failure]],
         now: float,
     ) -> None:
@@ -66,7 +66,7 @@ class Retries:
             for task, tried in known.items()
         }
         self._now = now
-        self.noted: dict[Task, Try] = {}
+        self.noted: dict[Task, RetryRecord] = {}
 
     def ask(self, task: Task) -> bool:
         """Whether a task is to be done now; if so, that is noted."""
@@ -75,7 +75,7 @@ class Retries:
             self.noted[task] = tried
             return False
         count, error = (tried.count, tried.error) if tried else (0, "")
-        self.noted[task] = Try(count + 1, self._now, error=error)
+        self.noted[task] = RetryRecord(count + 1, self._now, error=error)
         return True
 
     def effect(self, task: Task) -> None:
@@ -94,5 +94,5 @@ class Retries:
             if not tried.effect:
                 yield max(tried.at + tried.pause - self._now, 0.0)
 
-    def _of(self, of: Name) -> Iterator[tuple[Task, Try]]:
+    def _of(self, of: Name) -> Iterator[tuple[Task, RetryRecord]]:
         yield from ((task, tried) for task, tried in self.noted.items() if task.of == of)

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy_operator.kubernetes.planner.model import (
-    Finding,
-    Node,
+    ClusterFinding,
+    ClusterNode,
     Pod,
     Reference,
     RosProxy,
+    RosProxySpec,
     Selector,
-    Spec,
 )
 from rosproxy_operator.kubernetes.planner.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
 
@@ -28,7 +28,7 @@ class Choice:
     """
 
     rosproxy: RosProxy | None = None
-    finding: Finding | None = None
+    finding: ClusterFinding | None = None
 
 
 def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
@@ -41,7 +41,7 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
     return all(_fits(*one, labels) for one in selector.expressions)
 
 
-def label_selector(spec: Spec, name: str) -> str:
+def label_selector(spec: RosProxySpec, name: str) -> str:
     """The selector of a RosProxy's pods as the API server takes it (``labelSelector=``).
 
     ``name`` is the RosProxy's.
@@ -94,7 +94,7 @@ def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
     )
 
 
-def on_node(rosproxy: RosProxy, node: Node) -> bool:
+def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
     """Whether the RosProxy's nodeSelector fits a node."""
     return matches(Selector(rosproxy.spec.node_selector), node.labels)
 
@@ -113,9 +113,9 @@ def _ambiguous(taking: Iterable[RosProxy]) -> str:
     )
 
 
-def _finding(pod: Pod, of: RosProxy, reason: str, text: str) -> Finding:
+def _finding(pod: Pod, of: RosProxy, reason: str, text: str) -> ClusterFinding:
     about = Reference("Pod", pod.id, pod.uid)
-    return Finding(f"pod {pod.id}", text, reason=reason, of=of.id, about=about)
+    return ClusterFinding(f"pod {pod.id}", text, reason=reason, of=of.id, about=about)
 
 
 def _selects(rosproxy: RosProxy, pod: Pod) -> bool:

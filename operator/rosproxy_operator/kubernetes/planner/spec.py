@@ -15,13 +15,13 @@ from rosproxy_operator.kubernetes.planner.model import (
     Json,
     Name,
     RosProxy,
-    Spec,
+    RosProxySpec,
 )
 from rosproxy_operator.kubernetes.planner.spec_master import master
 from rosproxy_operator.kubernetes.planner.spec_selector import selector
 from rosproxy_operator.kubernetes.planner.values import (
     Field,
-    Unusable,
+    InvalidField,
     is_label,
     is_subdomain,
     number,
@@ -30,7 +30,7 @@ from rosproxy_operator.kubernetes.planner.values import (
     word,
 )
 
-__all__ = ["MOST_PORTS", "Unusable", "invalid", "rosproxy"]
+__all__ = ["MOST_PORTS", "InvalidField", "invalid", "rosproxy"]
 
 MOST_PORTS = 500
 MOST_NAME = 46
@@ -70,7 +70,7 @@ def rosproxy(obj: Json) -> RosProxy:
     )
 
 
-def invalid(obj: Json, error: Unusable) -> InvalidRosProxy:
+def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
     """What is left of a RosProxy that can't be read. Never raises."""
     meta = part(obj, "metadata")
     return InvalidRosProxy(
@@ -83,9 +83,9 @@ def _id(obj: Json) -> Name:
     return Name(word(meta, "namespace"), word(meta, "name"))
 
 
-def _spec(spec: Field, of: Name) -> Spec:
+def _spec(spec: Field, of: Name) -> RosProxySpec:
     ports = spec.child("ports").integer(32, 1, MOST_PORTS)
-    return Spec(
+    return RosProxySpec(
         master=master(spec.child("master"), of),
         ports=ports,
         window=_window(spec.child("portWindow"), ports),
@@ -113,7 +113,7 @@ def _window(field: Field, ports: int) -> PortRange:
     first = field.child("first").integer(WINDOW.first, 1024, 65535)
     last = field.child("last").integer(WINDOW.last, 1024, 65535)
     if last - first + 1 < ports:
-        raise Unusable(
+        raise InvalidField(
             f"{field.path}: {first}-{last} has not the {ports} ports that spec.ports asks for: "
             "make the window larger, or spec.ports smaller"
         )

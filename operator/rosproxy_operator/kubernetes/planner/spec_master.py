@@ -5,20 +5,20 @@ from urllib.parse import urlsplit
 
 from rosproxy.net.addresses import HostPort, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy_operator.kubernetes.planner.model import Master, Name
+from rosproxy_operator.kubernetes.planner.model import MasterSpec, Name
 from rosproxy_operator.kubernetes.planner.names import service_id
-from rosproxy_operator.kubernetes.planner.values import Field, Unusable, is_label
+from rosproxy_operator.kubernetes.planner.values import Field, InvalidField, is_label
 
 PORT = 11311
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _EXAMPLE = "http://robot.example:11311"
 
 
-def master(field: Field, of: Name) -> Master:
+def master(field: Field, of: Name) -> MasterSpec:
     """``spec.master`` of the RosProxy with this name. Raises Unusable."""
     uri, service = field.child("uri"), field.child("service")
     if uri.given == service.given:
-        raise Unusable(
+        raise InvalidField(
             f"{field.path}: give either uri, for a master outside of the cluster, or service, for "
             "one in it, and not both"
         )
@@ -26,10 +26,10 @@ def master(field: Field, of: Name) -> Master:
     address = _address(field.child("address"))
     if service.given:
         if address:
-            raise Unusable(f"{field.path}.address: goes with uri only: leave it out")
+            raise InvalidField(f"{field.path}.address: goes with uri only: leave it out")
         port = service.child("port").integer(PORT, 1, 65535)
-        return Master(service=_service(service, of), service_port=port, publish=publish)
-    return Master(uri=_uri(uri, of), address=address, publish=publish)
+        return MasterSpec(service=_service(service, of), service_port=port, publish=publish)
+    return MasterSpec(uri=_uri(uri, of), address=address, publish=publish)
 
 
 def _uri(field: Field, of: Name) -> str:

@@ -1,47 +1,197 @@
-"""What the controller remembers from look to look. Losing it costs time, never correctness."""
+"""What the operator remembers from look to look. Losing it costs time, never correctness.
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+Each plan makes the next state out of the one before, in two steps: `learn` draws from what is seen
+(who is not wanted any more, which node is gone, who has served where, which ports were refused),
+before anything is decided; `decide` adds the ranges that were given. The other parts are those of
+`departures` (addresses), `retries` (attempts) and `events` (reported), each made once as well.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.moves import Move
-from rosproxy_operator.kubernetes.planner.model import Finding, Name
-from rosproxy_operator.kubernetes.planner.retries import Task, Try
+from rosproxy_operator.common.allocation import (
+    MOVED_FOR,
+    RETRY_FOR,
+    TAKEN_FOR,
+    Move,
+    overlap,
+    within,
+)
+from rosproxy_operator.kubernetes.planner.model import (
+    ClusterFinding,
+    Pod,
+    ProxyPlace,
+    ProxyPod,
+    Stuck,
+)
+from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
+from rosproxy_operator.kubernetes.planner.view import View, finding, has_ports, place_of, serves
 
-
-@dataclass(frozen=True, slots=True, order=True)
-class Place:
-    """A node, as one RosProxy (``of``) sees it."""
-
-    of: Name
-    node: str
+TRIED_FOR = 60.0
+"""Seconds for which it is told that a proxy got other ports than were tried first."""
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
-    """Times are in seconds of the controller's monotonic clock.
+class ClusterState:
+    """Times are in seconds of the operator's monotonic clock.
 
     ``begun`` is False until the first look. ``absent`` are proxies since when no pod wants them,
     ``lost`` nodes since when they are not listed any more. ``served`` is the range on which a
     proxy was last seen to serve, ``given`` the one that it is to have. ``refused`` is since when a
     proxy that has served does not get its ports back; ``taken`` are ports by node that were refused
     at last, and when; ``moved`` are the ranges that had to be left, ``tried`` those that could not
-    be had in the first place. ``tries`` are actions that have not shown an effect yet, ``seen``
-    problems that Events were made of. ``addresses`` are, by node, those that pods have or
-    had, and when they were last seen to; ``strange``, by node and address, those that a proxy has
-    named and that no pod was seen with, since when.
+    be had in the first place. ``attempts`` are actions that have not shown an effect yet,
+    ``reported`` problems that Events were made of. ``addresses`` are, by node, those that pods have
+    or had, and when they were last seen to; ``strange``, by node and address, those that a proxy
+    has named and that no pod was seen with, since when.
     """
 
     begun: bool = False
-    absent: Mapping[Place, float] = field(default_factory=dict)
+    absent: Mapping[ProxyPlace, float] = field(default_factory=dict)
     lost: Mapping[str, float] = field(default_factory=dict)
-    served: Mapping[Place, PortRange] = field(default_factory=dict)
-    given: Mapping[Place, PortRange] = field(default_factory=dict)
-    refused: Mapping[Place, float] = field(default_factory=dict)
+    served: Mapping[ProxyPlace, PortRange] = field(default_factory=dict)
+    given: Mapping[ProxyPlace, PortRange] = field(default_factory=dict)
+    refused: Mapping[ProxyPlace, float] = field(default_factory=dict)
     taken: Mapping[tuple[str, int], float] = field(default_factory=dict)
-    moved: Mapping[Place, Move] = field(default_factory=dict)
-    tried: Mapping[Place, Move] = field(default_factory=dict)
-    tries: Mapping[Task, Try] = field(default_factory=dict)
-    seen: Mapping[Finding, float] = field(default_factory=dict)
+    moved: Mapping[ProxyPlace, Move] = field(default_factory=dict)
+    tried: Mapping[ProxyPlace, Move] = field(default_factory=dict)
+    attempts: Mapping[Task, RetryRecord] = field(default_factory=dict)
+    reported: Mapping[ClusterFinding, float] = field(default_factory=dict)
     addresses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     strange: Mapping[tuple[str, str], float] = field(default_factory=dict)
+
+
+def learn(view: View, state: ClusterState, now: float) -> ClusterState:
+    """What follows from what is seen.
+
+    A range that its proxy does not get is given up at once if it has never served, else after
+    `RETRY_FOR` seconds, since its ports may only be slow to be let go: they count as taken then.
+    """
+    absent = (place for place in sorted(view.proxies) if place not in view.wanted)
+    nodes = {one.on for one in view.observed.proxies}
+    lost = (node for node in sorted(nodes) if node not in view.observed.nodes)
+    served = _served(view, state)
+    waiting, refused = _refused(view, served, state.refused, now)
+    taken = {port: at for port, at in state.taken.items() if now - at < TAKEN_FOR}
+    return replace(
+        state,
+        begun=True,
+        absent={place: state.absent.get(place, now) for place in absent},
+        lost={node: state.lost.get(node, now) for node in lost},
+        served=served,
+        given={place: ports for place, ports in state.given.items() if _may_be(view, place)},
+        refused=waiting,
+        taken=taken | dict.fromkeys(refused, now),
+        moved=_recent(view, state.moved, now - MOVED_FOR),
+        tried=_recent(view, state.tried, now - TRIED_FOR),
+    )
+
+
+def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: float) -> ClusterState:
+    """The state with the ranges that are given, and with who had to leave which."""
+    served = {place: ports for place, ports in state.served.items() if place in ranges}
+    tried = {p: ports for p, ports in state.given.items() if p in ranges and p not in served}
+    left = _left(served, ranges, now)
+    return replace(
+        state,
+        given={**state.given, **ranges},
+        served={place: ports for place, ports in state.served.items() if place not in left},
+        moved={**state.moved, **left},
+        tried={**state.tried, **_left(tried, ranges, now)},
+    )
+
+
+def moves(
+    view: View, state: ClusterState, ranges: Mapping[ProxyPlace, PortRange]
+) -> Iterator[ClusterFinding]:
+    """Who has had to leave which ports."""
+    for left, why in ((state.moved, _MOVED), (state.tried, _TRIED)):
+        for place, move in sorted(left.items()):
+            ports = ranges.get(place)
+            if ports is not None and not _is_kept(move.ports, ports):
+                text = f"the proxy on node {place.node} has left ports {move.ports} for {ports}"
+                yield finding(view.rosproxies[place.of], "PortConflict", f"{text}, {why}")
+
+
+_MOVED = (
+    "since something else has taken them or the RosProxy forbids them now: nodes that had "
+    "registered under the old ones can't be reached until they register anew: restart their pods"
+)
+_TRIED = "since they could not be had: nothing needs to be done"
+
+
+def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
+    """Where each proxy has served; what the status says is believed only once, at the start."""
+    served = dict(state.served)
+    if not state.begun:
+        for of, rosproxy in view.rosproxies.items():
+            served |= {ProxyPlace(of, node): ports for node, ports in rosproxy.former.items()}
+    served |= {place_of(one): one.range for one in view.observed.proxies if serves(one)}
+    return {place: ports for place, ports in served.items() if _may_be(view, place)}
+
+
+def _may_be(view: View, place: ProxyPlace) -> bool:
+    return place.of in view.rosproxies and place.node in view.observed.nodes
+
+
+def _recent(view: View, moves: Mapping[ProxyPlace, Move], since: float) -> dict[ProxyPlace, Move]:
+    return {p: move for p, move in moves.items() if move.at > since and p in view.wanted}
+
+
+def _refused(
+    view: View,
+    served: Mapping[ProxyPlace, PortRange],
+    since: Mapping[ProxyPlace, float],
+    now: float,
+) -> tuple[dict[ProxyPlace, float], set[tuple[str, int]]]:
+    """Who waits for his ports since when, and the ports by node that nobody gets.
+
+    A proxy whose ports another one of the operator's still holds, while it ends, has only to wait.
+    """
+    waiting = {place: at for place, at in since.items() if not _is_back(view, place)}
+    taken: set[tuple[str, int]] = set()
+    stuck = (one for one in view.observed.proxies if one.stuck is Stuck.PORTS)
+    for proxy in (one for one in stuck if not one.pod.deleting):
+        place = place_of(proxy)
+        others = [one.pod for one in view.on(proxy.on) if place_of(one) != place]
+        ends = any(o.pod.deleting and overlap(o.range, proxy.range) for o in view.on(proxy.on))
+        if place not in view.wanted or ends:
+            continue
+        before = served.get(place)
+        began = waiting.get(place, now)
+        if before is not None and overlap(before, proxy.range) and now - began < RETRY_FOR:
+            waiting[place] = began
+            continue
+        waiting.pop(place, None)
+        held = ports_held((*view.strangers.get(proxy.on, ()), *others))
+        hit = held.intersection(proxy.range.ports())
+        if not held & proxy.pod.host_ports:
+            hit = set(proxy.range.ports())
+        taken |= {(proxy.on, port) for port in hit}
+    return waiting, taken
+
+
+def ports_held(pods: Iterable[Pod]) -> set[int]:
+    """The hostPorts of pods."""
+    return {port for pod in pods for port in pod.host_ports}
+
+
+def _is_back(view: View, place: ProxyPlace) -> bool:
+    proxy: ProxyPod | None = view.current(place)
+    return place not in view.wanted or (proxy is not None and has_ports(proxy))
+
+
+def _left(
+    before: Mapping[ProxyPlace, PortRange], ranges: Mapping[ProxyPlace, PortRange], now: float
+) -> dict[ProxyPlace, Move]:
+    return {
+        place: Move(ports, now)
+        for place, ports in before.items()
+        if not _is_kept(ports, ranges[place])
+    }
+
+
+def _is_kept(before: PortRange, ports: PortRange) -> bool:
+    """Whether ports were at most added or taken off."""
+    return within(before, ports) or within(ports, before)

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from typing import TypeGuard
 
 from rosproxy.telemetry.text import clean, shorten
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.text import bounded
+from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.kubernetes.planner.conditions import (
     DEGRADED,
     READY,
-    Verdict,
+    Condition,
     conditions,
     serving,
     told,
@@ -17,12 +16,12 @@ from rosproxy_operator.kubernetes.planner.conditions import (
 )
 from rosproxy_operator.kubernetes.planner.findings import findings, invalid_finding, of_node
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
     InvalidRosProxy,
     Json,
     NodeState,
+    ProxyReport,
+    ProxyService,
     RosProxy,
-    Service,
 )
 from rosproxy_operator.kubernetes.planner.names import master_uri
 from rosproxy_operator.kubernetes.planner.values import number, parts, word
@@ -44,7 +43,7 @@ def status_of(
     rosproxy: RosProxy,
     states: tuple[NodeState, ...],
     problems: tuple[Problem, ...],
-    service: Service | None,
+    service: ProxyService | None,
     master: str,
     stamp: str,
 ) -> Json:
@@ -90,9 +89,9 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     """
     former, text = rosproxy.status, rosproxy.text
     judged = [
-        Verdict(READY, "False", _INVALID, text),
+        Condition(READY, "False", _INVALID, text),
         *(_same(one) for one in parts(former, "conditions") if one.get("type") not in _OVERRULED),
-        Verdict(DEGRADED, "True", _INVALID, text),
+        Condition(DEGRADED, "True", _INVALID, text),
     ]
     return {
         **former,
@@ -104,8 +103,8 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
 _OVERRULED = (READY, DEGRADED)
 
 
-def _same(was: Json) -> Verdict:
-    return Verdict(*(word(was, key) for key in ("type", "status", "reason", "message")))
+def _same(was: Json) -> Condition:
+    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
 
 
 def _told(states: Sequence[NodeState]) -> list[NodeState]:
@@ -144,7 +143,7 @@ def _ros(state: NodeState, most: int, former: Json) -> dict[str, object]:
     }
 
 
-def _heard(answer: Answer | None) -> TypeGuard[Answer]:
+def _heard(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
     return answer is not None and answer.answered
 
 
@@ -167,7 +166,7 @@ def _ports(states: Sequence[NodeState]) -> str:
     return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(given.items())), _PORTS)
 
 
-def _master_uri(service: Service | None, former: Json) -> str:
+def _master_uri(service: ProxyService | None, former: Json) -> str:
     """The former one as long as there is no Service: it is to be had again."""
     return (
         master_uri(service.cluster_ip)

@@ -14,7 +14,7 @@ _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-
 _QUALIFIED = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
 
 
-class Unusable(Exception):
+class InvalidField(Exception):
     """Why an object can't be used: which field, what is wrong, and what to do."""
 
 
@@ -102,9 +102,9 @@ class Field:
         """Whether it is there."""
         return self.value is not None
 
-    def wrong(self, what: str, fix: str) -> Unusable:
+    def wrong(self, what: str, fix: str) -> InvalidField:
         """The error to raise for this field."""
-        return Unusable(f"{self.path}: {quoted(self.value)} {what}: {fix}")
+        return InvalidField(f"{self.path}: {quoted(self.value)} {what}: {fix}")
 
     def child(self, name: str) -> "Field":
         """A field of the map that this one is."""

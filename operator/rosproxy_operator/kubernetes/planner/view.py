@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from rosproxy_operator.kubernetes.planner.model import (
-    Finding,
+    ClusterFinding,
+    ClusterSnapshot,
     Name,
-    Observed,
     Pod,
+    ProxyPlace,
     ProxyPod,
     Reference,
     RosProxy,
@@ -17,7 +18,6 @@ from rosproxy_operator.kubernetes.planner.model import (
 )
 from rosproxy_operator.kubernetes.planner.names import KIND, is_own, proxy_id
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
-from rosproxy_operator.kubernetes.planner.state import Place
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -27,7 +27,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """An `Observed` by RosProxy and by node.
+    """An `ClusterSnapshot` by RosProxy and by node.
 
     ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of
     them, ``orphans`` those of RosProxies that are gone. ``wanted`` are the places where pods want a
@@ -36,22 +36,22 @@ class View:
     pods.
     """
 
-    observed: Observed
+    observed: ClusterSnapshot
     rosproxies: Mapping[Name, RosProxy]
-    proxies: Mapping[Place, tuple[ProxyPod, ...]]
+    proxies: Mapping[ProxyPlace, tuple[ProxyPod, ...]]
     orphans: tuple[ProxyPod, ...]
-    wanted: Mapping[Place, tuple[Pod, ...]]
+    wanted: Mapping[ProxyPlace, tuple[Pod, ...]]
     taken: Mapping[Name, tuple[Pod, ...]]
     strangers: Mapping[str, tuple[Pod, ...]]
-    findings: tuple[Finding, ...]
+    findings: tuple[ClusterFinding, ...]
     _by_node: Mapping[str, tuple[ProxyPod, ...]] = field(default_factory=dict)
 
-    def current(self, place: Place) -> ProxyPod | None:
+    def current(self, place: ProxyPlace) -> ProxyPod | None:
         """The proxy of a place, as long as it is not being deleted."""
         named = (one for one in self.proxies.get(place, ()) if is_current(one))
         return next(named, None)
 
-    def misplaced(self, place: Place) -> tuple[ProxyPod, ...]:
+    def misplaced(self, place: ProxyPlace) -> tuple[ProxyPod, ...]:
         """Other pods of a place, under names that a proxy does not have (any more)."""
         own = self.proxies.get(place, ())
         return tuple(one for one in own if one.pod.id != proxy_id(place.of, place.node))
@@ -60,7 +60,7 @@ class View:
         """All proxies that are meant for a node, whosever they are, as long as they hold ports."""
         return self._by_node.get(node, ())
 
-    def places(self) -> set[Place]:
+    def places(self) -> set[ProxyPlace]:
         """All places where a proxy is wanted or there."""
         return set(self.wanted) | set(self.proxies)
 
@@ -70,9 +70,9 @@ def is_current(proxy: ProxyPod) -> bool:
     return not proxy.pod.deleting and proxy.pod.id == proxy_id(proxy.of, proxy.on)
 
 
-def place_of(proxy: ProxyPod) -> Place:
+def place_of(proxy: ProxyPod) -> ProxyPlace:
     """The place that a proxy is meant for."""
-    return Place(proxy.of, proxy.on)
+    return ProxyPlace(proxy.of, proxy.on)
 
 
 def serves(proxy: ProxyPod) -> bool:
@@ -86,7 +86,7 @@ def has_ports(proxy: ProxyPod) -> bool:
     return bool(proxy.pod.node) and not proxy.pod.ended and proxy.stuck is not Stuck.PORTS
 
 
-def view(observed: Observed) -> View:
+def view(observed: ClusterSnapshot) -> View:
     """Put in order what is seen."""
     rosproxies = {one.id: one for one in observed.rosproxies if not one.deleting}
     uids = {one.uid: one.id for one in rosproxies.values()}
@@ -116,30 +116,30 @@ def short(texts: Iterable[str]) -> str:
 
 
 def _choose(
-    observed: Observed, rosproxies: Mapping[Name, RosProxy]
-) -> tuple[dict[Place, tuple[Pod, ...]], dict[Name, tuple[Pod, ...]], list[Finding]]:
+    observed: ClusterSnapshot, rosproxies: Mapping[Name, RosProxy]
+) -> tuple[dict[ProxyPlace, tuple[Pod, ...]], dict[Name, tuple[Pod, ...]], list[ClusterFinding]]:
     """Who is wanted where, who has taken which pods, and what is wrong with that."""
     taken: list[tuple[Name, Pod]] = []
-    findings: list[Finding] = []
+    findings: list[ClusterFinding] = []
     for pod in observed.pods:
         if not (pod.ended or pod.deleting or is_own(pod.labels)):
             choice = chosen(pod, rosproxies.values())
             taken += [(choice.rosproxy.id, pod)] if choice.rosproxy else []
             findings += [choice.finding] if choice.finding else []
-    wanted: list[tuple[Place, Pod]] = []
-    left_out: list[tuple[Place, Pod]] = []
+    wanted: list[tuple[ProxyPlace, Pod]] = []
+    left_out: list[tuple[ProxyPlace, Pod]] = []
     for of, pod in taken:
         node = observed.nodes.get(pod.node)
         if node is not None and not node.deleting:
             fits = on_node(rosproxies[of], node)
-            (wanted if fits else left_out).append((Place(of, pod.node), pod))
+            (wanted if fits else left_out).append((ProxyPlace(of, pod.node), pod))
     findings += _left_out(rosproxies, _grouped(left_out))
     return _grouped(wanted), _grouped(taken), findings
 
 
 def _left_out(
-    rosproxies: Mapping[Name, RosProxy], pods: Mapping[Place, tuple[Pod, ...]]
-) -> Iterator[Finding]:
+    rosproxies: Mapping[Name, RosProxy], pods: Mapping[ProxyPlace, tuple[Pod, ...]]
+) -> Iterator[ClusterFinding]:
     for place, some in sorted(pods.items()):
         of = rosproxies[place.of]
         yield finding(
@@ -151,9 +151,9 @@ def _left_out(
         )
 
 
-def finding(of: RosProxy, reason: str, text: str) -> Finding:
+def finding(of: RosProxy, reason: str, text: str) -> ClusterFinding:
     """Something about a RosProxy that keeps nothing else from being done."""
-    return Finding(
+    return ClusterFinding(
         subject=f"rosproxy {of.id}",
         text=text,
         fatal=False,
@@ -163,7 +163,7 @@ def finding(of: RosProxy, reason: str, text: str) -> Finding:
     )
 
 
-def _strangers(observed: Observed) -> dict[str, tuple[Pod, ...]]:
+def _strangers(observed: ClusterSnapshot) -> dict[str, tuple[Pod, ...]]:
     own = {one.pod.uid for one in observed.proxies}
     others = {pod.uid: pod for pod in observed.pods if pod.uid not in own}
     holding = (pod for pod in others.values() if pod.node and pod.host_ports and not pod.ended)

@@ -25,12 +25,12 @@ CERTIFICATE, KEY, CA = "tls.crt", "tls.key", "ca.crt"
 """Keys of the Secret; ``ca.crt`` also has the CAs before, as long as they are valid."""
 
 
-class Unfit(Exception):
+class InvalidCertificate(Exception):
     """What was found is no certificate with its key; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class KeyPair:
     """A certificate with its key, and the CAs by which it is trusted, all as PEM.
 
     ``ca`` is empty where that is somebody else's affair.
@@ -75,7 +75,9 @@ def service_names(namespace: str, name: str) -> list[str]:
     ]
 
 
-def make(names: Iterable[str], now: datetime, before: bytes = b"", life: timedelta = LIFE) -> Pair:
+def make(
+    names: Iterable[str], now: datetime, before: bytes = b"", life: timedelta = LIFE
+) -> KeyPair:
     """A new certificate for DNS names, with a new CA.
 
     ``before`` are the CAs until now: those that are valid stay trusted for the time in which the
@@ -107,34 +109,34 @@ def make(names: Iterable[str], now: datetime, before: bytes = b"", life: timedel
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    return Pair(_pem(certificate), private, _pem(ca) + still_valid(before, now))
+    return KeyPair(_pem(certificate), private, _pem(ca) + still_valid(before, now))
 
 
-def read(data: Mapping[str, object]) -> Pair:
+def read(data: Mapping[str, object]) -> KeyPair:
     """A pair from the ``data`` of a Secret. Raises Unfit."""
     try:
         found = [
             base64.b64decode(str(data[name]), validate=True) for name in (CERTIFICATE, KEY, CA)
         ]
     except KeyError as error:
-        raise Unfit(f"it has no {error.args[0]}") from None
+        raise InvalidCertificate(f"it has no {error.args[0]}") from None
     except ValueError:
-        raise Unfit("it is no base64") from None
-    return checked(Pair(*found))
+        raise InvalidCertificate("it is no base64") from None
+    return checked(KeyPair(*found))
 
 
-def checked(pair: Pair) -> Pair:
+def checked(pair: KeyPair) -> KeyPair:
     """The same pair, if it is one that can be served. Raises Unfit."""
     try:
         load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), pair)
         x509.load_pem_x509_certificate(pair.certificate)
         x509.load_pem_x509_certificates(pair.ca) if pair.ca else None
     except (ssl.SSLError, ValueError) as error:
-        raise Unfit(f"certificate and key can't be used: {error}") from None
+        raise InvalidCertificate(f"certificate and key can't be used: {error}") from None
     return pair
 
 
-def load(context: ssl.SSLContext, pair: Pair) -> None:
+def load(context: ssl.SSLContext, pair: KeyPair) -> None:
     """Let a context serve a pair from its next connection on. Raises ssl.SSLError.
 
     Python's ssl reads keys from files alone; this one is only in memory.

@@ -1,33 +1,37 @@
-"""A pod at admission: which RosProxy is its, and what it needs to find the proxy on its node.
+"""Wires a pod, as the API server is about to create it, to the proxy of its node.
 
-Whatever goes wrong, the pod is admitted; a warning says what is amiss and what to do.
+A pod with the label rosproxy.io/inject comes here from kopf (`handlers`). The RosProxies of its
+namespace and their Service are read as they are at this moment; the planner says which RosProxy
+takes the pod and what it needs. Nothing is written: the Service is the controller's alone to make,
+which knows its address, its owner and what to do when it is refused. Where it is not there yet,
+since pod and RosProxy were created together, the controller is woken and the pod waits. Whatever
+goes wrong, the pod is admitted; a warning says what is amiss and what to do.
 """
 
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, Found
-from rosproxy_operator.kubernetes.apply import create_service
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
-from rosproxy_operator.kubernetes.planner.manifests import service as service_body
 from rosproxy_operator.kubernetes.planner.model import Json, Pod, RosProxy
 from rosproxy_operator.kubernetes.planner.names import master_uri, service_id
 from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
-from rosproxy_operator.kubernetes.planner.spec import Unusable, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import InvalidField, rosproxy
 
 log = logging.getLogger(__name__)
 
 LONGEST = 4.0
 """Seconds until a pod is admitted as it is: less than the API server waits for the webhook."""
-AGAIN = 0.3
-"""Seconds until an API server is asked again that did not answer."""
+AGAIN = 0.2
+"""Seconds until the API server is asked again that did not answer, or has no Service yet."""
 YOUNG = 3.0
 """Seconds for which a Service may not be known on all nodes (kube-proxy gathers changes for 1 s).
 
@@ -43,41 +47,54 @@ class NotWired(Exception):
     """A pod can't be wired; the message says why and what to do."""
 
 
-class Injector:
-    """Wires pods, asking the API server for the RosProxies and the Service as they are now."""
+class NoService(NotWired):
+    """It can't be wired yet: its RosProxy has no Service, which the controller is about to make."""
 
-    def __init__(self, api: Api, metrics: ClusterMetrics) -> None:
-        self._api, self._metrics = api, metrics
+
+class Injector:
+    """Wires pods. ``wake`` lets the controller look at the cluster soon."""
+
+    def __init__(self, api: Api, metrics: ClusterMetrics, wake: Callable[[], None]) -> None:
+        self._api, self._metrics, self._wake = api, metrics, wake
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
-        """What a pod needs. Never raises. On a ``dry_run`` nothing is created."""
+        """What a pod needs. Never raises. A ``dry_run`` does not wait for a Service."""
         until = time.monotonic() + LONGEST
         try:
-            async with asyncio.timeout(LONGEST):
-                found, hold = await self._patiently(body, dry_run)
+            found, hold = await self._patiently(body, dry_run, until)
             await asyncio.sleep(min(hold, until - time.monotonic()))
             self._metrics.admissions.labels("wired" if found.spec is not None else "left").inc()
             return found
         except (ApiError, NotWired) as error:
             text = str(error)
-        except TimeoutError:
-            text = f"the API server did not answer within {LONGEST:g} s; create the pod anew"
         except Exception as error:
             log.exception("a pod could not be wired")
-            text = f"the controller failed: {error!r}"
+            text = f"the operator failed: {error!r}"
         self._metrics.admissions.labels("failed").inc()
         log.warning("a pod at admission: %s", text)
         return Wiring(warnings=(NOT_WIRED + text,))
 
-    async def _patiently(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
-        """What a pod needs, also from an API server that is just starting; and how long to wait."""
+    async def _patiently(self, body: Json, dry_run: bool, until: float) -> tuple[Wiring, float]:
+        """What a pod needs, and how long to wait then.
+
+        Also from an API server that is just starting, and before the Service is there.
+        """
+        missing = f"the API server did not answer within {LONGEST:g} s; create the pod anew"
         while True:
             try:
-                return await in_thread(self._wiring, body, dry_run)
+                async with asyncio.timeout(until - time.monotonic()):
+                    return await in_thread(self._wiring, body, dry_run)
             except ApiError as error:
-                if error.kind is not Kind.AWAY:
+                if error.kind is not ErrorKind.AWAY:
                     raise
                 log.debug("a pod at admission: %s; trying again", error)
+            except NoService as error:
+                if dry_run:
+                    raise
+                missing = str(error)
+                self._wake()
+            except TimeoutError:
+                raise NotWired(missing) from None
             await asyncio.sleep(AGAIN)
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
@@ -100,38 +117,34 @@ class Injector:
         for found in self._api.rosproxies(namespace, SOON):
             try:
                 usable.append(rosproxy(found))
-            except Unusable as error:
+            except InvalidField as error:
                 unusable.append(f"RosProxy {found['metadata']['name']}: {error}")
         return [each for each in usable if not each.deleting], unusable
 
     def _address(self, of: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
 
-        The Service is created if need be.
+        Raises NotWired.
         """
-        address, hold = self._service(of)
-        if not address and not dry_run:
-            create_service(self._api, service_body(of, of.cluster_ip), SOON)
-            address, hold = self._service(of)
-        address = address or (of.cluster_ip if dry_run else "")
-        if not address:
-            raise NotWired(f"the Service {service_id(of.id)} has no cluster IP yet")
-        return address, 0.0 if dry_run else hold
-
-    def _service(self, of: RosProxy) -> tuple[str, float]:
+        id = service_id(of.id)
+        missing = NoService(
+            f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
+            f"{of.id.name} says why; create the pod anew then"
+        )
         try:
-            there = self._api.get("services", service_id(of.id), SOON)
+            there = self._api.get("services", id, SOON)
         except ApiError as error:
-            if error.kind is Kind.GONE:
-                return "", 0.0
-            raise
+            if error.kind is not ErrorKind.GONE:
+                raise
+            if dry_run and of.cluster_ip:
+                return of.cluster_ip, 0.0
+            raise missing from None
         found = parse_service(there)
         if found is None:
-            raise NotWired(
-                f"the Service {service_id(of.id)} is not the controller's: delete or rename it"
-            )
-        fits = found.owner == of.uid and not found.deleting
-        return (found.cluster_ip, _until_known(there, time.time())) if fits else ("", 0.0)
+            raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
+        if found.owner != of.uid or found.deleting or not found.cluster_ip:
+            raise missing
+        return found.cluster_ip, 0.0 if dry_run else _until_known(there, time.time())
 
 
 def _until_known(service: Found, now: float) -> float:

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Protocol
 
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.problem_log import ProblemLog
+from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
-from rosproxy_operator.kubernetes.webhook.certificates import Pair, Unfit
-from rosproxy_operator.settings import WebhookSettings
+from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +29,20 @@ OVERLAP = 10.0
 _SUBJECT = "webhook"
 
 
-class Source(Protocol):
+class CertificateSource(Protocol):
     """Where the certificate comes from."""
 
     every: float
 
-    def refresh(self) -> Pair:
+    def refresh(self) -> KeyPair:
         """The certificate to serve by now. May take long. Raises Unfit and ApiError."""
 
 
 class CertificateRotation:
     """Holds the certificate that is to be served. `pair` may be read from any thread."""
 
-    def __init__(self, source: Source, metrics: ClusterMetrics) -> None:
-        self.pair: Pair | None = None
+    def __init__(self, source: CertificateSource, metrics: ClusterMetrics) -> None:
+        self.pair: KeyPair | None = None
         self._source, self._metrics = source, metrics
         self._log = ProblemLog()
 
@@ -58,7 +57,7 @@ class CertificateRotation:
         problems = []
         try:
             pair = await in_thread(self._source.refresh)
-        except (ApiError, Unfit) as error:
+        except (ApiError, InvalidCertificate) as error:
             problems.append(Problem(_SUBJECT, f"no certificate: {error}"))
         except Exception as error:  # a mistake of ours must not end the certificate
             log.exception("checking the webhook's certificate failed; going on")
@@ -72,7 +71,7 @@ class CertificateRotation:
         self._log.update(problems)
 
 
-class Directory:
+class CertificateDirectory:
     """A certificate that somebody else renews, cert-manager for one, as a mounted Secret."""
 
     every = EVERY_DIRECTORY
@@ -80,7 +79,7 @@ class Directory:
     def __init__(self, directory: str) -> None:
         self._directory = Path(directory)
 
-    def refresh(self) -> Pair:
+    def refresh(self) -> KeyPair:
         """What is there now. Raises Unfit."""
         try:
             found = [
@@ -88,11 +87,13 @@ class Directory:
                 for name in (certificates.CERTIFICATE, certificates.KEY)
             ]
         except OSError as error:
-            raise Unfit(f"--webhook-cert-dir: {error.filename}: {error.strerror}") from None
+            raise InvalidCertificate(
+                f"--webhook-cert-dir: {error.filename}: {error.strerror}"
+            ) from None
         try:
-            return certificates.checked(Pair(*found))
-        except Unfit as error:
-            raise Unfit(f"--webhook-cert-dir {self._directory}: {error}") from None
+            return certificates.checked(KeyPair(*found))
+        except InvalidCertificate as error:
+            raise InvalidCertificate(f"--webhook-cert-dir {self._directory}: {error}") from None
 
 
 class SelfSigned:
@@ -114,12 +115,12 @@ class SelfSigned:
     ) -> None:
         self._api, self._names, self._now = api, names, now
         self._secret, self._configuration = secret, configuration
-        self._pair: Pair | None = None
-        self._serving: Pair | None = None
+        self._pair: KeyPair | None = None
+        self._serving: KeyPair | None = None
         self._trusted_at: datetime | None = None
         self.problems: list[Problem] = []
 
-    def refresh(self) -> Pair:
+    def refresh(self) -> KeyPair:
         """Renew it if it is due, and see to it that its CA is trusted. Raises ApiError."""
         self.problems = []
         self._pair = self._kept()
@@ -135,14 +136,14 @@ class SelfSigned:
         self._trusted_at = self._trusted_at or self._now()
         return (self._now() - self._trusted_at).total_seconds() >= OVERLAP
 
-    def _kept(self) -> Pair:
+    def _kept(self) -> KeyPair:
         """The pair in the Secret, or a new one that is put there."""
         if self._secret is None:
             return self._usable(self._pair) or self._new(self._pair)
         try:
             there = self._api.get("secrets", self._secret)
         except ApiError as error:
-            if self._pair is None and error.kind is Kind.AWAY:
+            if self._pair is None and error.kind is ErrorKind.AWAY:
                 raise
             self._complain(error)
             return self._usable(self._pair) or self._new(self._pair)
@@ -151,13 +152,13 @@ class SelfSigned:
             return usable
         return self._put(self._new(found or self._pair), self._secret, there)
 
-    def _put(self, pair: Pair, secret: Name, there: Found) -> Pair:
+    def _put(self, pair: KeyPair, secret: Name, there: Found) -> KeyPair:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
             self._api.patch("secrets", secret, secret_patch(pair, there))
         except ApiError as error:
-            if error.kind in (Kind.INVALID, Kind.CONFLICT):
-                raise ApiError(Kind.AWAY, f"somebody else writes {secret}: {error}") from None
+            if error.kind in (ErrorKind.INVALID, ErrorKind.CONFLICT):
+                raise ApiError(ErrorKind.AWAY, f"somebody else writes {secret}: {error}") from None
             self._complain(error)
         log.info("webhook: made a certificate that is valid until %s", pair.expires)
         return pair
@@ -167,33 +168,33 @@ class SelfSigned:
 
         That the API server is away the controller's looks tell.
         """
-        if error.kind is Kind.AWAY:
+        if error.kind is ErrorKind.AWAY:
             return
         text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
-        if error.kind is Kind.GONE:
+        if error.kind is ErrorKind.GONE:
             text += "; create an empty Secret of this name (the chart does)"
         self.problems.append(Problem(_SUBJECT, text))
 
-    def _read(self, secret: Found) -> Pair | None:
+    def _read(self, secret: Found) -> KeyPair | None:
         data = secret.get("data")
         if not isinstance(data, dict) or not data.get(certificates.KEY):
             return None
         try:
             return certificates.read(data)
-        except Unfit as error:
+        except InvalidCertificate as error:
             log.warning("webhook: Secret %s: %s; making another one", self._secret, error)
             return None
 
-    def _usable(self, pair: Pair | None) -> Pair | None:
+    def _usable(self, pair: KeyPair | None) -> KeyPair | None:
         """The pair, if it is for our names and has not lived too long."""
         if pair is None or pair.due(self._now()) or not pair.names() >= set(self._names):
             return None
         return pair
 
-    def _new(self, before: Pair | None) -> Pair:
+    def _new(self, before: KeyPair | None) -> KeyPair:
         return certificates.make(self._names, self._now(), before.ca if before else b"")
 
-    def _is_expired(self, pair: Pair) -> bool:
+    def _is_expired(self, pair: KeyPair) -> bool:
         return pair.expires <= self._now()
 
     def _trust(self, authorities: bytes) -> bool:
@@ -208,23 +209,23 @@ class SelfSigned:
                 log.info("webhook: its CA is now in %s", self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
-            if error.kind is Kind.GONE:
+            if error.kind is ErrorKind.GONE:
                 text += "; without it no pod is wired: install it anew (the chart has it)"
-            if error.kind is not Kind.AWAY:
+            if error.kind is not ErrorKind.AWAY:
                 self.problems.append(Problem(_SUBJECT, text))
             return False
         return True
 
 
-def source(api: Api, settings: WebhookSettings) -> Source:
+def source(api: Api, settings: WebhookSettings) -> CertificateSource:
     """Where the certificate comes from, by the settings."""
     if settings.directory or settings.service is None:
-        return Directory(settings.directory)
+        return CertificateDirectory(settings.directory)
     names = certificates.service_names(settings.service.namespace, settings.service.name)
     return SelfSigned(api, names, settings.secret, settings.configuration)
 
 
-def secret_patch(pair: Pair, there: Found) -> list[Json]:
+def secret_patch(pair: KeyPair, there: Found) -> list[Json]:
     """The JSON patch that puts a pair into a Secret, if it is as it was when it was read."""
     version = there.get("metadata", {}).get("resourceVersion")
     return [

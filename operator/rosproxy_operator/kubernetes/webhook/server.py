@@ -16,7 +16,7 @@ from aiohttp import web
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.kubernetes.webhook import certificates
-from rosproxy_operator.kubernetes.webhook.certificates import Pair
+from rosproxy_operator.kubernetes.webhook.certificates import KeyPair
 from rosproxy_operator.kubernetes.webhook.injector import NOT_WIRED
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation
 
@@ -37,14 +37,14 @@ class WebhookServer:
     in the midst of one. Connections that stand go on.
     """
 
-    def __init__(self, bind: HostPort, keeper: CertificateRotation) -> None:
-        self._bind, self._keeper = bind, keeper
+    def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
+        self._bind, self._rotation = bind, rotation
 
     async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
         """Serve until cancelled."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
-        while (pair := self._keeper.pair) is None:  # noqa: ASYNC110 - set in another thread
+        while (pair := self._rotation.pair) is None:  # noqa: ASYNC110 - set in another thread
             await asyncio.sleep(CHECK)
         certificates.load(context, pair)
         runner = web.AppRunner(_application(fn), access_log=None, shutdown_timeout=ENDING)
@@ -58,11 +58,11 @@ class WebhookServer:
         finally:
             await runner.cleanup()
 
-    async def _keep(self, context: ssl.SSLContext, served: Pair) -> None:
+    async def _keep(self, context: ssl.SSLContext, served: KeyPair) -> None:
         """Serve another certificate as soon as there is one."""
         while True:
             await asyncio.sleep(CHECK)
-            pair = self._keeper.pair
+            pair = self._rotation.pair
             if pair is not None and pair != served:
                 try:
                     certificates.load(context, pair)

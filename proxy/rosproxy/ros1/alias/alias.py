@@ -1,7 +1,12 @@
-"""Ports that stand in for nodes on the master's host, for inside only (see `core.mirror`).
+"""Ports that stand in for those of nodes on the master's host, for inside nodes only.
 
-They are there only while the master's address is given (``--master-address``), which is what says
-that its name may lead to the proxy.
+Where the master's name leads to the proxy (see `policy`), a port is opened right before an inside
+node is given a URI that needs it (`Alias.listen_for`), and closed when the node behind it refuses,
+since a dead node must look dead. Slave API calls are forwarded to the node, TCPROS connections of
+services relayed as they are; topics flow directly, to the address in the node's own reply.
+
+All of this is done only while the master's address is given (``--master-address``), which is what
+says that its name may lead to the proxy.
 """
 
 import asyncio
@@ -20,16 +25,16 @@ from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.dialing import dial
 from rosproxy.net.http_server import Call, XmlRpcServer
 from rosproxy.net.interfaces import address_towards
-from rosproxy.ros1.alias import policy as core
+from rosproxy.ros1.alias import policy
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.telemetry.problems import Problem
 
 log = logging.getLogger(__name__)
 
 MOST_PORTS = 1024
+"""How many ports stand in for nodes at most, and how many that refused are remembered."""
 CONNECT_TIMEOUT = 2.0
 TIDY_INTERVAL = 30.0
 SERVICE_PROBLEM = 600.0
@@ -43,49 +48,54 @@ class Alias:
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._host = core.mirrored_host(context.settings.master_uri)
+        self._name = policy.aliased_host(context.settings.master_uri)
         self._acceptors: dict[int, Acceptor] = {}
         self._used: dict[int, float] = {}
-        self._gone: OrderedDict[int, None] = OrderedDict()
+        self._refused: OrderedDict[int, None] = OrderedDict()
         self._relays = OpenRelays()
-        self._server = XmlRpcServer(self._call, "rosproxy: a ROS node on the master's host\n")
+        self._server = XmlRpcServer(self._forward, "rosproxy: a ROS node on the master's host\n")
         self._closed = False
 
-    async def hand_over(self, uris: Iterable[str]) -> None:
+    def __len__(self) -> int:
+        """How many ports stand in for nodes."""
+        return len(self._acceptors)
+
+    async def listen_for(self, uris: Iterable[str]) -> None:
         """Have the ports listen that these URIs lead to, before an inside node is given them."""
         address = self._context.upstream.master_address
-        if self._host is None or address is None or self._closed:
+        if self._name is None or address is None or self._closed:
             return
-        wanted = core.to_mirror(uris, self._host, self._context.addressing)
-        await asyncio.gather(*(self._look_again(port) for port in wanted if port in self._gone))
+        wanted = policy.ports_needed(uris, self._name, self._context.addressing)
+        await asyncio.gather(*(self._try_again(port) for port in wanted if port in self._refused))
         for port, uri in wanted.items():
-            if port not in self._gone:
-                self._stand_in(port, uri, address)
+            if port not in self._refused:
+                self._listen(port, uri, address)
 
-    def toward_inside(self, body: bytes, call: xmlrpc.Call) -> bytes:
+    def import_call(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
         address = self._context.upstream.master_address
-        if self._host is None or address is None:
+        if self._name is None or address is None:
             return body
-        return core.direct_call(call, body, self._host, address)
+        return policy.direct_call(call, body, self._name, address)
 
     async def tidy(self) -> None:
-        """Forget the problems of nodes that have ended, and of services not looked up any more."""
-        if self._host is None or self._context.upstream.master_address is None:
+        """Forget the problems of nodes that have ended, and of services not looked up any more.
+
+        rospy complains of connections to a service's port that say nothing: none is made.
+        """
+        if self._name is None or self._context.upstream.master_address is None:
             return
         for problem in self._context.problems.all():
-            ports = core.to_mirror([problem.subject], self._host, self._context.addressing)
-            if ports and await self._is_over(problem, *ports):
-                self._context.problems.solved(problem.subject)
+            uri = problem.subject
+            for port in policy.ports_needed([uri], self._name, self._context.addressing):
+                old = time.time() - problem.when > SERVICE_PROBLEM
+                if old if policy.is_service(uri) else await self._refuses(port):
+                    self._context.problems.solved(uri)
 
     def status(self) -> list[dict[str, Any]]:
-        """The mirrored ports with their open connections, for ``/status``."""
+        """The ports with their open connections, for ``/status``."""
         counts = self._connections()
         return [{"port": port, "connections": counts[port]} for port in sorted(self._acceptors)]
-
-    def __len__(self) -> int:
-        """How many ports are mirrored."""
-        return len(self._acceptors)
 
     def close(self) -> None:
         """Stop listening, for good."""
@@ -97,36 +107,32 @@ class Alias:
         """End all connections."""
         await asyncio.gather(self._relays.stop(), self._server.close())
 
-    def _stand_in(self, port: int, uri: str, address: str) -> None:
+    def _listen(self, port: int, uri: str, address: str) -> None:
+        """Let a port listen that a URI needs, or report why it can't."""
         if port not in self._acceptors:
-            why = core.obstacle(port, self._context.settings) or self._open(port)
+            why = policy.obstacle(port, self._context.settings) or self._open(port)
             if why is not None:
-                self._report(uri, core.advice(port, why, address))
+                self._report(uri, policy.advice(port, why, address))
                 return
             self._context.problems.solved(uri)
         self._used[port] = self._context.now()
 
     def _open(self, port: int) -> str | None:
-        """Let a port listen; the reason if it can't."""
-        if not self._make_room():
-            return f"is one too many: {MOST_PORTS} others stand in for nodes and are in use"
+        """Open a port; the reason if that can't be done."""
+        if len(self._acceptors) >= MOST_PORTS:
+            oldest = policy.least_used(self._used, +self._connections())
+            if oldest is None:
+                return f"is one too many: {MOST_PORTS} others stand in for nodes and are in use"
+            self._close(oldest)
         try:
             sock = listeners.listen(self._context.settings.bind, port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
         self._acceptors[port] = Acceptor(
-            self._context.tasks, sock, lambda conn, peer: self._connection(port, conn, peer)
+            self._context.tasks, sock, lambda conn, peer: self._serve(port, conn, peer)
         )
-        log.debug("port %d stands in for that of %s", port, self._host)
+        log.debug("port %d stands in for that of %s", port, self._name)
         return None
-
-    def _make_room(self) -> bool:
-        if len(self._acceptors) < MOST_PORTS:
-            return True
-        oldest = core.least_used(self._used, +self._connections())
-        if oldest is not None:
-            self._close(oldest)
-        return oldest is not None
 
     def _close(self, port: int) -> None:
         """Let a port refuse; relays that are open stay."""
@@ -137,17 +143,17 @@ class Alias:
             acceptor.sock.close()
             self._server.close_port(port)
 
-    def _leave(self, port: int) -> None:
+    def _note_refused(self, port: int) -> None:
         """A node that refuses has ended: its port refuses as well, until it is found again."""
-        log.debug("port %d of %s refuses; it does so here", port, self._host)
+        log.debug("port %d of %s refuses; it does so here", port, self._name)
         self._close(port)
-        self._gone[port] = None
-        if len(self._gone) > MOST_PORTS:
-            self._gone.popitem(last=False)
+        self._refused[port] = None
+        if len(self._refused) > MOST_PORTS:
+            self._refused.popitem(last=False)
 
-    async def _look_again(self, port: int) -> None:
+    async def _try_again(self, port: int) -> None:
         if not await self._refuses(port):
-            self._gone.pop(port, None)
+            self._refused.pop(port, None)
 
     async def _refuses(self, port: int) -> bool:
         """Whether nobody listens at a port of the master's host."""
@@ -156,17 +162,8 @@ class Alias:
         except ConnectionRefusedError:
             return True
         except OSError as error:
-            log.debug("port %d of %s: %s", port, self._host, error)
+            log.debug("port %d of %s: %s", port, self._name, error)
         return False
-
-    async def _is_over(self, problem: Problem, port: int) -> bool:
-        """Whether a port that could not be mirrored does not matter any more.
-
-        rospy complains of connections to a service's port that say nothing: none is made.
-        """
-        if core.is_service(problem.subject):
-            return time.time() - problem.when > SERVICE_PROBLEM
-        return await self._refuses(port)
 
     def _target(self, port: int) -> HostPort:
         """Where a port of the master's host is. Raises ConnectionRefusedError if that is here."""
@@ -187,15 +184,18 @@ class Alias:
             log.warning("%s: %s", uri, text)
         problems.add(uri, text)
 
-    async def _connection(self, port: int, conn: socket.socket, peer: str) -> None:
+    def _note_used(self, port: int) -> None:
+        if port in self._used:
+            self._used[port] = self._context.now()
+
+    async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
         self._context.refresh_networks()
         if not is_inside(peer, self._context.addressing.networks):
             log.debug("%s is not inside: refused at port %d", peer, port)
             conn.close()
             return
-        if port in self._used:
-            self._used[port] = self._context.now()
+        self._note_used(port)
         first = await first_bytes(conn)
         if len(first) < 4:
             conn.close()
@@ -209,32 +209,28 @@ class Alias:
         try:
             node = await dial(self._target(port), CONNECT_TIMEOUT)
         except OSError as error:
-            log.debug("port %d of %s: %s", port, self._host, error)
+            log.debug("port %d of %s: %s", port, self._name, error)
             reset_on_close(conn)
             conn.close()
             if isinstance(error, ConnectionRefusedError):
-                self._leave(port)
+                self._note_refused(port)
             return
         relay = Relay(port, "service", f"at port {port}", "", peer, outside=node, inside=conn)
         relay.splice = self._context.settings.data_plane != "copy"
-        self._relays.start(relay, self._ended)
+        self._relays.start(relay, lambda ended: self._note_used(ended.port))
 
-    def _ended(self, relay: Relay) -> None:
-        if relay.port in self._used:
-            self._used[relay.port] = self._context.now()
-
-    async def _call(self, call: Call) -> bytes:
+    async def _forward(self, call: Call) -> bytes:
         """A node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
-            raise Unreachable(f"the address of {self._host} leads back to the proxy itself")
+            raise Unreachable(f"the address of {self._name} leads back to the proxy itself")
         parsed = xmlrpc.parse_call(call.body)
-        port, host, upstream = call.local.port, self._host or "", self._context.upstream
+        port, name, upstream = call.local.port, self._name or "", self._context.upstream
         try:
-            reply = await upstream.node(HostPort(host, port), call.body, path=call.path)
+            reply = await upstream.post_to_node(HostPort(name, port), call.body, path=call.path)
         except Unreachable as error:
             self._context.metrics.count("mirror", parsed.method, "unreachable")
             if error.refused:
-                self._leave(port)
+                self._note_refused(port)
             raise
         self._context.metrics.count("mirror", parsed.method, "answered")
-        return core.direct_reply(parsed, reply, host, upstream.master_address or host)
+        return policy.direct_reply(parsed, reply, name, upstream.master_address or name)

@@ -1,4 +1,4 @@
-"""The mirror: ports of the proxy that stand in for nodes on the master's host.
+"""The master's host name as an alias of the proxy: which ports it needs, and what is rewritten.
 
 In a container network the master's host name may lead to the proxy, so that ``ROS_MASTER_URI``
 need not change. Nodes outside that run on the master's host give that very name in their own
@@ -22,7 +22,7 @@ from rosproxy.settings import Settings
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 
 
-def mirrored_host(master_uri: str) -> str | None:
+def aliased_host(master_uri: str) -> str | None:
     """The master's host if it is a name that can lead to the proxy, in lower case."""
     where = parse_slave_uri(master_uri)
     if where is None or is_address(where.host) or is_loopback(where.host):
@@ -30,7 +30,7 @@ def mirrored_host(master_uri: str) -> str | None:
     return where.host.lower()
 
 
-def answered(answer: Answer) -> Iterator[str]:
+def uris_in_answer(answer: Answer) -> Iterator[str]:
     """The URIs that a reply of the master hands to an inside node."""
     for result in answer.results:
         held = result.triple.items[2]
@@ -39,16 +39,16 @@ def answered(answer: Answer) -> Iterator[str]:
             yield from (text for text in texts if text)
 
 
-def announced(call: Call) -> Iterator[str]:
+def announced_publishers(call: Call) -> Iterator[str]:
     """The publishers that a ``publisherUpdate`` names."""
     if call.method == "publisherUpdate" and len(call.params) > 2:
         yield from (text for item in call.params[2].items if (text := item.string()))
 
 
-def to_mirror(uris: Iterable[str], host: str, addressing: Addressing) -> dict[int, str]:
-    """The ports that have to be mirrored, each with a URI that names it.
+def ports_needed(uris: Iterable[str], host: str, addressing: Addressing) -> dict[int, str]:
+    """The ports that have to stand in for those of ``host``, each with a URI that names it.
 
-    An address of the proxy's own is not, even where the proxy is advertised by the same name.
+    An address of the proxy's own is none, even where the proxy is advertised by the same name.
     """
     found: dict[int, str] = {}
     for uri in uris:
@@ -64,7 +64,7 @@ def is_service(uri: str) -> bool:
 
 
 def obstacle(port: int, settings: Settings) -> str | None:
-    """What the proxy itself needs a port for, so that it can't be mirrored; None if nothing."""
+    """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
         return f"lies in --port-range {settings.ports.listen}"
     for option, own in (
@@ -78,7 +78,7 @@ def obstacle(port: int, settings: Settings) -> str | None:
 
 
 def advice(port: int, why: str, address: str) -> str:
-    """What to tell where a port can't be mirrored, and what to do; ``address`` is the master's."""
+    """What is wrong where a port can't stand in, and the cure; ``address`` is the master's."""
     return (
         f"inside nodes can't reach it: port {port} {why}. Start that node with ROS_IP={address}, "
         "so that it gives its address instead of its host name"
@@ -86,7 +86,7 @@ def advice(port: int, why: str, address: str) -> str:
 
 
 def least_used(used: Mapping[int, float], busy: Collection[int]) -> int | None:
-    """The mirrored port to give up first: the one unused for the longest time and not ``busy``.
+    """The port to give up first: the one unused for the longest time and not ``busy``.
 
     ``used`` tells when, in seconds, each was last of use.
     """
@@ -108,7 +108,7 @@ def direct_call(call: Call, body: bytes, host: str, address: str) -> bytes:
 
 
 def direct_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
-    """A node's reply, with the address in place of the mirrored host where a topic is to be had.
+    """A node's reply, with the address in place of the host's name where a topic is to be had.
 
     So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
     """

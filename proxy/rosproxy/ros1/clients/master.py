@@ -1,4 +1,9 @@
-"""XML-RPC calls to the master and to inside nodes."""
+"""XML-RPC calls to the master and to nodes.
+
+``post_to_…`` sends a document as it is and gives the reply's bytes: that is how calls of nodes are
+forwarded. ``call_…`` makes a call of the proxy's own and gives the value of the ROS triple
+``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once.
+"""
 
 import asyncio
 import time
@@ -93,7 +98,7 @@ class MasterClient:
             return HostPort(self.master_address, where.port)
         return where
 
-    async def master(self, body: bytes) -> bytes:
+    async def post_to_master(self, body: bytes) -> bytes:
         """The master's reply to a call. Raises Unreachable.
 
         Kept connections are told apart by address, so a new address means new connections.
@@ -104,14 +109,14 @@ class MasterClient:
         except _FAILURES as error:
             raise _unreachable(f"master {self.master_uri}", error) from error
 
-    async def ask_master(self, method: str, *params: Any) -> Any:
+    async def call_master(self, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
         started = time.monotonic()
-        reply = await self.master(xmlrpc.dump_call(method, CALLER_ID, *params))
+        reply = await self.post_to_master(xmlrpc.dump_call(method, CALLER_ID, *params))
         self._metrics.master_round_trip.observe(time.monotonic() - started)
         return _value(method, _parsed(reply))
 
-    async def batch(self, calls: Sequence[tuple[str, list[Any]]]) -> list[Any]:
+    async def multicall(self, calls: Sequence[tuple[str, list[Any]]]) -> list[Any]:
         """The values of many calls ``(method, params)``, as ``system.multicall``.
 
         ``params`` include the caller_id. A call that failed gives None. Raises Unreachable.
@@ -120,13 +125,13 @@ class MasterClient:
         for start in range(0, len(calls), MULTICALL_SIZE):
             part = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in part]
-            results = _parsed(await self.master(xmlrpc.dump_call("system.multicall", body)))
+            results = _parsed(await self.post_to_master(xmlrpc.dump_call("system.multicall", body)))
             if not isinstance(results, list) or len(results) != len(part):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
-            values += [_batched(result) for result in results]
+            values += [_result_of(result) for result in results]
         return values
 
-    async def node(
+    async def post_to_node(
         self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
     ) -> bytes:
         """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
@@ -135,10 +140,10 @@ class MasterClient:
         except _FAILURES as error:
             raise _unreachable(f"node at {where}", error) from error
 
-    async def ask_node(self, where: HostPort, within: float, method: str, *params: Any) -> Any:
+    async def call_node(self, where: HostPort, within: float, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
-        return _value(method, _parsed(await self.node(where, body, within)))
+        return _value(method, _parsed(await self.post_to_node(where, body, within)))
 
 
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
@@ -174,7 +179,7 @@ def _value(method: str, reply: Any) -> Any:
     raise MasterError(f"{method}: not a ROS status triple")
 
 
-def _batched(result: Any) -> Any:
+def _result_of(result: Any) -> Any:
     triple = result[0] if isinstance(result, list) and len(result) == 1 else None
     if not isinstance(triple, list) or len(triple) != 3 or triple[0] != 1:
         return None

@@ -11,7 +11,7 @@ from rosproxy.ros1.registry.graph import Graph, GraphError, read_state
 async def read_registrations(upstream: MasterClient) -> dict[str, list[Registration]]:
     """What each node has registered. Raises Unreachable, MasterError."""
     state, types = await asyncio.gather(
-        upstream.ask_master("getSystemState"), upstream.ask_master("getTopicTypes")
+        upstream.call_master("getSystemState"), upstream.call_master("getTopicTypes")
     )
     try:
         return read_state(state, types)
@@ -29,7 +29,21 @@ async def locate(
     upstream: MasterClient, held: Mapping[str, Sequence[Registration]], nodes: Iterable[str]
 ) -> Graph:
     """What nodes have registered, with where some of them are. Raises Unreachable."""
-    names = sorted(nodes)
-    uris = await upstream.batch([("lookupNode", [CALLER_ID, name]) for name in names])
-    found = zip(names, uris, strict=False)
-    return Graph(held, {name: uri for name, uri in found if isinstance(uri, str)})
+    return Graph(held, await look_up_nodes(upstream, nodes))
+
+
+async def look_up_nodes(upstream: MasterClient, nodes: Iterable[str]) -> dict[str, str]:
+    """The slave URIs of those nodes that the master knows. Raises Unreachable."""
+    return await _look_up(upstream, "lookupNode", nodes)
+
+
+async def look_up_services(upstream: MasterClient, services: Iterable[str]) -> dict[str, str]:
+    """The URIs of those services that the master knows. Raises Unreachable."""
+    return await _look_up(upstream, "lookupService", services)
+
+
+async def _look_up(upstream: MasterClient, method: str, names: Iterable[str]) -> dict[str, str]:
+    wanted = sorted(names)
+    uris = await upstream.multicall([(method, [CALLER_ID, name]) for name in wanted])
+    found = zip(wanted, uris, strict=True)
+    return {name: uri for name, uri in found if isinstance(uri, str)}

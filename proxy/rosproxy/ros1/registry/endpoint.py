@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.health import Health
+from rosproxy.ros1.registry.health import Health, ProbeResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,12 @@ class Endpoint:
     settles_at: float = 0.0
     fast_port: int | None = None
     fast_peers: Mapping[str, int] = field(default_factory=dict)
+
+    def mark_alive(self, pid: int | None, tcpros_port: int | None, now: float) -> None:
+        """Take in what its node has said of itself: it is served, and what it registered holds."""
+        self.trusted, self.tcpros_port = True, tcpros_port
+        self.health.note(ProbeResult.ANSWERED, now)
+        self.health.pid, self.health.cleaned = pid, False
 
     @property
     def direct(self) -> bool:

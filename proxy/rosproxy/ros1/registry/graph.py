@@ -1,4 +1,8 @@
-"""The ROS graph as the master tells it: who publishes, subscribes and serves what, and where."""
+"""The ROS graph: who publishes, subscribes and serves what, and where.
+
+The master tells it of all nodes (`Graph`), a node through its slave API of itself (`NodeInfo`).
+The two may differ: anybody can write to the master, and it keeps what a dead node had.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +33,29 @@ class Graph:
                 if held.kind is kind and node in self.uris:
                     topics.setdefault(held.name, []).append(self.uris[node])
         return topics
+
+
+@dataclass(frozen=True, slots=True)
+class NodeInfo:
+    """What a node says of itself: its pid, its topics with their types, its TCPROS port.
+
+    ``pid`` and ``tcpros_port`` are None where it does not tell.
+    """
+
+    pid: int | None
+    published: Mapping[str, str]
+    subscribed: Mapping[str, str]
+    tcpros_port: int | None
+
+    @property
+    def topics(self) -> set[str]:
+        """All topics that it publishes or subscribes to."""
+        return {*self.published, *self.subscribed}
+
+    @property
+    def by_kind(self) -> dict[Kind, Mapping[str, str]]:
+        """Its topics by the kind of registration that they need; of other kinds it can't tell."""
+        return {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
 
 
 def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:

@@ -1,7 +1,6 @@
 """The master port: inside nodes call it as their master."""
 
 import logging
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from rosproxy.net.http_server import Call
@@ -15,6 +14,8 @@ from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
 from rosproxy.ros1.rewriting.master_api import Answer, Request
+from rosproxy.ros1.upkeep.adoption.adopter import Adopter
+from rosproxy.ros1.upkeep.recovery.recovery import Recovery
 
 log = logging.getLogger(__name__)
 
@@ -22,21 +23,20 @@ log = logging.getLogger(__name__)
 class MasterApi:
     """Forwards master API calls, rewritten, and keeps the registry in step with the master.
 
-    ``recovered`` waits until the registry is rebuilt: a node that registered before would get
-    another port, and the master would shut it down for having moved. ``heed`` is told of each
-    name that is going to register at an endpoint.
+    Calls that register wait for the ``recovery``: a node that registered before would get
+    another port, and the master would shut it down for having moved.
     """
 
     def __init__(
         self,
         context: Context,
         leases: Leases,
-        mirror: Alias,
-        recovered: Callable[[], Awaitable[None]],
-        heed: Callable[[Endpoint, str], Awaitable[None]],
+        alias: Alias,
+        recovery: Recovery,
+        adopter: Adopter,
     ) -> None:
-        self._context, self._leases, self._mirror = context, leases, mirror
-        self._recovered, self._heed = recovered, heed
+        self._context, self._leases, self._alias = context, leases, alias
+        self._recovery, self._adopter = recovery, adopter
 
     async def __call__(self, call: Call) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
@@ -57,8 +57,8 @@ class MasterApi:
 
     async def _reply(self, request: Request) -> bytes:
         if request.plain:
-            return await self._context.upstream.master(request.body)
-        await self._recovered()
+            return await self._context.upstream.post_to_master(request.body)
+        await self._recovery.ensure()
         self._context.refresh_networks(request.asker.address)
         pending: list[Endpoint] = []
         try:
@@ -67,7 +67,7 @@ class MasterApi:
                 request.admissions.append(admission)
                 if isinstance(admission, Endpoint):
                     pending.append(admission)
-                    await self._heed(admission, call.string(0) or "" if call else "")
+                    await self._adopter.take_over(admission, call.string(0) or "" if call else "")
             return await self._forward(request)
         finally:
             for endpoint in pending:
@@ -78,10 +78,10 @@ class MasterApi:
         if local is not None:
             return local
         body = master_api.export_request(request, self._context.addressing)
-        reply = await self._context.upstream.master(body)
+        reply = await self._context.upstream.post_to_master(body)
         answer = master_api.read_answer(request, reply)
         self._note(answer, request.asker)
-        await self._mirror.hand_over(policy.answered(answer))
+        await self._alias.listen_for(policy.uris_in_answer(answer))
         return master_api.import_answer(request, answer, self._context.addressing)
 
     def _note(self, answer: Answer, asker: Asker) -> None:
@@ -122,7 +122,7 @@ class PublishedMaster:
         asker = Asker(call.source, call.local.host, master=self._address)
         request = master_api.read_request(call.body, asker)
         request.admissions = [None] * len(request.calls)
-        reply = await self._context.upstream.master(call.body)
+        reply = await self._context.upstream.post_to_master(call.body)
         if not any(inner and inner.method == "getUri" for inner in request.calls):
             return reply
         answer = master_api.read_answer(request, reply)

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_server import Call
@@ -19,6 +18,7 @@ from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.slave_api import TopicPort, Visit
 from rosproxy.ros1.upkeep.adoption import policy as adoption_policy
+from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 
 log = logging.getLogger(__name__)
 
@@ -27,20 +27,11 @@ REGISTRATION_GRACE = 0.5
 
 
 class SlaveApi:
-    """Forwards slave API calls to the node behind the port at which they arrive.
+    """Forwards slave API calls to the node behind the port at which they arrive."""
 
-    ``spared`` tells whether a node is to be kept from a ``shutdown`` by somebody for a reason.
-    """
-
-    def __init__(
-        self,
-        context: Context,
-        leases: Leases,
-        mirror: Alias,
-        spared: Callable[[Endpoint, str, str], Awaitable[bool]],
-    ) -> None:
-        self._context, self._leases, self._mirror = context, leases, mirror
-        self._spared = spared
+    def __init__(self, context: Context, leases: Leases, alias: Alias, adopter: Adopter) -> None:
+        self._context, self._leases, self._alias = context, leases, alias
+        self._adopter = adopter
 
     async def __call__(self, call: Call) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
@@ -96,11 +87,11 @@ class SlaveApi:
             return await self._ask(endpoint, call.body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
-            await self._mirror.hand_over(alias_policy.announced(parsed))
+            await self._alias.listen_for(alias_policy.announced_publishers(parsed))
         self._context.refresh_networks()
         visit = self._visit(endpoint, call, endpoint.port)
         addressing = self._context.addressing
-        body = self._mirror.toward_inside(call.body, parsed)
+        body = self._alias.import_call(call.body, parsed)
         reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
         said = slave_api.topic_port(parsed, reply)
         if said is not None:
@@ -112,11 +103,14 @@ class SlaveApi:
     async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
         """Whether a call only follows from how a node came to be behind the proxy."""
         if parsed.method == "shutdown":
-            return await self._spared(endpoint, parsed.string(0) or "", parsed.string(1) or "")
+            caller_id, reason = parsed.string(0) or "", parsed.string(1) or ""
+            return await self._adopter.absorb_shutdown(endpoint, caller_id, reason)
         if parsed.method != "publisherUpdate":
             return False
-        topic, uris = parsed.string(1) or "", alias_policy.announced(parsed)
-        return adoption_policy.outdated(topic, uris, self._context.addressing, self._context.now())
+        topic, uris = parsed.string(1) or "", alias_policy.announced_publishers(parsed)
+        return adoption_policy.is_outdated(
+            topic, uris, self._context.addressing, self._context.now()
+        )
 
     async def _after_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach the node first.
@@ -139,7 +133,7 @@ class SlaveApi:
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         try:
-            reply = await self._context.upstream.node(endpoint.slave, body)
+            reply = await self._context.upstream.post_to_node(endpoint.slave, body)
         except Unreachable as error:
             await self._suspect(endpoint, error)
             raise

@@ -98,11 +98,17 @@ class TcprosServer:
         asking = self._asking.get(endpoint)
         if asking is None:
             asking = self._context.tasks.spawn(
-                self._nodes.learn_tcpros_port(endpoint), f"TCPROS port of {endpoint.uri}"
+                self._ask_port(endpoint), f"TCPROS port of {endpoint.uri}"
             )
             self._asking[endpoint] = asking
             asking.add_done_callback(lambda _: self._asking.pop(endpoint))
         return await asyncio.shield(asking)
+
+    async def _ask_port(self, endpoint: Endpoint) -> int | None:
+        info = await self._nodes.inspect(endpoint.slave)
+        endpoint.topic_ports.clear()
+        endpoint.tcpros_port = info.tcpros_port if info else None
+        return endpoint.tcpros_port
 
     def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
         service = fields.get("service")

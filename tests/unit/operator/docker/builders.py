@@ -5,26 +5,31 @@ from dataclasses import replace
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.labels import find_members, read_labels
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    Host,
+    HostPorts,
+    HostState,
     Key,
+    Member,
     Network,
-    Observed,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import (
-    fingerprint,
     master,
     own_labels,
+    proxy_fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
 )
+from rosproxy_operator.docker.planner.state import DockerMemory
 
 ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"
@@ -75,7 +80,7 @@ def sandbox(
     made: str = "",
     started_at: str = "2026-01-01T10:00:00.5Z",
 ) -> Sandbox:
-    """A sandbox as the controller makes it, by default one that runs on its uplink and ``app``."""
+    """A sandbox as the operator makes it, by default one that runs on its uplink and ``app``."""
     name = name or sandbox_name(key)
     made = made or sandbox_fingerprint(key, ports, settings)
     aliases = ("rosproxy", master(key).host, proxy_name(key), name)
@@ -101,9 +106,9 @@ def proxy(
     sandbox_id: str = "",
     started_at: str = "2026-01-01T10:00:00.75Z",
 ) -> Proxy:
-    """A proxy as the controller makes it, by default one that runs in the `sandbox` of its key."""
+    """A proxy as the operator makes it, by default one that runs in the `sandbox` of its key."""
     name = name or proxy_name(key)
-    made = made or fingerprint(key, ports, settings, image)
+    made = made or proxy_fingerprint(key, ports, settings, image)
     mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
     labels = own_labels(ProxySpec(name, key, ports, made, sandbox_name(key)))
     own = container(name, labels, [], state, mode=mode)
@@ -124,14 +129,32 @@ def observed(
     ephemeral: PortRange = EPHEMERAL,
     image: str = IMAGE,
     advertise: Mapping[str, str] | None = None,
-) -> Observed:
+    **more: Any,
+) -> HostState:
     """A host with these containers."""
-    return Observed(
+    return HostState(
         containers=containers,
         networks=tuple(networks),
         proxies=tuple(proxies),
-        host=Host(ephemeral, frozenset(listening)),
+        host=HostPorts(ephemeral, frozenset(listening)),
         image_id=image,
         advertise=advertise or {},
         sandboxes=tuple(sandboxes),
+        **more,
     )
+
+
+def planned(
+    state: HostState, settings: PlanSettings, memory: DockerMemory, now: float
+) -> DockerPlan:
+    """The plan for a host, its labels read before."""
+    return plan(state, read_labels(state, settings), settings, memory, now)
+
+
+def read_members(
+    state: HostState, settings: PlanSettings = SETTINGS
+) -> tuple[tuple[Member, ...], list[Problem]]:
+    """The containers that belong to proxies, and what is wrong with labels."""
+    reading = read_labels(state, settings)
+    found, problems = find_members(reading, state)
+    return found, [*reading.problems, *problems]

@@ -11,22 +11,21 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
-from rosproxy_operator.docker.planner.data_planes import chosen
-from rosproxy_operator.docker.planner.labels import read_wishes
-from rosproxy_operator.docker.planner.model import STARTED, Key, Wish
-from rosproxy_operator.docker.planner.plan import Plan
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.desired import chosen_plane
+from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
-    Own,
-    fingerprint,
+    OwnLabels,
+    proxy_fingerprint,
     proxy_name,
     reserved_ports,
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import read_members
 from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engine, Failed, Refused
 
 HERE = "192.0.2.10"
@@ -48,7 +47,7 @@ def pick(items: Sequence[T], number: int) -> T:
 
 
 class Hosts:
-    """A host with labelled containers, a controller, and people who meddle."""
+    """A host with labelled containers, the operator, and people who meddle."""
 
     def __init__(self) -> None:
         self.engine = Engine(SETTINGS, EPHEMERAL)
@@ -58,8 +57,8 @@ class Hosts:
         self.served: dict[Key, PortRange] = {}
         self.may_move: set[Key] = set()
 
-    def own(self, *states: str, role: str = "") -> list[tuple[Box, Own]]:
-        """The controller's containers."""
+    def own(self, *states: str, role: str = "") -> list[tuple[Box, OwnLabels]]:
+        """The operator's containers."""
         return [
             (box, box.own)
             for box in self.engine.boxes
@@ -146,7 +145,7 @@ class Hosts:
             del self.engine.networks[name]
 
     def take_port(self, n: int, m: int) -> None:
-        """Another program listens; the controller may be unable to see it."""
+        """Another program listens; the operator may be unable to see it."""
         self.engine.names_ports = bool(m & 1)
         port = 11400 + n % 16
         if not any(port in box.ports for box in self.engine.boxes if box.state in SERVING):
@@ -212,7 +211,7 @@ class Hosts:
         if boxes := self.boxes(role=ROLE_SANDBOX):
             pick(boxes, n).networks.pop(pick((*NETWORKS[:3], SETTINGS.uplink), m), None)
 
-    # the controller
+    # the operator
 
     def wait(self, n: int, _: int) -> None:
         self.controller.now += pick((0.5, 5.0, 30.0), n)
@@ -221,7 +220,7 @@ class Hosts:
         self.carry_out(self.controller.look())
 
     def look_and_be_killed(self, n: int, _: int) -> None:
-        """The controller is killed after any of its actions and knows nothing any more."""
+        """The operator is killed after any of its actions and knows nothing any more."""
         found = self.controller.look()
         self.carry_out(found, n % (len(found.actions) + 1))
         self.lose_memory()
@@ -247,7 +246,7 @@ class Hosts:
             raise AssertionError(f"never comes to rest: {found.actions}")
         self.check_all_is_as_wished(found)
 
-    def carry_out(self, found: Plan, most: int | None = None) -> list[tuple[Action, Failed]]:
+    def carry_out(self, found: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
         self.check_new_ranges(found)
         before = self.engine.observe()
         remembered = self.controller.memory.served
@@ -271,7 +270,7 @@ class Hosts:
 
     def lose_memory(self) -> None:
         """Ports are then only known as long as there is a container that has had them."""
-        self.controller.memory = Memory()
+        self.controller.memory = DockerMemory()
         kept = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
         self.served = {key: ports for key, ports in self.served.items() if key in kept}
 
@@ -293,7 +292,7 @@ class Hosts:
             others = [other for one, other in held if one != key]
             assert not any(overlap(ports, other) for other in others), "ports are one's own"
 
-    def check_new_ranges(self, found: Plan) -> None:
+    def check_new_ranges(self, found: DockerPlan) -> None:
         """Ports of new sandboxes are nobody else's; who has ports keeps them."""
         seen = self.engine.observe()
         strangers = {port for one in seen.containers for port in one.host_ports}
@@ -309,25 +308,25 @@ class Hosts:
             for one in seen.sandboxes:
                 assert one.key == key or not overlap(one.range, ports)
 
-    def check_all_is_as_wished(self, found: Plan) -> None:
-        wishes, _ = read_wishes(self.engine.observe(), SETTINGS)
+    def check_all_is_as_wished(self, found: DockerPlan) -> None:
+        members, _ = read_members(self.engine.observe(), SETTINGS)
         fine = frozenset(
             name
             for name, network in self.engine.networks.items()
             if network.internal or name >= SETTINGS.uplink
         )
-        live = [wish for wish in wishes if wish.alive and wish.networks & fine]
-        assert {own.key for _, own in self.own()} <= {wish.key for wish in live}
+        live = [member for member in members if member.alive and member.networks & fine]
+        assert {own.key for _, own in self.own()} <= {member.key for member in live}
         fatal = {problem.subject for problem in found.problems if problem.fatal}
         told = {problem.subject for problem in found.problems}
-        for key in sorted({wish.key for wish in live}):
+        for key in sorted({member.key for member in live}):
             if not fatal & {f"proxy image {SETTINGS.image}", f"proxy {proxy_name(key)}"}:
-                mine = [wish for wish in live if wish.key == key]
-                plane = chosen(mine, SETTINGS.data_plane)
-                self.check_key(key, {n for wish in mine for n in wish.networks & fine}, plane)
-                for wish in mine:
-                    if f"container {wish.container}" not in told:
-                        self.check_names(wish, wish.networks & fine)
+                mine = [member for member in live if member.key == key]
+                plane = chosen_plane(mine, SETTINGS.data_plane)
+                self.check_key(key, {n for member in mine for n in member.networks & fine}, plane)
+                for member in mine:
+                    if f"container {member.container}" not in told:
+                        self.check_names(member, member.networks & fine)
 
     def check_key(self, key: Key, wanted: set[str], plane: DataPlane) -> None:
         own = [(box, own) for box, own in self.own() if own.key == key]
@@ -346,25 +345,25 @@ class Hosts:
         if self.engine.image:
             self.check_made_of(key, is_, runs, plane)
 
-    def check_made_of(self, key: Key, is_: Own, runs: Own, plane: DataPlane) -> None:
+    def check_made_of(self, key: Key, is_: OwnLabels, runs: OwnLabels, plane: DataPlane) -> None:
         forwards = plane == "kernel"
         assert is_.fingerprint == sandbox_fingerprint(key, is_.range, SETTINGS, forwards)
         image = self.engine.image
-        assert runs.fingerprint == fingerprint(key, is_.range, SETTINGS, image, plane)
+        assert runs.fingerprint == proxy_fingerprint(key, is_.range, SETTINGS, image, plane)
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""
         return (box.name == name) != any(one.name == name for one in self.strangers())
 
-    def check_names(self, wish: Wish, networks: frozenset[str]) -> None:
+    def check_names(self, member: Member, networks: frozenset[str]) -> None:
         """By the name that a container uses it finds its own proxy and nobody else."""
-        for network in networks if wish.needs else ():
+        for network in networks if member.needs else ():
             found = [
                 box.own.key if box.own else box.name
                 for box in self.engine.boxes
                 if network in box.networks
-                and wish.needs in box.networks[network][1] | {box.name}
+                and member.needs in box.networks[network][1] | {box.name}
                 and box.state not in ("dead", "removing")
             ]
             restarting = [own.key for _, own in self.own("restarting", role=ROLE_SANDBOX)]
-            assert found == [wish.key] or wish.key in restarting
+            assert found == [member.key] or member.key in restarting

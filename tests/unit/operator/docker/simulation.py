@@ -22,22 +22,23 @@ from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
     Container,
-    Host,
+    HostPorts,
+    HostState,
     Network,
-    Observed,
+    PlanSettings,
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.plan import Plan, plan
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
-    Own,
+    OwnLabels,
     own_labels,
     read_own,
 )
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import planned
 
 SERVING = {"running", "paused", "restarting"}
 
@@ -73,7 +74,7 @@ class Box:
     namespace: int = 0
 
     @property
-    def own(self) -> Own | None:
+    def own(self) -> OwnLabels | None:
         return read_own(self.labels)
 
     @property
@@ -86,7 +87,7 @@ class Box:
 
 
 class Engine:
-    """A Docker host. ``open`` and ``hidden`` are ports that other programs hold; the controller
+    """A Docker host. ``open`` and ``hidden`` are ports that other programs hold; the operator
     can't see the hidden ones. ``names_ports``: refusals name the port.
     """
 
@@ -131,12 +132,12 @@ class Engine:
         }
         return set(box.ports) & (others | self.open | self.hidden)
 
-    # what a controller sees
+    # what the operator sees
 
-    def observe(self) -> Observed:
+    def observe(self) -> HostState:
         held = {port for box in self.boxes if box.state in STARTED for port in box.ports}
         own = [(box, box.own) for box in self.boxes]
-        return Observed(
+        return HostState(
             containers=tuple(self._container(box) for box, role in own if role is None),
             networks=tuple(self.networks.values()),
             proxies=tuple(
@@ -144,7 +145,7 @@ class Engine:
                 for box, is_ in own
                 if is_ and is_.role == ROLE_PROXY
             ),
-            host=Host(self.ephemeral, frozenset(self.open | held)),
+            host=HostPorts(self.ephemeral, frozenset(self.open | held)),
             image_id=self.image,
             sandboxes=tuple(
                 Sandbox(is_.key, self._container(box), is_.range, is_.fingerprint)
@@ -170,7 +171,7 @@ class Engine:
             started_at=box.started_at,
         )
 
-    # what a controller does
+    # what the operator does
 
     def apply(self, action: Action) -> None:  # noqa: C901, PLR0912 - one case per action
         """Raises Failed. An AssertionError means that the plan is wrong in itself."""
@@ -209,11 +210,11 @@ class Engine:
                 self.boxes.remove(self.own(name))
 
     def own(self, name: str) -> Box:
-        """A container to do something to, which must be the controller's own."""
+        """A container to do something to, which must be the operator's own."""
         found = self.named(name)
         if not found:
             raise Failed(f"no container {name}")
-        assert found[0].own is not None, f"{name} is not the controller's"
+        assert found[0].own is not None, f"{name} is not the operator's"
         assert found[0].state != "removing"
         return found[0]
 
@@ -276,19 +277,19 @@ class Engine:
 
 
 class Controller:
-    """A controller that plans, carries out and may be killed anywhere."""
+    """The operator that plans, carries out and may be killed anywhere."""
 
     def __init__(self, engine: Engine, settings: PlanSettings) -> None:
         self.engine, self.settings = engine, settings
-        self.memory = Memory()
+        self.memory = DockerMemory()
         self.now = 1000.0
 
-    def look(self) -> Plan:
-        found = plan(self.engine.observe(), self.settings, self.memory, self.now)
+    def look(self) -> DockerPlan:
+        found = planned(self.engine.observe(), self.settings, self.memory, self.now)
         self.memory = found.memory
         return found
 
-    def carry_out(self, found: Plan, most: int | None = None) -> list[tuple[Action, Failed]]:
+    def carry_out(self, found: DockerPlan, most: int | None = None) -> list[tuple[Action, Failed]]:
         """Carry out a plan's actions, or the first few. What fails is returned."""
         failed: list[tuple[Action, Failed]] = []
         left = len(found.actions) if most is None else most

@@ -1,10 +1,10 @@
-"""The command line of the controller: every mistake is one line that names the option."""
+"""The command line of the operator: every mistake is one line that names the option."""
 
 import pytest
 from click.testing import CliRunner, Result
 
 from rosproxy_operator.cli import main
-from rosproxy_operator.settings import DEFAULT_ADMIN, parse_docker_settings
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, parse_docker_settings
 
 GIVEN = {
     "master_uri": None,
@@ -91,7 +91,7 @@ def test_once_is_for_the_controller_itself() -> None:
 def test_health_of_a_controller_that_is_not_there() -> None:
     result = run("health", ROSPROXY_ADMIN_BIND="127.0.0.1:1")
     assert result.exit_code == 1
-    assert result.stderr == "rosproxy-operator: no controller answers at http://127.0.0.1:1\n"
+    assert result.stderr == "rosproxy-operator: no operator answers at http://127.0.0.1:1\n"
 
 
 def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,19 +12,16 @@ from rosproxy_operator.docker.planner.actions import (
     ProxySpec,
     SandboxSpec,
 )
-from rosproxy_operator.docker.planner.labels import read_wishes
-from rosproxy_operator.docker.planner.model import Container, Proxy, Sandbox
-from rosproxy_operator.docker.planner.plan import Plan, plan
-from rosproxy_operator.docker.planner.report import line
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import Container, PlanSettings, Proxy, Sandbox
+from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     container_config,
-    fingerprint,
+    proxy_fingerprint,
     proxy_name,
     sandbox_config,
     sandbox_fingerprint,
 )
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
 from tests.unit.operator.docker.builders import (
     ENABLED,
     IMAGE,
@@ -33,7 +30,9 @@ from tests.unit.operator.docker.builders import (
     SETTINGS,
     container,
     observed,
+    planned,
     proxy,
+    read_members,
     sandbox,
 )
 
@@ -51,15 +50,15 @@ def look(
     *containers: Container,
     there: tuple[Sandbox, Proxy] | None = None,
     settings: PlanSettings = SETTINGS,
-    memory: Memory | None = None,
+    memory: DockerMemory | None = None,
     now: float = 0.0,
-) -> Plan:
+) -> DockerPlan:
     boxes, proxies = ([there[0]], [there[1]]) if there else ([], [])
     seen = observed(*containers, sandboxes=boxes, proxies=proxies)
-    return plan(seen, settings, memory or Memory(), now)
+    return planned(seen, settings, memory or DockerMemory(), now)
 
 
-def given(found: Plan) -> DataPlane:
+def given(found: DockerPlan) -> DataPlane:
     return found.desired[0].data_plane
 
 
@@ -72,7 +71,7 @@ def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
 def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
     box = sandbox(made=sandbox_fingerprint(KEY, RANGE, SETTINGS, forwards))
-    return box, proxy(made=fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
+    return box, proxy(made=proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
 
 
 # what is asked for
@@ -93,8 +92,8 @@ def test_a_label_goes_before_the_option(plane: str) -> None:
 
 @pytest.mark.parametrize("value", ["", "fast", "kernel,splice", "true"])
 def test_a_label_that_names_no_plane(value: str) -> None:
-    wishes, problems = read_wishes(observed(asking("a", value), container("b")), SETTINGS)
-    assert [wish.container for wish in wishes] == ["b"]
+    members, problems = read_members(observed(asking("a", value), container("b")), SETTINGS)
+    assert [member.container for member in members] == ["b"]
     assert [problem.text for problem in problems] == [
         f"label rosproxy.data-plane={value!r} is none of auto, kernel, splice, copy: write "
         "rosproxy.data-plane=kernel for a proxy that lets the kernel forward, or leave it out"
@@ -102,7 +101,7 @@ def test_a_label_that_names_no_plane(value: str) -> None:
 
 
 def test_a_misspelt_label() -> None:
-    _, problems = read_wishes(
+    _, problems = read_members(
         observed(container(labels={**ENABLED, "rosproxy.dataplane": "kernel"})), SETTINGS
     )
     assert "did you mean rosproxy.data-plane?" in problems[0].text
@@ -163,7 +162,7 @@ def test_the_sandbox_forwards_and_gets_no_capability() -> None:
 
 
 def test_the_plan_names_the_capability() -> None:
-    texts = [line(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
+    texts = [str(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
     assert ["NET_ADMIN" in text for text in texts] == [True, False]
 
 

@@ -8,11 +8,16 @@ import pytest
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.aliases import assign
 from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.labels import read_wishes
-from rosproxy_operator.docker.planner.model import Container, Desired, Key, Network, Observed
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import (
+    Container,
+    Desired,
+    HostState,
+    Key,
+    Network,
+    PlanSettings,
+)
 from rosproxy_operator.docker.planner.specs import proxy_name
-from rosproxy_operator.docker.planner.state import Memory, noticed
+from rosproxy_operator.docker.planner.state import DockerMemory, noticed
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
@@ -24,6 +29,7 @@ from tests.unit.operator.docker.builders import (
     container,
     observed,
     place,
+    read_members,
     sandbox,
 )
 
@@ -34,14 +40,14 @@ NAME = proxy_name(KEY)
 
 
 def want(
-    seen: Observed,
-    memory: Memory | None = None,
+    seen: HostState,
+    memory: DockerMemory | None = None,
     now: float = 0.0,
     settings: PlanSettings = SETTINGS,
 ) -> tuple[dict[Key, Desired], tuple[Problem, ...]]:
-    wishes, _ = read_wishes(seen, settings)
-    memory = noticed(memory or Memory(), wishes, now)
-    desired, problems = desire(seen, settings, wishes, memory, now)
+    members, _ = read_members(seen, settings)
+    memory = noticed(memory or DockerMemory(), members, now)
+    desired, problems = desire(seen, settings, members, memory, now)
     assert list(desired) == sorted(desired, key=lambda one: one.key)
     return {one.key: one for one in desired}, problems
 
@@ -67,7 +73,7 @@ def test_one_proxy_for_all_who_mean_the_same() -> None:
     )
     desired, problems = want(seen)
     assert problems == ()
-    assert [wish.container for wish in desired[KEY].wishes] == ["a", "b"]
+    assert [member.container for member in desired[KEY].members] == ["a", "b"]
     assert (desired[KEY].networks, desired[KEY].ports) == (frozenset({"app", "lab"}), 40)
     assert (desired[ARM].networks, desired[ARM].ports) == (frozenset({"app"}), 32)
 
@@ -124,7 +130,7 @@ def test_networks_of_who_has_exited_stay_joined_for_the_grace() -> None:
     there = [sandbox(networks=("app", "lab"))]
     seen = observed(container("a"), gone, networks=(UPLINK, APP, LAB), sandboxes=there)
     assert want(seen)[0][KEY].networks == {"app", "lab"}
-    since = Memory(exited={gone.id: 0.0})
+    since = DockerMemory(exited={gone.id: 0.0})
     assert want(seen, since, 59.0)[0][KEY].networks == {"app", "lab"}
     assert want(seen, since, 60.0)[0][KEY].networks == {"app"}
 
@@ -255,6 +261,6 @@ def test_two_masters_on_one_host() -> None:
 def test_container_that_is_just_being_created_has_its_network_soon(mode: str) -> None:
     """The engine lists it without any for a moment; that was told as an error."""
     seen = observed(container(networks=(), state="created", mode=mode))
-    wishes, problems = read_wishes(seen, SETTINGS)
-    assert [wish.networks for wish in wishes] == [{APP.name}]
+    members, problems = read_members(seen, SETTINGS)
+    assert [member.networks for member in members] == [{APP.name}]
     assert not problems

@@ -160,6 +160,6 @@ async def test_a_mistake_of_ours_is_a_problem_and_not_a_loop(
 ) -> None:
     host.does[Start("a")] = TypeError("oops")
     await host.start(Group(ONE, (Start("a"),)))
-    assert host.work.problems[0].text == "the controller failed: TypeError('oops')"
+    assert host.work.problems[0].text == "the operator failed: TypeError('oops')"
     assert (host.work.again_in or 0) > 0.5
     assert "Traceback" in caplog.text

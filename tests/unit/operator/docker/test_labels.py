@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import masters, read_wishes
-from rosproxy_operator.docker.planner.model import Container, Key, Wish
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.labels import master_hosts, read_labels
+from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,
@@ -21,6 +20,7 @@ from tests.unit.operator.docker.builders import (
     observed,
     place,
     proxy,
+    read_members,
     sandbox,
 )
 
@@ -30,34 +30,34 @@ EXPOSING = replace(SETTINGS, expose_by_default=True)
 
 def read(
     one: Container, settings: PlanSettings = SETTINGS, *others: Container, **more
-) -> tuple[Wish | None, list[Problem]]:
-    """The wish of one container, if any, and its problems."""
-    wishes, problems = read_wishes(observed(one, *others, **more), settings)
+) -> tuple[Member | None, list[Problem]]:
+    """The member of one container, if any, and its problems."""
+    members, problems = read_members(observed(one, *others, **more), settings)
     mine = [problem for problem in problems if problem.subject == f"container {one.name}"]
-    return next((wish for wish in wishes if wish.container == one.name), None), mine
+    return next((member for member in members if member.container == one.name), None), mine
 
 
 def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
     """Why a container is left out."""
-    wish, problems = read(one, settings, **more)
-    assert wish is None
+    member, problems = read(one, settings, **more)
+    assert member is None
     assert problems[-1].fatal
     return problems[-1].text
 
 
 def warning(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
-    """What a container is told that has its wish nevertheless."""
-    wish, problems = read(one, settings, **more)
-    assert wish is not None
+    """What a container is told that has its member nevertheless."""
+    member, problems = read(one, settings, **more)
+    assert member is not None
     assert [problem.fatal for problem in problems] == [False]
     return problems[0].text
 
 
 def test_a_labelled_container_wishes_for_a_proxy() -> None:
     labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
-    wish, problems = read(container(labels=labels, networks=("app", "lab")))
+    member, problems = read(container(labels=labels, networks=("app", "lab")))
     assert problems == []
-    assert wish == Wish(
+    assert member == Member(
         "talker",
         "id-talker",
         Key(ROBOT, "host.lab"),
@@ -68,10 +68,10 @@ def test_a_labelled_container_wishes_for_a_proxy() -> None:
 
 
 def test_the_label_alone_is_enough() -> None:
-    wish, problems = read(container(labels=ON, env=ROBOT))
+    member, problems = read(container(labels=ON, env=ROBOT))
     assert problems == []
-    assert wish
-    assert (wish.key, wish.ports, wish.needs) == (KEY, 0, "robot")
+    assert member
+    assert (member.key, member.ports, member.needs) == (KEY, 0, "robot")
 
 
 @pytest.mark.parametrize("value", ["true", "True", " TRUE "])
@@ -99,8 +99,8 @@ def test_false_is_said_once_and_nothing_is_answered() -> None:
 
 
 def test_a_label_without_enable_is_ignored_and_told() -> None:
-    wish, problems = read(container(labels={"rosproxy.ports": "8"}, env=ROBOT))
-    assert wish is None
+    member, problems = read(container(labels={"rosproxy.ports": "8"}, env=ROBOT))
+    assert member is None
     assert [problem.fatal for problem in problems] == [False]
     assert problems[0].text == "label rosproxy.ports ignored: add the label rosproxy.enable=true"
 
@@ -144,9 +144,9 @@ def test_bad_numbers_of_ports(value: str) -> None:
 
 @pytest.mark.parametrize("value", ["1", "1000", " 32 "])
 def test_good_numbers_of_ports(value: str) -> None:
-    wish, problems = read(container(labels={**ENABLED, "rosproxy.ports": value}))
-    assert wish
-    assert (wish.ports, problems) == (int(value), [])
+    member, problems = read(container(labels={**ENABLED, "rosproxy.ports": value}))
+    assert member
+    assert (member.ports, problems) == (int(value), [])
 
 
 # masters
@@ -165,9 +165,9 @@ def test_good_numbers_of_ports(value: str) -> None:
     ],
 )
 def test_a_master_has_one_uri(uri: str, same: str) -> None:
-    wish, _ = read(container(labels={**ON, "rosproxy.master-uri": uri}))
-    assert wish
-    assert wish.key.master_uri == same
+    member, _ = read(container(labels={**ON, "rosproxy.master-uri": uri}))
+    assert member
+    assert member.key.master_uri == same
 
 
 @pytest.mark.parametrize(
@@ -199,15 +199,15 @@ def test_a_proxy_is_no_master(host: str) -> None:
     assert "names a proxy: give the real master" in refusal(container(labels=labels))
 
 
-def test_the_controllers_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
+def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
     settings = replace(SETTINGS, master_uri="http://arm:11311")
     for env in ("", "http://rosproxy:11311", "http://rosproxy-arm-0a1b2c:11311"):
-        wish, _ = read(container(labels=ON, env=env), settings)
-        assert wish
-        assert wish.key.master_uri == "http://arm:11311"
-    wish, _ = read(container(labels=ON, env=ROBOT), settings)
-    assert wish
-    assert wish.key == KEY
+        member, _ = read(container(labels=ON, env=env), settings)
+        assert member
+        assert member.key.master_uri == "http://arm:11311"
+    member, _ = read(container(labels=ON, env=ROBOT), settings)
+    assert member
+    assert member.key == KEY
 
 
 def test_no_master() -> None:
@@ -216,7 +216,7 @@ def test_no_master() -> None:
         "no master is known: add the label rosproxy.master-uri=http://HOST:11311"
     )
     text = refusal(container(labels=ON), replace(SETTINGS, master_uri="robot"))
-    assert text.startswith("the controller's --master-uri 'robot' is not of the form")
+    assert text.startswith("the operator's --master-uri 'robot' is not of the form")
 
 
 # by which name the proxy is found
@@ -251,10 +251,10 @@ def test_a_variable_that_leads_astray(env: str, told: str) -> None:
 
 @pytest.mark.parametrize("env", ["", "http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
 def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
-    wish, problems = read(container(env=env))
-    assert wish
+    member, problems = read(container(env=env))
+    assert member
     assert problems == []
-    assert wish.needs == ("rosproxy" if "rosproxy" in env or not env else "robot")
+    assert member.needs == ("rosproxy" if "rosproxy" in env or not env else "robot")
 
 
 # this host's address
@@ -268,9 +268,9 @@ def test_who_says_what_this_host_is_called() -> None:
         (container(), SETTINGS, HERE),
         (container(), PlanSettings(), "192.0.2.99"),
     ):
-        wish, problems = read(one, settings, advertise=found)
-        assert wish
-        assert (wish.key.advertise_host, problems) == (host, [])
+        member, problems = read(one, settings, advertise=found)
+        assert member
+        assert (member.key.advertise_host, problems) == (host, [])
 
 
 @pytest.mark.parametrize("value", ["", "a b", "http://host", "host:1", "-x", "x" * 300])
@@ -294,32 +294,32 @@ def test_an_address_that_is_not_known_for_a_moment() -> None:
     """The proxy that is there stays: of several, the one on the container's network."""
     other = Key(ROBOT, "192.0.2.1")
     seen = [sandbox(other, networks=()), sandbox(KEY)]
-    wish, problems = read(container(), PlanSettings(), sandboxes=seen)
-    assert wish
-    assert (wish.key, problems) == (KEY, [])
+    member, problems = read(container(), PlanSettings(), sandboxes=seen)
+    assert member
+    assert (member.key, problems) == (KEY, [])
 
 
 # networks
 
 
 def test_only_user_defined_networks_but_the_uplink() -> None:
-    wish, _ = read(container(networks=("bridge", "app", "0-rosproxy")))
-    assert wish
-    assert wish.networks == {"app"}
+    member, _ = read(container(networks=("bridge", "app", "0-rosproxy")))
+    assert member
+    assert member.networks == {"app"}
 
 
 def test_one_network_of_several() -> None:
     labels = {**ENABLED, "rosproxy.network": "lab"}
-    wish, _ = read(container(labels=labels, networks=("app", "lab")))
-    assert wish
-    assert wish.networks == {"lab"}
+    member, _ = read(container(labels=labels, networks=("app", "lab")))
+    assert member
+    assert member.networks == {"lab"}
 
 
 def test_a_network_as_compose_files_call_it() -> None:
     labels = {**ENABLED, "rosproxy.network": "lab", "com.docker.compose.project": "demo"}
-    wish, _ = read(container(labels=labels, networks=("demo_lab", "demo_default")))
-    assert wish
-    assert wish.networks == {"demo_lab"}
+    member, _ = read(container(labels=labels, networks=("demo_lab", "demo_default")))
+    assert member
+    assert member.networks == {"demo_lab"}
 
 
 def test_a_network_that_it_is_not_on() -> None:
@@ -350,10 +350,10 @@ def test_the_network_of_another_container() -> None:
     one = container("talker", networks=(), mode="container:id-pod")
     two = container("two", networks=(), mode="container:id-talker")
     for each, other in ((one, two), (two, one)):
-        wish, problems = read(each, SETTINGS, pod, other)
-        assert wish
+        member, problems = read(each, SETTINGS, pod, other)
+        assert member
         assert problems == []
-        assert wish.networks == {"app", "lab"}
+        assert member.networks == {"app", "lab"}
 
 
 def test_the_network_of_a_container_that_is_gone() -> None:
@@ -367,15 +367,15 @@ def test_the_network_of_a_container_that_is_gone() -> None:
 
 @pytest.mark.parametrize("state", ["created", "running", "paused", "restarting"])
 def test_who_lives_counts(state: str) -> None:
-    wish, _ = read(container(state=state))
-    assert wish
-    assert wish.alive
+    member, _ = read(container(state=state))
+    assert member
+    assert member.alive
 
 
 def test_who_has_exited_has_no_problems() -> None:
-    wish, problems = read(container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited"))
-    assert wish
-    assert (wish.alive, problems) == (False, [])
+    member, problems = read(container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited"))
+    assert member
+    assert (member.alive, problems) == (False, [])
     assert read(container(labels=ON, state="exited")) == (None, [])
 
 
@@ -388,18 +388,18 @@ def test_who_is_dead_wants_nothing(state: str) -> None:
 
 
 def test_everybody_with_a_master_is_exposed() -> None:
-    wish, problems = read(container(labels={}, env=ROBOT), EXPOSING)
-    assert wish
-    assert (wish.key, problems) == (KEY, [])
-    wish, _ = read(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING)
-    assert wish
+    member, problems = read(container(labels={}, env=ROBOT), EXPOSING)
+    assert member
+    assert (member.key, problems) == (KEY, [])
+    member, _ = read(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING)
+    assert member
     assert read(container(labels={}), EXPOSING) == (None, [])
 
 
 def test_who_has_not_asked_is_no_failure() -> None:
     one = container(labels={}, env=ROBOT, networks=("host",))
-    wish, problems = read(one, EXPOSING)
-    assert wish is None
+    member, problems = read(one, EXPOSING)
+    assert member is None
     assert [problem.fatal for problem in problems] == [False]
 
 
@@ -413,9 +413,9 @@ def test_one_bad_container_does_not_touch_the_others() -> None:
         container("bad2", ON),
         container("bad3", networks=()),
     ]
-    wishes, _ = read_wishes(observed(*good), SETTINGS)
-    with_bad, problems = read_wishes(observed(*bad, *good), SETTINGS)
-    assert with_bad == wishes
+    members, _ = read_members(observed(*good), SETTINGS)
+    with_bad, problems = read_members(observed(*bad, *good), SETTINGS)
+    assert with_bad == members
     assert {problem.subject for problem in problems if problem.fatal} == {
         "container bad1",
         "container bad2",
@@ -423,7 +423,7 @@ def test_one_bad_container_does_not_touch_the_others() -> None:
     }
 
 
-def test_a_container_with_the_controllers_own_label() -> None:
+def test_a_container_with_the_operators_own_label() -> None:
     _, problems = read(container(labels={"io.rosproxy.managed": "true"}))
     assert problems[0].text.startswith("has the label io.rosproxy.managed, which is for proxies")
 
@@ -438,7 +438,7 @@ def test_whose_address_is_needed() -> None:
         container("e", {**ON, "rosproxy.enable": "maybe"}, env="http://no:11311"),
         **both(key=there),
     )
-    assert masters(seen, SETTINGS) == ("http://arm:11311", "http://left:11311", ROBOT)
+    assert master_hosts(read_labels(seen, SETTINGS), seen) == ("arm", "left", "robot")
 
 
 def test_a_proxy_of_whatever_name_is_no_master() -> None:
@@ -464,11 +464,11 @@ def test_labels_of_whatever_kind_are_read_or_told(
 ) -> None:
     one = container("odd", labels, [place("app")], env=env, mode=mode)
     settings = replace(SETTINGS, expose_by_default=expose)
-    wish, problems = read(one, settings)
+    member, problems = read(one, settings)
     asked = labels.get("rosproxy.enable", "").strip().lower()
     if asked == "true":
-        assert wish or any(problem.fatal for problem in problems)
-    if wish:
-        assert wish.key.master_uri.startswith("http://")
-        assert wish.key.advertise_host
-        assert 0 <= wish.ports <= 1000
+        assert member or any(problem.fatal for problem in problems)
+    if member:
+        assert member.key.master_uri.startswith("http://")
+        assert member.key.advertise_host
+        assert 0 <= member.ports <= 1000

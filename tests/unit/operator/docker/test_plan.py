@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.moves import Move
+from rosproxy_operator.common.allocation import Move
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -23,16 +23,15 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import Key, Network, Observed
-from rosproxy_operator.docker.planner.plan import Plan, plan
-from rosproxy_operator.docker.planner.settings import PlanSettings
+from rosproxy_operator.docker.planner.model import HostState, Key, Network, PlanSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
-    fingerprint,
+    proxy_fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
 )
-from rosproxy_operator.docker.planner.state import Memory
+from rosproxy_operator.docker.planner.state import DockerMemory
 from tests.unit.operator.docker.builders import (
     APP,
     ENABLED,
@@ -46,6 +45,7 @@ from tests.unit.operator.docker.builders import (
     container,
     observed,
     place,
+    planned,
     proxy,
     sandbox,
 )
@@ -66,24 +66,24 @@ def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
-    made = fingerprint(KEY, ports, SETTINGS, image)
+    made = proxy_fingerprint(KEY, ports, SETTINGS, image)
     return Create(ProxySpec(NAME, KEY, ports, made, home, replaces))
 
 
 def look(
-    seen: Observed,
-    memory: Memory | None = None,
+    seen: HostState,
+    memory: DockerMemory | None = None,
     now: float = 0.0,
     settings: PlanSettings = SETTINGS,
-) -> Plan:
-    return plan(seen, settings, memory or Memory(), now)
+) -> DockerPlan:
+    return planned(seen, settings, memory or DockerMemory(), now)
 
 
-def actions(seen: Observed, **more: Any) -> list[Action]:
+def actions(seen: HostState, **more: Any) -> list[Action]:
     return list(look(seen, **more).actions)
 
 
-def texts(found: Plan) -> list[str]:
+def texts(found: DockerPlan) -> list[str]:
     return [problem.text for problem in found.problems]
 
 
@@ -400,7 +400,7 @@ def test_the_grace() -> None:
     why = "no running container wants it any more"
     assert list(third.actions) == [Remove(NAME, why, retire=True), Remove(PORTS, why)]
     assert third.again_in is None
-    assert look(observed(), memory=third.memory, now=61.0).memory == Memory()
+    assert look(observed(), memory=third.memory, now=61.0).memory == DockerMemory()
 
 
 def test_the_grace_begins_anew_with_each_container() -> None:
@@ -431,11 +431,11 @@ def test_a_container_that_has_exited_keeps_its_network_for_the_grace() -> None:
 # ports
 
 
-def port_problem(found: Plan) -> str:
+def port_problem(found: DockerPlan) -> str:
     return next(problem.text for problem in found.problems if problem.subject == f"proxy {NAME}")
 
 
-def created(found: Plan) -> PortRange:
+def created(found: DockerPlan) -> PortRange:
     return next(a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox))
 
 
@@ -452,7 +452,7 @@ def created(found: Plan) -> PortRange:
         (observed(container(), sandboxes=[sandbox(ARM, state="created")]), 11432),
     ],
 )
-def test_new_ports_are_nobodys(seen: Observed, first: int) -> None:
+def test_new_ports_are_nobodys(seen: HostState, first: int) -> None:
     assert created(look(seen)) == PortRange(first, first + 31)
 
 
@@ -515,7 +515,7 @@ def test_a_stopped_sandbox_tells_more_than_memory_only_if_it_has_more_ports() ->
         (PortRange(11500, 11531), RANGE),
     ):
         seen = observed(container(), sandboxes=[sandbox(ports=ports, state="exited")])
-        found = look(seen, memory=Memory(served={KEY: RANGE}))
+        found = look(seen, memory=DockerMemory(served={KEY: RANGE}))
         assert found.memory.planned == {KEY: kept}
 
 
@@ -542,7 +542,9 @@ def test_exhausted() -> None:
     )
 
 
-def refused(seen: Observed, ports: Iterable[int] | None, memory: Memory, now: float) -> Plan:
+def refused(
+    seen: HostState, ports: Iterable[int] | None, memory: DockerMemory, now: float
+) -> DockerPlan:
     return look(seen, memory=memory.port_taken(PORTS, ports, now), now=now)
 
 
@@ -553,7 +555,7 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
     ports: list[int] | None, then: PortRange
 ) -> None:
     seen = observed(container(), sandboxes=[sandbox(state="created", networks=())])
-    found = refused(seen, ports, Memory(), 0.0)
+    found = refused(seen, ports, DockerMemory(), 0.0)
     assert found.actions[:4] == (
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(then),
@@ -568,7 +570,7 @@ def test_ports_that_have_served_are_tried_for_a_while(ports: list[int] | None) -
     seen = observed(
         container(), sandboxes=[sandbox(state="exited", networks=())], proxies=[proxy()]
     )
-    first = refused(seen, ports, Memory(), 100.0)
+    first = refused(seen, ports, DockerMemory(), 100.0)
     assert first.actions[0] == Start(PORTS)
     assert first.again_in == 1.0
     then = refused(seen, ports, first.memory, 119.9)
@@ -598,10 +600,10 @@ def test_ports_that_a_stranger_publishes_now_are_left() -> None:
 
 
 def test_a_start_that_went_well_is_the_end_of_it() -> None:
-    memory = Memory().port_taken(PORTS, None, 0.0)
+    memory = DockerMemory().port_taken(PORTS, None, 0.0)
     found = look(observed(container(), **both()), memory=memory, now=30.0)
     assert (found.actions, found.again_in) == ((), None)
-    assert found.memory == Memory(served={KEY: RANGE}, planned={KEY: RANGE})
+    assert found.memory == DockerMemory(served={KEY: RANGE}, planned={KEY: RANGE})
 
 
 # all together
@@ -631,3 +633,23 @@ def test_what_lets_names_go_comes_first() -> None:
     found = look(seen)
     assert isinstance(found.actions[0], Disconnect)
     assert Connect(PORTS, "app", ALIASES) in found.actions
+
+
+def test_nothing_is_done_for_a_key_while_one_of_its_containers_is_busy() -> None:
+    name = sandbox_name(KEY)
+    idle = look(observed(container(), sandboxes=[sandbox(state="exited")]))
+    assert idle.actions
+    busy = look(observed(container(), sandboxes=[sandbox(state="exited")], busy={name}))
+    assert not busy.actions
+    assert not busy.deferred
+
+
+def test_a_proxy_is_not_made_before_the_address_of_its_master_is_known() -> None:
+    found = look(observed(container(), unresolved=frozenset({"robot"})))
+    assert not any(isinstance(action, Create) for action in found.actions)
+    assert any(isinstance(action, Create) for group in found.deferred for action in group.actions)
+    (problem,) = [each for each in found.problems if each.subject == "master robot"]
+    assert "--add-host robot:ADDRESS" in problem.text
+    assert problem.fatal
+    other = look(observed(container(), unresolved=frozenset({"arm"})))
+    assert any(isinstance(action, Create) for action in other.actions)

@@ -1,7 +1,7 @@
-"""Whatever happens on a host, and wherever the controller is killed: it ends as it ought to.
+"""Whatever happens on a host, and wherever the operator is killed: it ends as it ought to.
 
 After each event what must always hold is checked, see `Hosts.check`. From time to time nothing
-else happens: then the controller must come to rest, with everything as wished.
+else happens: then the operator must come to rest, with everything as wished.
 """
 
 from dataclasses import replace
@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy_operator.docker.planner.model import Container
-from rosproxy_operator.docker.planner.plan import plan
-from tests.unit.operator.docker.builders import container
+from tests.unit.operator.docker.builders import container, planned
 from tests.unit.operator.docker.hosts import SETTINGS, Hosts
 
 CONTAINERS = (
@@ -71,8 +70,8 @@ def test_a_bad_object_does_not_change_what_is_done_for_others(
     seen, memory, now = host.engine.observe(), host.controller.memory, host.controller.now
     bad = replace(bad, labels={**bad.labels, "rosproxy.advertise-host": more + " "})
     with_bad = replace(seen, containers=(bad, *seen.containers))
-    alone = plan(seen, SETTINGS, memory, now)
-    found = plan(with_bad, SETTINGS, memory, now)
+    alone = planned(seen, SETTINGS, memory, now)
+    found = planned(with_bad, SETTINGS, memory, now)
     assert found.groups == alone.groups
     assert (found.memory, found.again_in) == (alone.memory, alone.again_in)
     assert set(alone.problems) <= set(found.problems)

@@ -7,16 +7,20 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    Host,
+    HostPorts,
+    HostState,
     Key,
+    Member,
     Network,
-    Observed,
     Proxy,
     Sandbox,
-    Wish,
 )
-from rosproxy_operator.docker.proxy_news import Facts, Places, facts, gone, node_addresses
-from rosproxy_operator.docker.snapshot import Look
+from rosproxy_operator.docker.planner.proxy_news import (
+    NetworkFacts,
+    Places,
+    facts,
+    gone,
+)
 
 KEY = Key("http://robot:11311", "192.0.2.10")
 PORTS = PortRange(11400, 11431)
@@ -24,62 +28,58 @@ SUBNET = IPv4Network("172.18.0.0/16")
 
 
 def at(address: str, network: str = "app", *names: str) -> Attachment:
-    return Attachment(network, address, frozenset(names))
+    return Attachment(network, address, frozenset(names), endpoint="e1")
 
 
 def talker(address: str = "172.18.0.5", state: str = "running") -> Container:
     return Container("t" * 20, "talker", state, attachments=(at(address),), hostname="bhost")
 
 
-def look(*containers: Container) -> Look:
+def look(*containers: Container) -> HostState:
     home = Container(
         "box", "box", "running", attachments=(at("172.30.0.2", "up"), at("172.18.0.2"))
     )
     process = Container("p", "p", "running", network_mode="container:box")
     networks = (
-        Network("1", "app", gateway="172.18.0.1"),
+        Network("1", "app", gateway="172.18.0.1", subnets=(SUBNET,)),
         Network("2", "up", gateway="172.30.0.1"),
-        Network("3", "other", gateway="172.19.0.1"),
+        Network("3", "other", gateway="172.19.0.1", subnets=(IPv4Network("172.19.0.0/16"),)),
     )
-    return Look(
-        Observed(
-            containers,
-            networks,
-            (Proxy(KEY, process, PORTS, ""),),
-            Host(PORTS),
-            sandboxes=(Sandbox(KEY, home, PORTS, ""),),
-        ),
-        endpoints={("t" * 20, "app"): "e1"},
-        subnets={"app": (SUBNET,), "other": (IPv4Network("172.19.0.0/16"),)},
+    return HostState(
+        containers,
+        networks,
+        (Proxy(KEY, process, PORTS, ""),),
+        HostPorts(PORTS),
+        sandboxes=(Sandbox(KEY, home, PORTS, ""),),
         addresses=frozenset({"172.18.0.5", "172.18.0.2", "172.30.0.2"}),
     )
 
 
-def told(seen: Look, *wishes: Wish, master: str = "198.51.100.7") -> Facts:
-    return facts(seen, seen.observed.proxies[0], wishes, master)
+def told(seen: HostState, *members: Member, master: str = "198.51.100.7") -> NetworkFacts:
+    return facts(seen, seen.proxies[0], members, master)
 
 
-def wish(container: Container) -> Wish:
-    return Wish(container.name, container.id, KEY)
+def member(container: Container) -> Member:
+    return Member(container.name, container.id, KEY)
 
 
 def test_a_running_container_has_arrived_under_all_its_names() -> None:
     seen = look(replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),)))
-    (arrival,) = told(seen, wish(talker())).arrivals
+    (arrival,) = told(seen, member(talker())).arrivals
     assert (arrival.address, arrival.network, arrival.endpoint) == ("172.18.0.5", "app", "e1")
     assert arrival.names == {"talker", "t" * 12, "web", "bhost"}
 
 
 def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
-    other = Wish("talker", "t" * 20, Key("http://other:11311", "192.0.2.10"))
+    other = Member("talker", "t" * 20, Key("http://other:11311", "192.0.2.10"))
     assert not told(look(talker()), other).arrivals
-    assert not told(look(talker(state="exited")), wish(talker())).arrivals
+    assert not told(look(talker(state="exited")), member(talker())).arrivals
     assert not told(look(talker())).arrivals
 
 
 def test_networks_that_the_proxy_is_not_on_do_not_count() -> None:
     away = replace(talker(), attachments=(at("172.19.0.5", "other"),))
-    known = told(look(away), wish(away))
+    known = told(look(away), member(away))
     assert not known.arrivals
     assert not known.addresses
     assert known.subnets == (SUBNET,)
@@ -87,7 +87,7 @@ def test_networks_that_the_proxy_is_not_on_do_not_count() -> None:
 
 def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
     guest = Container("g" * 20, "guest", "running", network_mode=f"container:{'t' * 20}")
-    (arrival,) = told(look(talker(), guest), wish(guest)).arrivals
+    (arrival,) = told(look(talker(), guest), member(guest)).arrivals
     assert (arrival.container, arrival.address, arrival.endpoint) == ("g" * 20, "172.18.0.5", "e1")
     assert {"guest", "bhost"} <= arrival.names
 
@@ -96,7 +96,7 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
     assert told(look()).master_address == "198.51.100.7"
     seen = look()
     key = Key("http://198.51.100.8:11311", "192.0.2.10")
-    process = replace(seen.observed.proxies[0], key=key)
+    process = replace(seen.proxies[0], key=key)
     assert facts(seen, process, (), "198.51.100.8").master_address == ""
 
 
@@ -105,13 +105,6 @@ def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
     nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
     assert gone(nodes, known.taken, known.subnets) == ["172.18.0.6"]
     assert gone(nodes, known.taken, ()) == []
-
-
-def test_the_addresses_of_nodes() -> None:
-    ended = {"address": "172.18.0.7:4001", "state": "cleaned"}
-    status = {"nodes": [{"address": "172.18.0.6:4001"}, {"address": "[fd00::1]:1"}, {}, ended]}
-    assert node_addresses(status) == {"172.18.0.6", "fd00::1"}
-    assert node_addresses({}) == frozenset()
 
 
 OLD, NEW = "172.18.0.5", "172.18.0.9"
@@ -126,7 +119,7 @@ HERE, AWAY, THERE, NOBODY = (
 )
 
 
-def places(*looks: tuple[float, Facts]) -> Places:
+def places(*looks: tuple[float, NetworkFacts]) -> Places:
     found = Places()
     for when, known in looks:
         found.look(known, when)
@@ -174,9 +167,9 @@ def test_an_address_that_another_container_has_now_is_not_told_as_moved() -> Non
 
 
 def test_container_that_changes_networks_takes_its_nodes_along() -> None:
-    before = Facts(addresses={("t", "app"): "172.18.0.5"}, running=frozenset("t"))
-    between = Facts(running=frozenset("t"))
-    after = Facts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
+    before = NetworkFacts(addresses={("t", "app"): "172.18.0.5"}, running=frozenset("t"))
+    between = NetworkFacts(running=frozenset("t"))
+    after = NetworkFacts(addresses={("t", "other"): "172.19.0.9"}, running=frozenset("t"))
 
     found = places((0.0, before), (0.1, between), (1.0, after))
 
@@ -188,7 +181,7 @@ def test_container_that_changes_networks_takes_its_nodes_along() -> None:
 
 def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> None:
     app, other = ("t", "app"), ("t", "other")
-    both = Facts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
+    both = NetworkFacts(addresses={app: "172.18.0.5", other: "172.19.0.9"}, running=frozenset("t"))
     one = replace(both, addresses={other: "172.19.0.9"})
 
     assert places((0.0, both), (0.1, one)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}

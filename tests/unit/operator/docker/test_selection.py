@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy_operator.docker.planner.model import Container
-from rosproxy_operator.docker.planner.selection import IDLE, free_name, succession
+from rosproxy_operator.docker.planner.selection import IDLE, free_name, select
 from tests.unit.operator.docker.builders import container
 from tests.unit.operator.docker.simulation import SERVING
 
@@ -30,7 +30,7 @@ def test_everybody_has_one_part(some: list[tuple[str, bool, bool]], creatable: b
         container(f"name-{n}" if n else "name", label(right, usable), state=state)
         for n, (state, right, usable) in enumerate(some)
     ]
-    found = succession(every, "name", is_right, is_usable, creatable)
+    found = select(every, "name", is_right, is_usable, creatable)
     runs = [one for one in every if one.state in SERVING]
     ready = [one for one in every if one.state in IDLE and is_right(one) and is_usable(one)]
     if any(one.state == "removing" for one in every):
@@ -58,7 +58,7 @@ def test_everybody_has_one_part(some: list[tuple[str, bool, bool]], creatable: b
 
 def test_the_one_with_the_name_is_preferred() -> None:
     every = [container(name, label(True, True)) for name in ("a", "name", "z")]
-    found = succession(every, "name", is_right, is_usable, True)
+    found = select(every, "name", is_right, is_usable, True)
     assert found.kept == every[1]
     assert [one.name for one in found.others] == ["a", "z"]
 

@@ -1,15 +1,30 @@
 """From the engine's JSON to what the core plans with."""
 
 from dataclasses import replace
-from ipaddress import ip_network
+from ipaddress import IPv4Network
 from typing import Any
 
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.docker.details import Details, bound_ports, read_details, signature
-from rosproxy_operator.docker.planner.model import Container, Host, Key, Network, Observed, Sandbox
-from rosproxy_operator.docker.snapshot import Look, read_container, read_network, read_subnets
+from rosproxy_operator.docker.engine_json import (
+    Details,
+    bound_ports,
+    read_container,
+    read_details,
+    read_network,
+    signature,
+)
+from rosproxy_operator.docker.planner.model import (
+    Attachment,
+    Container,
+    HostPorts,
+    HostState,
+    Key,
+    Network,
+    Sandbox,
+)
+from rosproxy_operator.docker.snapshot import address_in, strangers
 from tests.unit.operator.docker import captured
 
 APP = Network(captured.APP_ID, "app")
@@ -92,16 +107,16 @@ def test_no_bindings() -> None:
 
 
 def test_a_network_and_its_subnets() -> None:
+    subnets = (IPv4Network("172.29.0.0/16"),)
     assert read_network(captured.network()) == Network(
-        captured.APP_ID, "app", "bridge", False, "172.29.0.1"
+        captured.APP_ID, "app", "bridge", False, "172.29.0.1", subnets
     )
-    assert read_subnets(captured.network()) == (ip_network("172.29.0.0/16"),)
 
 
 def test_a_network_without_addresses() -> None:
     host = {"Name": "host", "Id": "1", "Driver": "host", "IPAM": {"Config": None}}
     assert read_network(host).gateway == ""
-    assert read_subnets(host) == ()
+    assert read_network(host).subnets == ()
 
 
 def test_the_signature_changes_with_each_connection() -> None:
@@ -116,9 +131,19 @@ def test_the_signature_changes_with_each_connection() -> None:
 def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
-    observed = Observed((), (), (), Host(ports), sandboxes=(box,))
-    look = Look(observed, unsure=frozenset({"box"}), at_host=True)
+    state = HostState((), (), (), HostPorts(ports), sandboxes=(box,))
     listening = frozenset({22, 11400, 11401})
-    assert look.strangers(listening) == {22}
-    assert replace(look, unsure=frozenset()).strangers(listening) == listening
-    assert replace(look, at_host=False).strangers(listening) == frozenset()
+    assert strangers(replace(state, busy=frozenset({"box"})), listening) == {22}
+    assert strangers(state, listening) == listening
+
+
+def test_the_engine_knows_names_that_no_name_server_has() -> None:
+    uplink = Network("n0", "0-rosproxy", gateway="172.30.0.1")
+    places = (Attachment("app", "172.18.0.5", frozenset({"RosCore"})),)
+    core = Container("1", "core", "running", attachments=places)
+    state = HostState((core,), (uplink,), (), HostPorts(PortRange(1, 2)))
+    assert address_in(state, "roscore", "0-rosproxy") == "172.18.0.5"
+    assert address_in(state, "host.docker.internal", "0-rosproxy") == "172.30.0.1"
+    assert address_in(state, "robot", "0-rosproxy") == ""
+    ended = replace(state, containers=(replace(core, state="exited"),))
+    assert address_in(ended, "roscore", "0-rosproxy") == ""

@@ -10,12 +10,12 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
-    Own,
+    OwnLabels,
     admin_port,
     container_config,
-    fingerprint,
     is_proxy_name,
     own_labels,
+    proxy_fingerprint,
     proxy_name,
     read_own,
     reserved_ports,
@@ -110,16 +110,18 @@ def test_what_makes_a_sandbox_anew() -> None:
 
 
 def test_what_makes_a_proxy_anew() -> None:
-    now = fingerprint(KEY, RANGE, SETTINGS, IMAGE)
-    assert now == fingerprint(KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE)
-    assert now != fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
-    assert now != fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
-    assert now != fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
+    now = proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE)
+    assert now == proxy_fingerprint(
+        KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE
+    )
+    assert now != proxy_fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
+    assert now != proxy_fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
+    assert now != proxy_fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
 
 
 def test_labels_are_read_back() -> None:
-    assert read_own(own_labels(SANDBOX)) == Own("ports", KEY, PortRange(11400, 11401), "f1")
-    assert read_own(own_labels(PROXY)) == Own("proxy", KEY, PortRange(11400, 11401), "f2")
+    assert read_own(own_labels(SANDBOX)) == OwnLabels("ports", KEY, PortRange(11400, 11401), "f1")
+    assert read_own(own_labels(PROXY)) == OwnLabels("proxy", KEY, PortRange(11400, 11401), "f2")
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,15 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
-    Master,
+    MasterSpec,
     Name,
     NodeState,
     Pod,
     ProxyPod,
+    ProxyReport,
     RosProxy,
+    RosProxySpec,
     Selector,
-    Spec,
     Stuck,
 )
 from rosproxy_operator.kubernetes.planner.names import own_labels, proxy_name, service_name
@@ -111,8 +111,8 @@ def service_obj(of: str = "arm", **meta: Any) -> Obj:
 
 def rosproxy(name: str = "arm", selector: Selector | None = None, **more: Any) -> RosProxy:
     """A RosProxy that has been read."""
-    master = more.pop("master", Master(uri=ROBOT))
-    spec = Spec(master, 32, PortRange(11400, 29999), pod_selector=selector)
+    master = more.pop("master", MasterSpec(uri=ROBOT))
+    spec = RosProxySpec(master, 32, PortRange(11400, 29999), pod_selector=selector)
     namespace = more.pop("namespace", NAMESPACE)
     return RosProxy(Name(namespace, name), f"uid-{name}", 3, spec, **more)
 
@@ -137,10 +137,10 @@ def stuck_proxy(why: Stuck, message: str = "because") -> ProxyPod:
     return proxy(ready=False, stuck=why, message=message)
 
 
-def answer(*names: str, **more: Any) -> Answer:
+def answer(*names: str, **more: Any) -> ProxyReport:
     """The answer of a proxy whose master is up, with ROS nodes in one pod."""
     there = {"10.244.1.5": names} if names else {}
-    return Answer(**{"answered": True, "master_up": True, "nodes": there, **more})
+    return ProxyReport(**{"answered": True, "master_up": True, "nodes": there, **more})
 
 
 def state(node: str = "node1", **more: Any) -> NodeState:

@@ -10,21 +10,21 @@ from rosproxy_operator.kubernetes.planner import manifests, names, objects
 from rosproxy_operator.kubernetes.planner.actions import Action, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
 from rosproxy_operator.kubernetes.planner.model import (
-    Finding,
-    Master,
+    ClusterFinding,
+    ClusterNode,
+    ClusterSnapshot,
+    MasterSpec,
     Name,
-    Node,
-    Observed,
     Pod,
     ProxyPod,
+    ProxyService,
     RosProxy,
-    Service,
-    Spec,
+    RosProxySpec,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 
 SETTINGS = ClusterSettings(image="rosproxy:1")
 STAMP = "2026-01-01T00:00:00Z"
@@ -35,19 +35,21 @@ ROBOT = Name("ros", "robot")
 def rosproxy(name: str = "robot", uid: str = "", **changes: Any) -> RosProxy:
     """A RosProxy in namespace ros with four ports per node. ``changes`` are of it or its spec."""
     words: dict[str, Any] = {
-        "master": Master("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
+        "master": MasterSpec("http://robot:11311"), "ports": 4, "window": PortRange(11400, 11499),
     }  # fmt: skip
     own = {key: changes.pop(key) for key in ("former", "cluster_ip", "status", "deleting")
            if key in changes}  # fmt: skip
-    return RosProxy(Name("ros", name), uid or f"uid-{name}", 1, Spec(**words | changes), **own)
+    return RosProxy(
+        Name("ros", name), uid or f"uid-{name}", 1, RosProxySpec(**words | changes), **own
+    )
 
 
-def node(name: str = "one", **changes: Any) -> Node:
+def node(name: str = "one", **changes: Any) -> ClusterNode:
     words: dict[str, Any] = {
         "addresses": {"InternalIP": "192.0.2.1", "Hostname": name},
         "pod_networks": ("10.244.1.0/24",),
     }
-    return Node(name, **words | changes)
+    return ClusterNode(name, **words | changes)
 
 
 def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **changes: Any) -> Pod:
@@ -64,14 +66,14 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
     return Pod(Name("ros", name), f"uid-{name}", **words | changes)
 
 
-def site(of: RosProxy, on: Node, ports: PortRange = RANGE, publish: int = 0) -> Site:
+def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> Site:
     host = on.advertise_host or on.addresses["InternalIP"]
     return Site(of, on, host, ports, Upstream(of.spec.master.uri, of.spec.master.address), publish)
 
 
 def proxy(
     of: RosProxy | None = None,
-    on: Node | None = None,
+    on: ClusterNode | None = None,
     ports: PortRange = RANGE,
     stuck: Stuck | None = None,
     phase: str = "Running",
@@ -93,18 +95,20 @@ def proxy(
     return replace(found, pod=own, ready=running, stuck=stuck, message="so it is" if stuck else "")
 
 
-def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -> Service:
+def service(of: RosProxy | None = None, ip: str = "10.96.1.1", **changes: Any) -> ProxyService:
     of = of or rosproxy()
     print_ = manifests.fingerprint_of(manifests.service(of))
-    found = Service(of.id, of.uid, f"uid-service-{of.id.name}", ip, print_)
+    found = ProxyService(of.id, of.uid, f"uid-service-{of.id.name}", ip, print_)
     return replace(found, **changes)
 
 
-def observed(*things: RosProxy | Node | Pod | ProxyPod | Service, **more: Any) -> Observed:
+def observed(
+    *things: RosProxy | ClusterNode | Pod | ProxyPod | ProxyService, **more: Any
+) -> ClusterSnapshot:
     """A cluster with these. Node one is there unless other nodes are given."""
-    nodes = [one for one in things if isinstance(one, Node)] or [node()]
-    services = [one for one in things if isinstance(one, Service)]
-    return Observed(
+    nodes = [one for one in things if isinstance(one, ClusterNode)] or [node()]
+    services = [one for one in things if isinstance(one, ProxyService)]
+    return ClusterSnapshot(
         rosproxies=tuple(one for one in things if isinstance(one, RosProxy)),
         nodes={one.name: one for one in nodes},
         pods=tuple(one for one in things if isinstance(one, Pod)),
@@ -114,21 +118,21 @@ def observed(*things: RosProxy | Node | Pod | ProxyPod | Service, **more: Any) -
     )
 
 
-def complete(**changes: Any) -> Observed:
+def complete(**changes: Any) -> ClusterSnapshot:
     """A pod, its proxy, and the Service."""
     return replace(observed(rosproxy(), pod(), proxy(), service()), **changes)
 
 
 def look(
-    seen: Observed,
-    memory: Memory | None = None,
+    seen: ClusterSnapshot,
+    memory: ClusterState | None = None,
     now: float = 100.0,
     settings: ClusterSettings = SETTINGS,
-) -> Plan:
-    return plan(seen, settings, memory or Memory(), now, STAMP)
+) -> ClusterPlan:
+    return plan(seen, settings, memory or ClusterState(), now, STAMP)
 
 
-def written(seen: Observed, found: Plan | None = None) -> Observed:
+def written(seen: ClusterSnapshot, found: ClusterPlan | None = None) -> ClusterSnapshot:
     """The cluster with the status that a plan, or the first one, writes."""
     found = found or look(seen)
     new = {one.of: one.status for one in found.actions if isinstance(one, PatchStatus)}
@@ -136,20 +140,20 @@ def written(seen: Observed, found: Plan | None = None) -> Observed:
     return replace(seen, rosproxies=tuple(rosproxies))
 
 
-def done(found: Plan) -> list[Action]:
+def done(found: ClusterPlan) -> list[Action]:
     """What a plan does to pods and Services."""
     return [action for action in found.actions if not isinstance(action, Emit | PatchStatus)]
 
 
-def status(found: Plan, of: Name = ROBOT) -> Mapping[str, Any]:
+def status(found: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:
     """The status that a plan writes."""
     written = [action for action in found.actions if isinstance(action, PatchStatus)]
     return next(action.status for action in written if action.of == of)
 
 
-def told(found: Plan, reason: str) -> list[str]:
+def told(found: ClusterPlan, reason: str) -> list[str]:
     """The texts of findings with a reason."""
-    some = (one for one in found.problems if isinstance(one, Finding))
+    some = (one for one in found.problems if isinstance(one, ClusterFinding))
     return [f"{one.subject}: {one.text}" for one in some if one.reason == reason]
 
 

@@ -23,10 +23,10 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
-from rosproxy_operator.kubernetes.planner.model import Answer, Failure, Name, Observed
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Failure, Name, ProxyReport
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 
 NAMESPACE = "ros"
 BAD_IMAGE = "no-such-image"
@@ -255,7 +255,9 @@ class Cluster:
 
     # what the controller sees
 
-    def observe(self, old: State | None, failures: dict[Name, tuple[Failure, ...]]) -> Observed:
+    def observe(
+        self, old: State | None, failures: dict[Name, tuple[Failure, ...]]
+    ) -> ClusterSnapshot:
         """What is there; pods, nodes and Services as they were before, if ``old`` is given."""
         seen = old or self.state
         pods = [parse.pod(one) for one in seen.pods.values()]
@@ -264,15 +266,15 @@ class Cluster:
         of = tuple(parse_rosproxy.rosproxy(one) for one in self.state.rosproxies.values())
         masters = {one.spec.master.service for one in of if one.spec.master.service}
         there = (self.master_ip, "") if self.master_ip else ("", "does not exist")
-        return Observed(
+        return ClusterSnapshot(
             rosproxies=of,
             nodes={name: parse.node(one) for name, one in seen.nodes.items()},
             pods=tuple(pods),
             proxies=tuple(own),
             services={one.of: one for one in services},
             masters=dict.fromkeys(masters, there),
-            answers={
-                uid: Answer(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
+            reports={
+                uid: ProxyReport(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
                 for uid, known in self.ros.items()
                 if uid in self.running()
             },
@@ -325,7 +327,7 @@ class Controller:
 
     def __init__(self, cluster: Cluster, settings: ClusterSettings) -> None:
         self.cluster, self.settings = cluster, settings
-        self.memory = Memory()
+        self.state = ClusterState()
         self.failures: dict[Name, tuple[Failure, ...]] = {}
         self.now = 1000.0
         self.old: State | None = None
@@ -334,16 +336,16 @@ class Controller:
         """What is there now is what the next looks see, until `forget`."""
         self.old = self.old or copy.deepcopy(self.cluster.state)
 
-    def look(self) -> Plan:
+    def look(self) -> ClusterPlan:
         observed = self.cluster.observe(self.old, self.failures)
         stamp = f"2026-01-01T{int(self.now) // 3600 % 24:02}:00:00Z"
-        found = plan(observed, self.settings, self.memory, self.now, stamp)
-        self.memory = found.memory
+        found = plan(observed, self.settings, self.state, self.now, stamp)
+        self.state = found.state
         for uid, addresses in found.gone.items():
             self.cluster.ros[uid] -= set(addresses)
         return found
 
-    def carry_out(self, found: Plan, most: int | None = None) -> None:
+    def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
         """Carry out a plan's actions, or the first few."""
         actions = found.actions[:most]
         failed: dict[Name, list[Failure]] = {action.of: [] for action in actions}
@@ -367,7 +369,7 @@ class Controller:
         return None
 
     def lose_memory(self) -> None:
-        self.memory, self.failures, self.old = Memory(), {}, None
+        self.state, self.failures, self.old = ClusterState(), {}, None
 
 
 SETTINGS = replace(ClusterSettings(), image="rosproxy:1")

@@ -8,9 +8,15 @@ import pytest
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.kubernetes.planner.model import Master, Name, Observed, Stuck
-from rosproxy_operator.kubernetes.planner.plan import Plan
-from rosproxy_operator.kubernetes.planner.state import Memory, Place
+from rosproxy_operator.kubernetes.planner.model import (
+    ClusterSnapshot,
+    MasterSpec,
+    Name,
+    ProxyPlace,
+    Stuck,
+)
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 from tests.unit.operator.kubernetes.objects import (
     RANGE,
     ROBOT,
@@ -28,29 +34,29 @@ from tests.unit.operator.kubernetes.objects import (
     told,
 )
 
-HERE = Place(ROBOT, "one")
+HERE = ProxyPlace(ROBOT, "one")
 NEXT = PortRange(11404, 11407)
 ARM = {names.INJECT: "arm"}
 OURS = {names.INJECT: "robot"}
 
 
-def scene(*more: Any, of: Any = None) -> Observed:
+def scene(*more: Any, of: Any = None) -> ClusterSnapshot:
     """A pod that wants a proxy, and other things."""
     of = of or rosproxy()
     return observed(of, service(of), pod(), *more)
 
 
-def created(found: Plan) -> str:
+def created(found: ClusterPlan) -> str:
     (action,) = done(found)
     assert isinstance(action, CreateProxy), action
     return ports_of(action)
 
 
 def publishing(port: int) -> Any:
-    return rosproxy(master=Master("http://robot:11311", publish=port))
+    return rosproxy(master=MasterSpec("http://robot:11311", publish=port))
 
 
-def host_ports(found: Plan) -> list[int]:
+def host_ports(found: ClusterPlan) -> list[int]:
     (action,) = done(found)
     assert isinstance(action, CreateProxy)
     return [one["hostPort"] for one in action.body["spec"]["containers"][0]["ports"]]
@@ -148,12 +154,12 @@ def test_ports_that_no_pod_may_have_are_named() -> None:
 # changes of what is asked for
 
 
-def changed(**changes: Any) -> tuple[str, Plan]:
+def changed(**changes: Any) -> tuple[str, ClusterPlan]:
     """The range that a running proxy gets when its RosProxy changes."""
     of = rosproxy(**changes)
     found = look(observed(of, service(of), pod(), proxy()))
-    assert found.memory.given[HERE] == found.memory.given[HERE]
-    return str(found.memory.given[HERE]), found
+    assert found.state.given[HERE] == found.state.given[HERE]
+    return str(found.state.given[HERE]), found
 
 
 @pytest.mark.parametrize(
@@ -163,7 +169,7 @@ def changed(**changes: Any) -> tuple[str, Plan]:
         ({"ports": 6}, "11400-11405"),
         ({"window": PortRange(11402, 11499)}, "11402-11405"),
         ({"window": PortRange(11400, 11403)}, "11400-11403"),
-        ({"master": Master("http://robot:11311", publish=11402)}, "11403-11406"),
+        ({"master": MasterSpec("http://robot:11311", publish=11402)}, "11403-11406"),
     ],
 )
 def test_a_change_moves_no_more_than_need_be(changes: dict, ports: str) -> None:
@@ -175,7 +181,7 @@ def test_a_change_moves_no_more_than_need_be(changes: dict, ports: str) -> None:
 def test_ports_are_not_left_because_there_could_be_more_elsewhere() -> None:
     of = rosproxy(ports=8)
     found = look(observed(of, service(of), pod(), proxy(), pod("web", ports=[11405])))
-    assert found.memory.given[HERE] == RANGE
+    assert found.state.given[HERE] == RANGE
     (text,) = told(found, "PortsExhausted")
     assert "spec.ports is 8, but the proxy on node one keeps its 4 at 11400-11403" in text
     assert "11404-11407 are not free" in text
@@ -191,28 +197,28 @@ def test_who_has_left_his_ports_is_told() -> None:
 # conflicts
 
 
-def served(**more: Any) -> Memory:
+def served(**more: Any) -> ClusterState:
     """The memory of a controller that has seen the proxy serve."""
-    return look(scene(proxy()), **more).memory
+    return look(scene(proxy()), **more).state
 
 
 def test_ports_that_never_served_are_left_at_once_if_they_can_not_be_had() -> None:
     first = look(scene())
     stuck = scene(proxy(stuck=Stuck.PORTS))
-    second = look(stuck, first.memory, 101.0)
+    second = look(stuck, first.state, 101.0)
     (deleted,) = done(second)
     assert isinstance(deleted, DeleteProxy)
     assert deleted.why == "made anew: its ports are to be 11404-11407 instead of 11400-11403"
-    third = look(scene(), second.memory, 102.0)
+    third = look(scene(), second.state, 102.0)
     assert created(third) == "11404-11407"
     assert "nothing needs to be done" in told(third, "PortConflict")[0]
-    assert not told(look(scene(proxy(ports=NEXT)), third.memory, 170.0), "PortConflict")
+    assert not told(look(scene(proxy(ports=NEXT)), third.state, 170.0), "PortConflict")
 
 
 def test_the_next_range_begins_after_the_port_that_a_pod_is_seen_to_hold() -> None:
     first = look(scene())
     stuck = scene(proxy(stuck=Stuck.PORTS), pod("web", ports=[11400]))
-    assert str(look(stuck, first.memory, 101.0).memory.given[HERE]) == "11401-11404"
+    assert str(look(stuck, first.state, 101.0).state.given[HERE]) == "11401-11404"
 
 
 def test_ports_that_have_served_are_tried_for_a_while() -> None:
@@ -220,18 +226,18 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
     first = look(stuck, served(), 101.0)
     assert done(first) == []
     assert told(first, "PortConflict")
-    second = look(stuck, first.memory, 120.9)
+    second = look(stuck, first.state, 120.9)
     assert done(second) == []
-    third = look(stuck, second.memory, 121.0)
+    third = look(stuck, second.state, 121.0)
     assert [type(one) for one in done(third)] == [DeleteProxy]
-    assert third.memory.given[HERE] == NEXT
+    assert third.state.given[HERE] == NEXT
     assert any("restart their pods" in text for text in told(third, "PortConflict"))
 
 
 def test_the_controller_looks_again_when_that_while_is_over() -> None:
     stuck = scene(proxy(stuck=Stuck.PORTS))
     first = look(stuck, served(), 101.0)
-    second = look(stuck, first.memory, 119.0)
+    second = look(stuck, first.state, 119.0)
     assert second.again_in == 2.0
 
 
@@ -239,16 +245,16 @@ def test_a_rejected_pod_is_made_anew_on_the_same_ports_for_a_while() -> None:
     failed = scene(replace(proxy(phase="Failed"), stuck=Stuck.PORTS))
     first = look(failed, served(), 101.0)
     assert [type(one) for one in done(first)] == [DeleteProxy]
-    second = look(scene(), first.memory, 102.0)
+    second = look(scene(), first.state, 102.0)
     assert created(second) == "11400-11403"
-    third = look(failed, second.memory, 122.0)
-    assert third.memory.given[HERE] == NEXT
+    third = look(failed, second.state, 122.0)
+    assert third.state.given[HERE] == NEXT
 
 
 def test_who_gets_his_ports_back_in_time_stays() -> None:
     first = look(scene(proxy(stuck=Stuck.PORTS)), served(), 101.0)
-    second = look(scene(proxy()), first.memory, 110.0)
-    third = look(scene(proxy(stuck=Stuck.PORTS)), second.memory, 125.0)
+    second = look(scene(proxy()), first.state, 110.0)
+    third = look(scene(proxy(stuck=Stuck.PORTS)), second.state, 125.0)
     assert done(third) == []
 
 
@@ -258,7 +264,7 @@ def test_another_proxy_that_is_about_to_end_is_waited_for() -> None:
     found = look(scene(proxy(stuck=Stuck.PORTS), ending))
     for now in (200.0, 300.0):
         assert not [one for one in done(found) if getattr(one, "of", None) == ROBOT]
-        found = look(scene(proxy(stuck=Stuck.PORTS), ending), found.memory, now)
+        found = look(scene(proxy(stuck=Stuck.PORTS), ending), found.state, now)
 
 
 def test_what_the_status_names_counts_as_served_after_a_restart_of_the_controller() -> None:
@@ -267,7 +273,7 @@ def test_what_the_status_names_counts_as_served_after_a_restart_of_the_controlle
 
 
 def test_refused_ports_are_avoided_for_five_minutes() -> None:
-    memory = look(scene(proxy(stuck=Stuck.PORTS)), look(scene()).memory, 101.0).memory
+    memory = look(scene(proxy(stuck=Stuck.PORTS)), look(scene()).state, 101.0).state
     arm = rosproxy("arm")
     wants = observed(arm, service(arm), pod("a", labels=ARM))
     assert created(look(wants, memory, 400.0)) == "11404-11407"
@@ -298,7 +304,7 @@ def test_of_two_that_wait_with_the_same_ports_one_stays() -> None:
     (deleted,) = done(found)
     assert isinstance(deleted, DeleteProxy)
     assert deleted.of.name == "robot"
-    assert found.memory.given[HERE] == PortRange(11404, 11407)
+    assert found.state.given[HERE] == PortRange(11404, 11407)
 
 
 def test_who_serves_comes_before_who_waits() -> None:
@@ -357,6 +363,6 @@ def test_who_has_the_masters_port_keeps_it() -> None:
 def test_a_masters_port_that_is_in_the_way_does_not_move_the_range() -> None:
     of = publishing(11500)
     stuck = proxy(of, stuck=Stuck.PORTS, publish=11500)
-    found = look(scene(stuck, pod("web", ports=[11500]), of=of), look(scene(of=of)).memory, 101.0)
+    found = look(scene(stuck, pod("web", ports=[11500]), of=of), look(scene(of=of)).state, 101.0)
     assert [type(one) for one in done(found)] == [DeleteProxy]
-    assert found.memory.given[HERE] == RANGE
+    assert found.state.given[HERE] == RANGE

@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, Kind, missing_rule, refusal
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, missing_rule, refusal
 from rosproxy_operator.kubernetes.planner.model import Name
 from rosproxy_operator.kubernetes.planner.names import own_labels
 from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
@@ -82,7 +82,7 @@ async def test_deletes_only_what_has_the_uid(server: ApiServer, api: Api) -> Non
     server.put("pods", pod("a"))
     with pytest.raises(ApiError) as caught:
         await in_thread(api.delete, "pods", Name("ns", "a"), "another")
-    assert caught.value.kind is Kind.CONFLICT
+    assert caught.value.kind is ErrorKind.CONFLICT
     uid = server.get("pods", "a")["metadata"]["uid"]
     await in_thread(api.delete, "pods", Name("ns", "a"), uid)
     assert not server.all("pods")
@@ -101,7 +101,7 @@ async def test_a_patch_with_a_failed_test_is_a_conflict(server: ApiServer, api: 
     operations = [{"op": "test", "path": "/metadata/uid", "value": "another"}]
     with pytest.raises(ApiError) as caught:
         await in_thread(api.patch, "pods", Name("ns", "a"), operations)
-    assert caught.value.kind is Kind.CONFLICT
+    assert caught.value.kind is ErrorKind.CONFLICT
 
 
 async def test_the_token_is_sent(server: ApiServer, api: Api) -> None:
@@ -120,7 +120,7 @@ async def test_an_api_server_that_is_away_and_back(
     late = Api()
     with pytest.raises(ApiError, match=f"API server at {other.url} can't be reached") as caught:
         await in_thread(late.nodes)
-    assert caught.value.kind is Kind.AWAY
+    assert caught.value.kind is ErrorKind.AWAY
     async with listening(other, port):
         assert await in_thread(late.nodes) == []
         late.close()
@@ -130,7 +130,7 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
     server.refuse("GET", "nodes", 200, "hello")
     with pytest.raises(ApiError, match="is no API server") as caught:
         await in_thread(api.nodes)
-    assert caught.value.kind is Kind.AWAY
+    assert caught.value.kind is ErrorKind.AWAY
 
 
 def test_no_cluster_is_one_line_that_says_what_to_do(
@@ -147,24 +147,29 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
 @pytest.mark.parametrize(
     ("status", "message", "kind", "told"),
     [
-        (403, FORBIDDEN, Kind.DENIED, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
-        (403, 'pods "p" is forbidden: violates PodSecurity "baseline"', Kind.INVALID, "violates"),
+        (403, FORBIDDEN, ErrorKind.DENIED, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
+        (
+            403,
+            'pods "p" is forbidden: violates PodSecurity "baseline"',
+            ErrorKind.INVALID,
+            "violates",
+        ),
         (
             403,
             "unable to create new content in namespace x because it is being terminated",
-            Kind.GONE,
+            ErrorKind.GONE,
             "terminated",
         ),
-        (401, "Unauthorized", Kind.AWAY, "does not know the controller's token"),
-        (404, 'pods "p" not found', Kind.GONE, 'pods "p" not found'),
-        (409, "exists", Kind.CONFLICT, "exists"),
-        (422, "spec.clusterIP: Invalid value", Kind.INVALID, "spec.clusterIP"),
-        (429, "storage is (re)initializing", Kind.AWAY, "HTTP 429"),
-        (503, "etcd", Kind.AWAY, "HTTP 503: etcd"),
-        (418, "tea", Kind.OTHER, "tea"),
+        (401, "Unauthorized", ErrorKind.AWAY, "does not know the controller's token"),
+        (404, 'pods "p" not found', ErrorKind.GONE, 'pods "p" not found'),
+        (409, "exists", ErrorKind.CONFLICT, "exists"),
+        (422, "spec.clusterIP: Invalid value", ErrorKind.INVALID, "spec.clusterIP"),
+        (429, "storage is (re)initializing", ErrorKind.AWAY, "HTTP 429"),
+        (503, "etcd", ErrorKind.AWAY, "HTTP 503: etcd"),
+        (418, "tea", ErrorKind.OTHER, "tea"),
     ],
 )
-def test_refusals(status: int, message: str, kind: Kind, told: str) -> None:
+def test_refusals(status: int, message: str, kind: ErrorKind, told: str) -> None:
     body = json.dumps({"kind": "Status", "message": message})
     error = refusal(status, "reason", body.encode())
     assert error.kind is kind

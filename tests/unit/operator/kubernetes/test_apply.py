@@ -9,7 +9,7 @@ from aiohttp import web
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.apply import Applier
+from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -20,7 +20,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.model import Name, Observed, RosProxy
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Name, RosProxy
 from rosproxy_operator.kubernetes.planner.names import own_labels
 from rosproxy_operator.kubernetes.planner.spec import rosproxy
 from tests.unit.operator.kubernetes.api_server import ApiServer
@@ -37,14 +37,14 @@ class Carried:
     def __init__(self, api: Api) -> None:
         self.counted: list[tuple[str, str]] = []
         self.tasks, self.proxies = Tasks(), ProxyClient()
-        self.applier = Applier(api, self.proxies, self.tasks, self.count)
+        self.applier = ClusterApplier(api, self.proxies, self.tasks, self.count)
 
     def count(self, action: Action, outcome: str) -> None:
         self.counted.append((type(action).__name__, outcome))
 
     async def out(self, *actions: Action, **observed: Any) -> None:
         observed.setdefault("rosproxies", (seen(),))
-        await self.applier.carry_out(actions, Observed(**observed))
+        await self.applier.carry_out(actions, ClusterSnapshot(**observed))
 
 
 @pytest.fixture

@@ -19,8 +19,12 @@ from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.errors import ApiError
 from rosproxy_operator.kubernetes.planner.model import Name
 from rosproxy_operator.kubernetes.webhook import certificates, rotation
-from rosproxy_operator.kubernetes.webhook.certificates import Pair, Unfit
-from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, Directory, SelfSigned
+from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
+from rosproxy_operator.kubernetes.webhook.rotation import (
+    CertificateDirectory,
+    CertificateRotation,
+    SelfSigned,
+)
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 from tests.unit.operator.kubernetes.api_server import ApiServer
 
@@ -61,7 +65,7 @@ def source(api: Api, clock: Clock) -> SelfSigned:
 
 
 @contextlib.asynccontextmanager
-async def served(pair: Pair) -> AsyncIterator[tuple[int, ssl.SSLContext]]:
+async def served(pair: KeyPair) -> AsyncIterator[tuple[int, ssl.SSLContext]]:
     """A TLS server on loopback; its port and context."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     certificates.load(context, pair)
@@ -145,9 +149,9 @@ def test_a_secret_holds_it() -> None:
     ],
 )
 def test_what_is_no_pair_is_unfit(change: dict[str, str]) -> None:
-    with pytest.raises(Unfit):
+    with pytest.raises(InvalidCertificate):
         certificates.read({**certificates.make(NAMES, NOW).secret(), **change})
-    with pytest.raises(Unfit, match=r"it has no tls.crt"):
+    with pytest.raises(InvalidCertificate, match=r"it has no tls.crt"):
         certificates.read({})
 
 
@@ -265,14 +269,14 @@ async def test_who_writes_the_secret_first_has_the_right_one(server: ApiServer, 
     assert await in_thread(one.refresh) == theirs
 
 
-def write(directory: Path, pair: Pair) -> None:
+def write(directory: Path, pair: KeyPair) -> None:
     (directory / "tls.crt").write_bytes(pair.certificate)
     (directory / "tls.key").write_bytes(pair.key)
 
 
 async def test_a_directory_is_read_again(tmp_path: Path) -> None:
-    one = Directory(str(tmp_path))
-    with pytest.raises(Unfit, match=r"--webhook-cert-dir: .*tls.crt: No such file"):
+    one = CertificateDirectory(str(tmp_path))
+    with pytest.raises(InvalidCertificate, match=r"--webhook-cert-dir: .*tls.crt: No such file"):
         one.refresh()
     pair, other = certificates.make(NAMES, NOW), certificates.make(NAMES, NOW)
     write(tmp_path, pair)
@@ -283,7 +287,7 @@ async def test_a_directory_is_read_again(tmp_path: Path) -> None:
 
 async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> None:
     write(tmp_path, certificates.make(NAMES, NOW))
-    one = CertificateRotation(Directory(str(tmp_path)), ClusterMetrics())
+    one = CertificateRotation(CertificateDirectory(str(tmp_path)), ClusterMetrics())
     await one.refresh()
     first = one.pair
     (tmp_path / "tls.crt").write_bytes(certificates.make(NAMES, NOW).certificate)
@@ -295,7 +299,7 @@ async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) ->
     class Broken:
         every = 1.0
 
-        def refresh(self) -> Pair:
+        def refresh(self) -> KeyPair:
             raise RuntimeError("oops")
 
     one = CertificateRotation(Broken(), ClusterMetrics())
@@ -311,7 +315,7 @@ async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPa
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    held = CertificateRotation(rotation.Directory(""), ClusterMetrics())
+    held = CertificateRotation(rotation.CertificateDirectory(""), ClusterMetrics())
 
     async def answer(review: Any, **_: Any) -> Any:
         return {}

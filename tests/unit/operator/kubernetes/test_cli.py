@@ -7,7 +7,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator import cli
 from rosproxy_operator.kubernetes.planner.model import Name
-from rosproxy_operator.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
 
 HOOK = ["--webhook-bind=0.0.0.0:9443"]
 

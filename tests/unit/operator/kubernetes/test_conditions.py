@@ -6,11 +6,11 @@ import pytest
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
+    ClusterFinding,
     Failure,
-    Finding,
-    Master,
+    MasterSpec,
     Name,
+    ProxyReport,
     Reference,
     Stuck,
 )
@@ -85,7 +85,7 @@ def test_another_reason_for_a_node_without_proxy():
 
 
 def test_the_master_is_not_reached():
-    down = Answer(True, False, "refused", problems=("master: refused", "/a: hangs"))
+    down = ProxyReport(True, False, "refused", problems=("master: refused", "/a: hangs"))
     found = status(state("node2"), state(proxy=proxy(ready=False), answer=down))
 
     assert judged(found, "MasterReachable") == ("False", "MasterUnreachable")
@@ -96,8 +96,8 @@ def test_the_master_is_not_reached():
 
 
 def test_a_master_in_the_cluster_is_told_by_its_service():
-    of = rosproxy(master=Master(service=Name("robots", "roscore")))
-    down = state(proxy=proxy(ready=False), answer=Answer(True, False, "refused"))
+    of = rosproxy(master=MasterSpec(service=Name("robots", "roscore")))
+    down = state(proxy=proxy(ready=False), answer=ProxyReport(True, False, "refused"))
 
     assert "start roscore behind Service robots/roscore, port 11311" in message(status(down, of=of))
 
@@ -120,7 +120,9 @@ def test_what_proxies_warn_of_keeps_nobody_from_being_served():
 
 def test_a_pod_that_is_left_out_keeps_the_others_ready():
     about = Reference("Pod", Name("robots", "x"), "u")
-    one = Finding("pod robots/x", "is ambiguous", reason="Ambiguous", of=rosproxy().id, about=about)
+    one = ClusterFinding(
+        "pod robots/x", "is ambiguous", reason="Ambiguous", of=rosproxy().id, about=about
+    )
 
     assert judged(status(state(), more=(one,)), "Ready") == ("True", "Serving")
     assert judged(status(state(), more=(one,)), "Degraded") == ("True", "Ambiguous")

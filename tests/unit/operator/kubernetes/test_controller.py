@@ -9,14 +9,16 @@ from typing import Any
 import pytest
 from aiohttp import web
 
+from rosproxy_operator.common import control_loop
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.planner.model import Observed
-from rosproxy_operator.kubernetes.planner.plan import Plan, plan
-from rosproxy_operator.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.webhook.injector import Injector
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
 
@@ -40,14 +42,15 @@ class Running:
         self.task = asyncio.create_task(self.controller.run())
 
     def looks(self, outcome: str = "ok") -> float:
-        return float(self.metrics.looks.labels(outcome)._value.get())
+        name, labels = "rosproxy_operator_looks_total", {"outcome": outcome}
+        return self.metrics.registry.get_sample_value(name, labels) or 0.0
 
 
 @pytest.fixture
 async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Running]:
     monkeypatch.setattr(module, "DEBOUNCE", 0.01)
     monkeypatch.setattr(module, "SETTLED", 0.05)
-    monkeypatch.setattr(module, "PAUSES", (0.02,))
+    monkeypatch.setattr(control_loop, "PAUSES", (0.02,))
     monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
     monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.02)
     one = Running(api)
@@ -85,6 +88,21 @@ async def test_a_labelled_pod_gets_a_proxy(server: ApiServer, running: Running) 
         return server.get("rosproxies", "arm", NAMESPACE)["status"].get("masterURI")
 
     await until(lambda: told() == "http://10.96.0.7:11311")
+
+
+async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
+    server: ApiServer, api: Api, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The webhook waits for the Service that the controller makes."""
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.0)
+    await until(lambda: running.looks() > 0)
+    put_all(server)
+    injector = Injector(api, running.metrics, running.controller.wake)
+    wiring = await injector.wiring(pod_obj("talker", INJECT), dry_run=False)
+    (service,) = server.all("services")
+    uri = f"http://{service['spec']['clusterIP']}:11311"
+    assert wiring.annotations == {"rosproxy.io/master-uri": uri}
+    assert len(server.asked("POST", "services")) == 1
 
 
 async def test_it_settles(server: ApiServer, running: Running) -> None:
@@ -133,14 +151,14 @@ async def test_a_mistake_of_ours_does_not_end_it(
 ) -> None:
     await until(lambda: running.looks() > 0)
 
-    def broken(*_: Any) -> Plan:
+    def broken(*_: Any) -> ClusterPlan:
         raise RuntimeError("oops")
 
     real = plan
     monkeypatch.setattr(module, "plan", broken)
     running.controller.wake()
     await until(lambda: running.looks("failed") > 2)
-    assert running.controller.unready() == "the controller failed: RuntimeError('oops')"
+    assert running.controller.unready() == "the operator failed: RuntimeError('oops')"
     monkeypatch.setattr(module, "plan", real)
     await until(lambda: running.controller.unready() is None)
 
@@ -170,7 +188,7 @@ async def test_a_proxy_is_asked_and_told(
     told: list[Any] = []
 
     async def status(_: web.Request) -> web.Response:
-        return web.json_response({"master": {"up": True}, "nodes": []})
+        return web.json_response({"settings": {}, "master": {"up": True}, "nodes": []})
 
     async def containers(request: web.Request) -> web.Response:
         told.append((request.headers["Authorization"], await request.json()))
@@ -185,9 +203,9 @@ async def test_a_proxy_is_asked_and_told(
     real = plan
     gone: dict[str, tuple[str, ...]] = {}
 
-    def planned(observed: Observed, *rest: Any) -> Plan:
+    def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
         found = real(observed, *rest)
-        return Plan(found.actions, found.problems, found.memory, {**gone}, found.again_in)
+        return ClusterPlan(found.actions, found.problems, found.state, {**gone}, found.again_in)
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)
@@ -208,25 +226,3 @@ async def test_a_proxy_is_asked_and_told(
     token = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN")
     assert told == [(f"Bearer {token}", {"gone": ["10.244.1.9"]})] * 2
     await runner.cleanup()
-
-
-async def test_a_loop_that_hangs_is_dead(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    await until(lambda: running.looks() > 0)
-    monkeypatch.setattr(module, "LONGEST_BEAT", 0.05)
-    time.sleep(0.2)
-    assert "the event loop has not run for" in (running.controller.dead() or "")
-
-
-async def test_a_look_that_hangs_is_dead(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    await until(lambda: running.looks() > 0)
-    monkeypatch.setattr(module, "LONGEST_LOOK", 0.05)
-    release = asyncio.Event()
-
-    async def hang() -> Any:
-        await release.wait()
-
-    monkeypatch.setattr(running.controller, "look", hang)
-    running.controller._looking_since = time.monotonic() - 1
-    assert "looking at the cluster for 1 s" in (running.controller.dead() or "")
-    running.controller.wake()
-    await until(lambda: running.looks("unavailable") > 0)

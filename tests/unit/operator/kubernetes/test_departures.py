@@ -4,27 +4,29 @@ from dataclasses import replace
 from typing import Any
 
 from rosproxy_operator.kubernetes.planner.departures import AGAIN, REMEMBERED, UNSEEN, gone, waits
-from rosproxy_operator.kubernetes.planner.model import Answer, Observed
-from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyReport
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 from tests.unit.operator.kubernetes.objects import look, node, observed, pod, proxy, rosproxy
 
 PROXY = "uid-proxy-robot-one"
 TALKER, LISTENER = "10.244.1.7", "10.244.1.8"
 
 
-def seen(*things: Any, names: tuple[str, ...] = (TALKER,), **more: Any) -> Observed:
-    answer = Answer(True, True, nodes=dict.fromkeys(names, ("/a",)))
-    return observed(rosproxy(), proxy(), *things, **{"answers": {PROXY: answer}} | more)
+def seen(*things: Any, names: tuple[str, ...] = (TALKER,), **more: Any) -> ClusterSnapshot:
+    answer = ProxyReport(True, True, nodes=dict.fromkeys(names, ("/a",)))
+    return observed(rosproxy(), proxy(), *things, **{"reports": {PROXY: answer}} | more)
 
 
-def remembering(*things: Any) -> Memory:
-    return gone(seen(*things), Memory(), 0.0).memory
+def remembering(*things: Any) -> ClusterState:
+    return gone(seen(*things), ClusterState(), 0.0).state
 
 
 KNOWN = remembering(pod(ip=TALKER))
 
 
-def told(observed_: Observed, memory: Memory = KNOWN, now: float = 1.0) -> tuple[str, ...]:
+def told(
+    observed_: ClusterSnapshot, memory: ClusterState = KNOWN, now: float = 1.0
+) -> tuple[str, ...]:
     return gone(observed_, memory, now).gone.get(PROXY, ())
 
 
@@ -46,12 +48,12 @@ def test_nodes_of_a_pod_that_is_about_to_end_are_not_gone_yet() -> None:
 
 def test_it_is_told_until_the_proxy_does_not_name_them_any_more() -> None:
     first = gone(seen(), KNOWN, 1.0)
-    second = gone(seen(), first.memory, 2.0)
+    second = gone(seen(), first.state, 2.0)
     assert first.gone == second.gone == {PROXY: (TALKER,)}
-    third = gone(seen(names=()), second.memory, 3.0)
+    third = gone(seen(names=()), second.state, 3.0)
     assert third.gone == {}
-    fourth = gone(seen(names=()), third.memory, REMEMBERED)
-    assert TALKER not in fourth.memory.addresses["one"]
+    fourth = gone(seen(names=()), third.state, REMEMBERED)
+    assert TALKER not in fourth.state.addresses["one"]
 
 
 def test_a_node_that_has_registered_just_before_its_pod_went_is_told() -> None:
@@ -59,7 +61,7 @@ def test_a_node_that_has_registered_just_before_its_pod_went_is_told() -> None:
     unnamed = seen(names=())
     second = gone(unnamed, KNOWN, 3.0)
     assert list(waits(second, 3.0)) == [AGAIN]
-    assert gone(seen(), second.memory, 6.0).gone == {PROXY: (TALKER,)}
+    assert gone(seen(), second.state, 6.0).gone == {PROXY: (TALKER,)}
 
 
 def test_the_controller_looks_again_until_it_is_told_no_more() -> None:
@@ -80,39 +82,39 @@ def test_an_address_on_another_node_counts_as_nobodys_here() -> None:
 
 def test_a_pod_may_run_before_its_address_is_known() -> None:
     starting = seen(pod(ip="", phase="Pending"), names=(TALKER,))
-    first = gone(starting, Memory(), 0.0)
+    first = gone(starting, ClusterState(), 0.0)
     assert first.gone == {}
-    assert gone(starting, first.memory, UNSEEN + 1).gone == {}
-    assert gone(seen(pod(ip=TALKER)), first.memory, UNSEEN + 1).gone == {}
+    assert gone(starting, first.state, UNSEEN + 1).gone == {}
+    assert gone(seen(pod(ip=TALKER)), first.state, UNSEEN + 1).gone == {}
 
 
 def test_after_a_restart_addresses_in_the_pod_network_are_given_up_after_a_while() -> None:
-    first = gone(seen(), Memory(), 0.0)
+    first = gone(seen(), ClusterState(), 0.0)
     assert first.gone == {}
-    assert gone(seen(), first.memory, UNSEEN - 1).gone == {}
-    assert gone(seen(), first.memory, UNSEEN).gone == {PROXY: (TALKER,)}
+    assert gone(seen(), first.state, UNSEEN - 1).gone == {}
+    assert gone(seen(), first.state, UNSEEN).gone == {PROXY: (TALKER,)}
 
 
 def test_the_controller_looks_again_when_that_while_is_over() -> None:
     again = look(seen(names=(TALKER,)), now=0.0)
-    assert again.memory.strange == {("one", TALKER): 0.0}
-    later = look(seen(names=(TALKER,)), again.memory, UNSEEN - 0.5)
+    assert again.state.strange == {("one", TALKER): 0.0}
+    later = look(seen(names=(TALKER,)), again.state, UNSEEN - 0.5)
     assert later.again_in == 0.5
-    assert look(seen(names=(TALKER,)), later.memory, UNSEEN).gone == {PROXY: (TALKER,)}
+    assert look(seen(names=(TALKER,)), later.state, UNSEEN).gone == {PROXY: (TALKER,)}
 
 
 def test_what_is_outside_the_pod_network_is_left_alone() -> None:
     stranger = seen(names=("192.0.2.99", "no address", "fd00::7"))
-    first = gone(stranger, Memory(), 0.0)
-    assert first.memory.strange == {}
-    assert gone(stranger, first.memory, 100.0).gone == {}
+    first = gone(stranger, ClusterState(), 0.0)
+    assert first.state.strange == {}
+    assert gone(stranger, first.state, 100.0).gone == {}
 
 
 def test_without_a_known_pod_network_only_what_was_a_pods_is_gone() -> None:
     bare = seen(node(pod_networks=()), names=(TALKER, LISTENER))
     first = gone(bare, KNOWN, 0.0)
     assert first.gone == {PROXY: (TALKER,)}
-    assert gone(bare, first.memory, 100.0).gone == {PROXY: (TALKER,)}
+    assert gone(bare, first.state, 100.0).gone == {PROXY: (TALKER,)}
 
 
 def test_a_node_that_is_not_ready_is_not_judged() -> None:
@@ -126,9 +128,9 @@ def test_pods_in_the_nodes_own_network_are_no_reason_to_call_its_address_gone() 
 
 
 def test_a_proxy_that_does_not_answer_is_told_nothing_and_nothing_is_forgotten() -> None:
-    silent = seen(answers={PROXY: Answer(False, error="refused")})
+    silent = seen(reports={PROXY: ProxyReport(False, error="refused")})
     found = gone(silent, KNOWN, 1.0)
     assert found.gone == {}
-    assert TALKER in found.memory.addresses["one"]
-    unasked = gone(replace(silent, answers={}), found.memory, 2.0)
-    assert gone(seen(), unasked.memory, 3.0).gone == {PROXY: (TALKER,)}
+    assert TALKER in found.state.addresses["one"]
+    unasked = gone(replace(silent, reports={}), found.state, 2.0)
+    assert gone(seen(), unasked.state, 3.0).gone == {PROXY: (TALKER,)}

@@ -8,20 +8,20 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.events import LONGEST, MOST, QUIET, done, news
-from rosproxy_operator.kubernetes.planner.model import Finding, Name, Reference
+from rosproxy_operator.kubernetes.planner.events import LONGEST, MOST, QUIET, results, warnings
+from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Name, Reference
 from tests.unit.operator.kubernetes.builders_api import proxy_obj, rosproxy
 
 ARM = Name("robots", "arm")
 OF_ARM = Reference("RosProxy", ARM, "uid-arm")
 
 
-def finding(text: str = "no ports", about: Reference | None = OF_ARM) -> Finding:
-    return Finding("node node1", text, reason="PortsExhausted", of=ARM, about=about)
+def finding(text: str = "no ports", about: Reference | None = OF_ARM) -> ClusterFinding:
+    return ClusterFinding("node node1", text, reason="PortsExhausted", of=ARM, about=about)
 
 
 def test_a_problem_that_is_new_is_told():
-    found = news([finding()], {}, 10.0)
+    found = warnings([finding()], {}, 10.0)
 
     (emit,) = found.emits
     assert (emit.of, emit.type, emit.reason) == (ARM, "Warning", "PortsExhausted")
@@ -33,66 +33,68 @@ def test_a_problem_that_is_new_is_told():
         "name": "arm",
         "uid": "uid-arm",
     }
-    assert found.seen == {finding(): 10.0}
+    assert found.reported == {finding(): 10.0}
 
 
 def test_a_pods_problem_is_told_at_the_pod():
     about = Reference("Pod", Name("robots", "talker"), "uid-talker")
-    one = Finding("pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=about)
+    one = ClusterFinding(
+        "pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=about
+    )
 
-    (emit,) = news([one], {}, 0.0).emits
+    (emit,) = warnings([one], {}, 0.0).emits
 
     assert (emit.about["apiVersion"], emit.about["kind"]) == ("v1", "Pod")
     assert emit.message == "is not wired"
 
 
 def test_a_problem_that_stays_is_not_told_again():
-    told = news([finding()], {}, 0.0)
+    told = warnings([finding()], {}, 0.0)
     for now in (3.0, 1000.0, 2000.0):
-        told = news([finding()], told.seen, now)
+        told = warnings([finding()], told.reported, now)
         assert told.emits == ()
 
 
 def test_a_problem_that_comes_and_goes_is_told_once():
-    told = news([finding()], {}, 0.0)
+    told = warnings([finding()], {}, 0.0)
     for now in range(3, 600, 3):
-        told = news([finding()] if now % 2 else [], told.seen, float(now))
+        told = warnings([finding()] if now % 2 else [], told.reported, float(now))
         assert told.emits == ()
 
 
 def test_a_problem_that_comes_back_after_a_while_is_told_again():
-    told = news([], news([finding()], {}, 0.0).seen, QUIET)
+    told = warnings([], warnings([finding()], {}, 0.0).reported, QUIET)
 
-    assert told.seen == {}
-    assert len(news([finding()], told.seen, QUIET + 1).emits) == 1
+    assert told.reported == {}
+    assert len(warnings([finding()], told.reported, QUIET + 1).emits) == 1
 
 
 def test_another_text_is_another_problem():
-    told = news([finding()], {}, 0.0)
+    told = warnings([finding()], {}, 0.0)
 
-    assert len(news([finding("other ports")], told.seen, 1.0).emits) == 1
+    assert len(warnings([finding("other ports")], told.reported, 1.0).emits) == 1
 
 
 def test_problems_without_an_object_make_no_event():
-    assert news([finding(about=None), Problem("x", "y")], {}, 0.0).emits == ()
+    assert warnings([finding(about=None), Problem("x", "y")], {}, 0.0).emits == ()
 
 
 def test_the_same_problem_twice_makes_one_event():
-    assert len(news([finding(), finding()], {}, 0.0).emits) == 1
+    assert len(warnings([finding(), finding()], {}, 0.0).emits) == 1
 
 
 def test_many_problems_have_their_turn():
     many = [finding(str(i)) for i in range(MOST + 5)]
 
-    first = news(many, {}, 0.0)
-    second = news(many, first.seen, 1.0)
+    first = warnings(many, {}, 0.0)
+    second = warnings(many, first.reported, 1.0)
 
     assert (len(first.emits), len(second.emits)) == (MOST, 5)
-    assert news(many, second.seen, 2.0).emits == ()
+    assert warnings(many, second.reported, 2.0).emits == ()
 
 
 def test_a_message_is_not_longer_than_the_api_server_takes():
-    (emit,) = news([finding("ü" * LONGEST)], {}, 0.0).emits
+    (emit,) = warnings([finding("ü" * LONGEST)], {}, 0.0).emits
 
     assert LONGEST - 3 <= len(emit.message.encode()) <= LONGEST
     assert emit.message.endswith("ü…")
@@ -108,7 +110,7 @@ def test_what_is_done_is_told():
         SetImage(Name("robots", "leg"), pod, "u", "rosproxy:3"),
     ]
 
-    found = done(rosproxy(), actions)
+    found = results(rosproxy(), actions)
 
     name = body["metadata"]["name"]
     assert [(one.type, one.reason, one.message) for one in found] == [

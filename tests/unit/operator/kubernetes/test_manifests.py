@@ -8,7 +8,7 @@ import pytest
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests, objects
 from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
-from rosproxy_operator.kubernetes.planner.model import Json, Master
+from rosproxy_operator.kubernetes.planner.model import Json, MasterSpec
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
@@ -179,7 +179,7 @@ def test_a_fingerprint_tells_whether_nodes_are_found_again() -> None:
     same = manifests.fingerprint_of(body(cleanup_after=1.0))
     assert manifests.finds_again(own, same)
     assert manifests.finds_again("", own)
-    for other in (body(master=Master("http://arm:11311")),
+    for other in (body(master=MasterSpec("http://arm:11311")),
                   body(site(rosproxy(), node(advertise_host="gate")))):  # fmt: skip
         assert not manifests.finds_again(own, manifests.fingerprint_of(other))
 
@@ -204,8 +204,8 @@ def test_the_fingerprint_does_not_depend_on_image_and_token() -> None:
         site(rosproxy(), node(pod_networks=())),
         site(rosproxy(), node(), PortRange(11400, 11404)),
         site(rosproxy(), node(), publish=11500),
-        site(rosproxy(master=Master("http://arm:11311")), node()),
-        site(rosproxy(master=Master("http://robot:11311", "192.0.2.7")), node()),
+        site(rosproxy(master=MasterSpec("http://arm:11311")), node()),
+        site(rosproxy(master=MasterSpec("http://robot:11311", "192.0.2.7")), node()),
         site(rosproxy(cleanup_after=1.0), node()),
         site(rosproxy(image_pull_policy="Never"), node()),
     ],

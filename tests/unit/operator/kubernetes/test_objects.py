@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.admin.status_document import read_status
 from rosproxy_operator.kubernetes.planner.model import ELSEWHERE, Name
 from rosproxy_operator.kubernetes.planner.objects import node, pod, proxy_pod, service
-from rosproxy_operator.kubernetes.planner.proxy_status import RECENT, answer, no_answer
+from rosproxy_operator.kubernetes.planner.proxy_status import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.planner.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
     CLUSTER_IP,
@@ -233,7 +234,7 @@ STATUS = {
 
 
 def test_what_a_proxy_answers():
-    found = answer(STATUS)
+    found = report(read_status(STATUS))
 
     assert (found.answered, found.master_up, found.error, found.used) == (True, True, "", 2)
     assert found.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
@@ -242,8 +243,8 @@ def test_what_a_proxy_answers():
 
 
 def test_a_proxy_without_its_master():
-    assert answer({"master": {"up": False, "error": "refused"}}).error == "refused"
-    assert answer({"master": {"up": False, "error": ""}}).error == "not asked yet"
+    assert report(read_status({"master": {"up": False, "error": "refused"}})).error == "refused"
+    assert report(read_status({"master": {"up": False, "error": ""}})).error == "not asked yet"
 
 
 def test_a_proxy_that_does_not_answer():
@@ -268,7 +269,7 @@ _json = st.recursive(
 
 @given(_json)
 def test_no_answer_of_a_proxy_is_too_strange(status):
-    assert answer(status).answered
+    assert report(read_status(status)).answered
 
 
 @given(st.dictionaries(st.sampled_from(["metadata", "spec", "status"]), _json))

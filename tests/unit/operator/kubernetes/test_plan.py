@@ -17,12 +17,12 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.model import (
     Advertise,
+    ClusterSnapshot,
     InvalidRosProxy,
-    Master,
+    MasterSpec,
     Name,
-    Observed,
 )
-from rosproxy_operator.kubernetes.planner.plan import Plan
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,
@@ -42,7 +42,7 @@ from tests.unit.operator.kubernetes.objects import (
 
 PROXY = names.proxy_id(ROBOT, "one")
 MASTER = Name("ros", "roscore")
-INSIDE = Master(service=MASTER)
+INSIDE = MasterSpec(service=MASTER)
 
 
 def env(action: Any) -> dict[str, str]:
@@ -50,7 +50,7 @@ def env(action: Any) -> dict[str, str]:
     return {one["name"]: one["value"] for one in variables}
 
 
-def reasons(found: Plan) -> list[str]:
+def reasons(found: ClusterPlan) -> list[str]:
     return [action.reason for action in found.actions if isinstance(action, Emit)]
 
 
@@ -74,7 +74,7 @@ def test_when_all_is_there_nothing_is_done() -> None:
     first = look(complete())
     assert done(first) == []
     of = rosproxy(status=status(first), cluster_ip="10.96.1.1")
-    second = look(complete(rosproxies=(of,)), first.memory, 101.0)
+    second = look(complete(rosproxies=(of,)), first.state, 101.0)
     assert (second.actions, second.again_in) == ((), None)
 
 
@@ -120,9 +120,9 @@ def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
     alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
     first = look(alone, now=100.0)
     assert (done(first), first.again_in) == ([], 30.0)
-    second = look(alone, first.memory, 120.0)
+    second = look(alone, first.state, 120.0)
     assert (done(second), second.again_in) == ([], 10.0)
-    (gone,) = done(look(alone, second.memory, 130.0))
+    (gone,) = done(look(alone, second.state, 130.0))
     assert gone == DeleteProxy(
         ROBOT, PROXY, "uid-proxy-robot-one", "no pod on node one wants it since 30 s", retire=True
     )
@@ -130,7 +130,7 @@ def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
 
 def test_the_grace_begins_anew_when_pods_come_back() -> None:
     alone = written(observed(rosproxy(grace=30.0), service(), proxy()))
-    memory = look(complete(), look(alone, now=100.0).memory, 110.0).memory
+    memory = look(complete(), look(alone, now=100.0).state, 110.0).state
     assert look(alone, memory, 135.0).again_in == 30.0
 
 
@@ -138,7 +138,7 @@ def test_a_proxy_on_a_node_that_is_gone_is_deleted_after_a_while() -> None:
     gone = written(observed(rosproxy(), service(), node("two"), proxy()))
     first = look(gone)
     assert (done(first), first.again_in) == ([], 10.0)
-    (deleted,) = done(look(gone, first.memory, 110.0))
+    (deleted,) = done(look(gone, first.state, 110.0))
     assert isinstance(deleted, DeleteProxy)
     assert (deleted.why, deleted.retire) == ("its node is gone", False)
 
@@ -152,7 +152,7 @@ def test_another_image_is_given_to_the_pod_that_is_there() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"master": Master("http://robot2:11311")},
+        {"master": MasterSpec("http://robot2:11311")},
         {"ports": 5},
         {"cleanup_after": 5.0},
         {"slave_control": "master"},
@@ -171,9 +171,9 @@ def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: d
     assert deleted.retire == ("master" in changes)
     assert deleted.why.startswith("made anew: ")
     ending = observed(of, pod(), service(of), proxy(deleting=True))
-    second = look(ending, first.memory, 101.0)
+    second = look(ending, first.state, 101.0)
     assert done(second) == []
-    third = look(observed(of, pod(), service(of)), second.memory, 102.0)
+    third = look(observed(of, pod(), service(of)), second.state, 102.0)
     assert [type(one) for one in done(third)] == [CreateProxy]
 
 
@@ -186,7 +186,9 @@ def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: d
         (complete(rosproxies=(rosproxy(ports=2),)), False),
     ],
 )
-def test_who_is_not_found_again_at_the_master_is_unregistered(seen: Observed, retire: bool) -> None:
+def test_who_is_not_found_again_at_the_master_is_unregistered(
+    seen: ClusterSnapshot, retire: bool
+) -> None:
     (deleted,) = done(look(seen))
     assert isinstance(deleted, DeleteProxy)
     assert deleted.retire == retire
@@ -226,7 +228,7 @@ def test_one_of_the_same_name_takes_over_once_all_is_gone() -> None:
         (DeleteProxy, False),
         (DeleteService, None),
     ]
-    service_, proxy_ = done(look(observed(new, pod()), first.memory, 110.0))
+    service_, proxy_ = done(look(observed(new, pod()), first.state, 110.0))
     assert isinstance(service_, CreateService)
     assert service_.body["spec"]["clusterIP"] == "10.96.1.1"
     assert isinstance(proxy_, CreateProxy)
@@ -265,7 +267,7 @@ def test_a_proxy_under_a_name_of_former_times_goes_first() -> None:
     old = replace(proxy(), pod=replace(proxy().pod, id=Name("ros", "rosproxy-old")))
     first = look(observed(rosproxy(), service(), pod(), old))
     assert [getattr(one, "id", None) for one in done(first)] == [Name("ros", "rosproxy-old")]
-    second = look(observed(rosproxy(), service(), pod()), first.memory, 101.0)
+    second = look(observed(rosproxy(), service(), pod()), first.state, 101.0)
     assert [type(one) for one in done(second)] == [CreateProxy]
 
 

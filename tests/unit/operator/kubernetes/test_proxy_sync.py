@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 
+from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.planner.model import ProxyPod
 from rosproxy_operator.kubernetes.planner.objects import proxy_pod
-from rosproxy_operator.kubernetes.proxy_sync import ProxySync
+from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
 UP = {"master": {"up": True}, "nodes": []}
@@ -31,12 +32,12 @@ class Told(ProxyClient):
         self.asked = self.failing = 0
         self.told: list[Any] = []
 
-    async def status(self, where: HostPort) -> dict[str, Any]:
+    async def status(self, where: HostPort) -> ProxyStatus:
         self.asked += 1
         self.failing -= 1
         if self.says is None or self.failing >= 0:
             raise ProxyError(f"{where} refuses connections")
-        return self.says
+        return read_status(self.says)
 
     async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)
@@ -48,7 +49,7 @@ class Told(ProxyClient):
 class Talk:
     def __init__(self) -> None:
         self.proxies, self.tasks, self.changes = Told(), Tasks(), 0
-        self.all = ProxySync(self.tasks, self.proxies, self.changed)
+        self.all = ClusterProxySync(self.tasks, self.proxies, self.changed)
 
     def changed(self) -> None:
         self.changes += 1
@@ -85,22 +86,22 @@ UID = proxy().pod.uid
 
 async def test_an_answer(talk: Talk) -> None:
     talk.proxies.says = UP
-    talk.all.hold([proxy()])
+    talk.all.follow([proxy()])
     await talk.asked()
-    assert talk.all.answers[UID].master_up
+    assert talk.all.reports[UID].master_up
     assert talk.changes == 1  # the same answer is no news
 
 
 async def test_one_that_is_just_starting_is_no_news(talk: Talk) -> None:
-    talk.all.hold([proxy()])
+    talk.all.follow([proxy()])
     await talk.asked()
     talk.proxies.says = DOWN  # it has not asked its master yet
     await talk.asked()
-    assert talk.all.answers == {}
+    assert talk.all.reports == {}
     assert talk.changes == 0
     talk.proxies.says = UP
     await talk.asked()
-    assert talk.all.answers[UID].answered
+    assert talk.all.reports[UID].answered
 
 
 @pytest.mark.parametrize("says", [None, DOWN])
@@ -109,31 +110,31 @@ async def test_one_that_never_gets_well_is_told_of(
 ) -> None:
     monkeypatch.setattr(proxy_sync, "STARTING", 0.05)
     talk.proxies.says = says
-    talk.all.hold([proxy()])
-    await until(lambda: UID in talk.all.answers)
-    assert not talk.all.answers[UID].master_up
-    assert "refuse" in talk.all.answers[UID].error
+    talk.all.follow([proxy()])
+    await until(lambda: UID in talk.all.reports)
+    assert not talk.all.reports[UID].master_up
+    assert "refuse" in talk.all.reports[UID].error
 
 
 async def test_one_unanswered_question_is_no_silence(talk: Talk) -> None:
     talk.proxies.says = UP
-    talk.all.hold([proxy()])
+    talk.all.follow([proxy()])
     await talk.asked()
     talk.proxies.failing = 1
     await talk.asked()
     assert talk.changes == 1
     talk.proxies.says = None
     await talk.asked()
-    assert not talk.all.answers[UID].answered
+    assert not talk.all.reports[UID].answered
     assert talk.changes == 2
 
 
 async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
     talk.proxies.says, talk.proxies.hears = UP, False
-    talk.all.hold([proxy()])
-    talk.all.tell({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
+    talk.all.follow([proxy()])
+    talk.all.report_gone({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
     await until(lambda: len(talk.proxies.told) > 2)
-    talk.all.tell({UID: ["10.0.0.1"]})
+    talk.all.report_gone({UID: ["10.0.0.1"]})
     talk.proxies.hears = True
     await until(lambda: talk.proxies.told[-1] == {"gone": ["10.0.0.1", "10.0.0.2"]})
     count, changes = len(talk.proxies.told), talk.changes
@@ -144,27 +145,27 @@ async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
 
 async def test_who_is_not_there_any_more_is_forgotten(talk: Talk) -> None:
     talk.proxies.says = UP
-    talk.all.hold([proxy()])
+    talk.all.follow([proxy()])
     await talk.asked()
-    talk.all.hold([])
-    assert talk.all.answers == {}
+    talk.all.follow([])
+    assert talk.all.reports == {}
     await asyncio.sleep(0.03)
     asked = talk.proxies.asked
     await asyncio.sleep(0.05)
     assert talk.proxies.asked == asked
 
 
-async def test_another_address_is_another_conversation(talk: Talk) -> None:
+async def test_another_address_is_another_poller(talk: Talk) -> None:
     talk.proxies.says = UP
-    talk.all.hold([proxy()])
+    talk.all.follow([proxy()])
     await talk.asked()
-    talk.all.hold([proxy("10.244.1.8")])
-    assert talk.all.answers == {}
+    talk.all.follow([proxy("10.244.1.8")])
+    assert talk.all.reports == {}
 
 
-async def test_no_address_no_conversation(talk: Talk) -> None:
+async def test_no_address_no_poller(talk: Talk) -> None:
     one = proxy()
     ended = replace(one, pod=replace(one.pod, phase="Failed"))
-    talk.all.hold([proxy(""), ended])
+    talk.all.follow([proxy(""), ended])
     await asyncio.sleep(0.05)
     assert talk.proxies.asked == 0

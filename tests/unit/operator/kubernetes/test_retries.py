@@ -5,7 +5,7 @@ from dataclasses import replace
 from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, CreateService, PatchStatus
 from rosproxy_operator.kubernetes.planner.model import Failure, Name
-from rosproxy_operator.kubernetes.planner.state import Memory
+from rosproxy_operator.kubernetes.planner.state import ClusterState
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     complete,
@@ -33,33 +33,33 @@ def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
     found, now, pauses = look(replace(seen, failures={})), 100.0, []
     assert [type(one) for one in done(found)] == [CreateProxy]
     for _ in range(8):
-        seen = written(seen, look(seen, found.memory, now))
-        found = look(seen, found.memory, now)
+        seen = written(seen, look(seen, found.state, now))
+        found = look(seen, found.state, now)
         assert done(found) == []
         assert "kubectl label namespace ros" in told(found, "ProxyNotAdmitted")[0]
         assert found.again_in is not None
         pauses.append(found.again_in)
         now += found.again_in
-        found = look(seen, found.memory, now)
+        found = look(seen, found.state, now)
         assert [type(one) for one in done(found)] == [CreateProxy]
     assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
 
 
 def test_a_refusal_stays_told_until_the_object_is_there() -> None:
     seen = observed(rosproxy(), service(), pod())
-    memory = look(seen).memory
-    memory = look(replace(seen, failures=refusing()), memory, 100.5).memory
+    memory = look(seen).state
+    memory = look(replace(seen, failures=refusing()), memory, 100.5).state
     found = look(seen, memory, 101.0)
     assert told(found, "ProxyNotAdmitted")
-    assert not told(look(complete(), found.memory, 102.0), "ProxyNotAdmitted")
+    assert not told(look(complete(), found.state, 102.0), "ProxyNotAdmitted")
 
 
 def test_what_was_created_and_is_not_listed_yet_is_not_created_again_at_once() -> None:
     seen = observed(rosproxy(), pod())
     first = look(seen, now=100.0)
-    second = look(seen, first.memory, 101.0)
+    second = look(seen, first.state, 101.0)
     assert (done(second), second.again_in) == ([], 2.0)
-    third = look(seen, second.memory, 103.0)
+    third = look(seen, second.state, 103.0)
     assert [type(one) for one in done(third)] == [CreateService, CreateProxy]
 
 
@@ -67,39 +67,39 @@ def test_what_was_deleted_and_is_still_listed_is_not_deleted_again_at_once() -> 
     changed = complete(rosproxies=(rosproxy(ports=5),))
     first = look(changed)
     assert done(first)
-    assert done(look(changed, first.memory, 101.0)) == []
+    assert done(look(changed, first.state, 101.0)) == []
 
 
 def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
     without = observed(rosproxy(), service(), pod())
     evicted = observed(rosproxy(), service(), pod(), proxy(phase="Failed"))
-    memory, now, created = Memory(), 100.0, 0
+    memory, now, created = ClusterState(), 100.0, 0
     for _ in range(100):
         found = look(without, memory, now)
         if any(isinstance(one, CreateProxy) for one in done(found)):
             created += 1
-            found = look(evicted, found.memory, now)
-        memory, now = found.memory, now + 1.0
+            found = look(evicted, found.state, now)
+        memory, now = found.state, now + 1.0
     assert 5 <= created <= 12
 
 
 def test_a_proxy_that_was_well_is_made_anew_at_once_when_it_is_gone() -> None:
-    without, memory = observed(rosproxy(), service(), pod()), Memory()
+    without, memory = observed(rosproxy(), service(), pod()), ClusterState()
     for now in range(100, 200, 10):
         found = look(without, memory, now)
         assert [type(one) for one in done(found)] == [CreateProxy]
-        memory = look(complete(), found.memory, now + 1).memory
+        memory = look(complete(), found.state, now + 1).state
 
 
 def test_a_status_is_not_written_over_and_over_again_if_that_does_not_help() -> None:
     first = look(complete())
-    second = look(complete(), first.memory, 101.0)
+    second = look(complete(), first.state, 101.0)
     assert not [one for one in second.actions if isinstance(one, PatchStatus)]
-    third = look(complete(), second.memory, 104.0)
+    third = look(complete(), second.state, 104.0)
     assert [type(one) for one in third.actions] == [PatchStatus]
 
 
 def test_another_status_is_written_at_once() -> None:
     first = look(complete())
-    second = look(complete(nodes={"one": node(ready=False)}), first.memory, 100.1)
+    second = look(complete(nodes={"one": node(ready=False)}), first.state, 100.1)
     assert [one for one in second.actions if isinstance(one, PatchStatus)]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner.model import Name, Node, Selector
+from rosproxy_operator.kubernetes.planner.model import ClusterNode, Name, Selector
 from rosproxy_operator.kubernetes.planner.names import own_labels
 from rosproxy_operator.kubernetes.planner.selection import (
     chosen,
@@ -200,4 +200,4 @@ def test_nodes_that_may_have_a_proxy(wanted, fits):
     one = rosproxy()
     picky = replace(one, spec=replace(one.spec, node_selector=wanted))
 
-    assert on_node(picky, Node("node1", {"disk": "ssd"})) is fits
+    assert on_node(picky, ClusterNode("node1", {"disk": "ssd"})) is fits

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, Kind
+from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.masters import read_master
 from rosproxy_operator.kubernetes.planner.model import Name, Stuck
-from rosproxy_operator.kubernetes.snapshot import Observer
+from rosproxy_operator.kubernetes.snapshot import SnapshotReader
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
     NAMESPACE,
@@ -41,7 +41,7 @@ def put_all(server: ApiServer) -> None:
 
 async def test_a_look(server: ApiServer, api: Api) -> None:
     put_all(server)
-    found = await Observer(api).look()
+    found = await SnapshotReader(api).read()
     assert [each.id.name for each in found.rosproxies] == ["arm"]
     assert set(found.nodes) == {"node1", "node2", "node3"}
     assert {pod.id.name for pod in found.pods} >= {"talker", "stranger"}
@@ -56,7 +56,7 @@ async def test_a_look(server: ApiServer, api: Api) -> None:
 
 async def test_rosproxies_come_first(server: ApiServer, api: Api) -> None:
     put_all(server)
-    await Observer(api).look()
+    await SnapshotReader(api).read()
     assert server.requests[0][1].endswith("/rosproxies")
 
 
@@ -65,14 +65,14 @@ async def test_all_or_nothing(server: ApiServer, api: Api) -> None:
     put_all(server)
     server.refuse("GET", "nodes", 500, "etcd")
     with pytest.raises(ApiError):
-        await Observer(api).look()
+        await SnapshotReader(api).read()
 
 
 async def test_one_bad_rosproxy_does_not_stop_the_others(server: ApiServer, api: Api) -> None:
     put_all(server)
     server.put("rosproxies", rosproxy_obj({"master": {}}, "bad"), NAMESPACE)
     server.put("rosproxies", {"metadata": {"name": "worse"}, "spec": 3}, NAMESPACE)
-    found = await Observer(api).look()
+    found = await SnapshotReader(api).read()
     assert [each.id.name for each in found.rosproxies] == ["arm"]
     assert {id.name for id in found.unusable} == {"bad", "worse"}
 
@@ -88,11 +88,11 @@ async def test_a_selector_that_the_api_server_refuses_is_that_rosproxys_problem(
 
     def pods(namespace: str, selector: str) -> list[dict[str, Any]]:
         if namespace == "other":
-            raise ApiError(Kind.INVALID, "unable to parse requirement")
+            raise ApiError(ErrorKind.INVALID, "unable to parse requirement")
         return real(namespace, selector)
 
     api.pods = pods  # type: ignore[method-assign]
-    found = await Observer(api).look()
+    found = await SnapshotReader(api).read()
     (bad,) = found.unusable.values()
     assert bad.text == "spec.podSelector: unable to parse requirement"
     assert [each.id.name for each in found.rosproxies] == ["arm"]
@@ -101,8 +101,8 @@ async def test_a_selector_that_the_api_server_refuses_is_that_rosproxys_problem(
 async def test_a_missing_crd_is_told(server: ApiServer, api: Api) -> None:
     server.refuse("GET", "rosproxies", 404, "the server could not find the requested resource")
     with pytest.raises(ApiError, match="install the CustomResourceDefinition") as caught:
-        await Observer(api).look()
-    assert caught.value.kind is Kind.GONE
+        await SnapshotReader(api).read()
+    assert caught.value.kind is ErrorKind.GONE
 
 
 async def test_what_only_an_event_tells(server: ApiServer, api: Api) -> None:
@@ -119,7 +119,7 @@ async def test_what_only_an_event_tells(server: ApiServer, api: Api) -> None:
             "lastTimestamp": stamp,
         }
         server.put("events", event, NAMESPACE)
-    found = await Observer(api).look()
+    found = await SnapshotReader(api).read()
     (proxy,) = found.proxies
     assert proxy.stuck is Stuck.PORTS
     assert proxy.message == SANDBOX.format("…")
@@ -137,7 +137,7 @@ async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
     obj["spec"] = spec
     server.put("rosproxies", obj, NAMESPACE)
     id = Name("ros", "roscore")
-    assert (await Observer(api).look()).masters == {
+    assert (await SnapshotReader(api).read()).masters == {
         id: ("", "there is no Service roscore in the namespace ros: create it")
     }
     ports = [{"port": 11311}]
@@ -146,7 +146,7 @@ async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
         {"metadata": {"name": "roscore"}, "spec": {"clusterIP": "10.96.1.1", "ports": ports}},
         "ros",
     )
-    assert (await Observer(api).look()).masters == {id: ("10.96.1.1", "")}
+    assert (await SnapshotReader(api).read()).masters == {id: ("10.96.1.1", "")}
 
 
 @pytest.mark.parametrize(

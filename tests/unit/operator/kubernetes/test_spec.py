@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.model import Advertise, Master, Name, Selector
-from rosproxy_operator.kubernetes.planner.spec import RESOURCES, Unusable, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.model import Advertise, MasterSpec, Name, Selector
+from rosproxy_operator.kubernetes.planner.spec import RESOURCES, InvalidField, invalid, rosproxy
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
 
 
@@ -18,7 +18,7 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
 
     assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
     spec = found.spec
-    assert spec.master == Master(uri="http://robot:11311")
+    assert spec.master == MasterSpec(uri="http://robot:11311")
     assert (spec.ports, spec.window) == (32, PortRange(11400, 29999))
     assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
@@ -57,7 +57,7 @@ def test_all_fields():
         )
     ).spec
 
-    assert found.master == Master(service=Name(NAMESPACE, "roscore"), publish=31100)
+    assert found.master == MasterSpec(service=Name(NAMESPACE, "roscore"), publish=31100)
     assert (found.ports, found.window) == (8, PortRange(12000, 29999))
     assert found.pod_selector == Selector(
         {"app": "ros"},
@@ -187,7 +187,7 @@ def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> d
     ],
 )
 def test_what_can_not_be_used_is_told_by_its_field(spec, field):
-    with pytest.raises(Unusable, match=re.escape(field)) as error:
+    with pytest.raises(InvalidField, match=re.escape(field)) as error:
         rosproxy(rosproxy_obj(spec))
 
     assert ": " in str(error.value)
@@ -196,7 +196,7 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
 
 @pytest.mark.parametrize("name", ["a" * 47, "Arm", "arm.1", "", "-a"])
 def test_names_that_are_no_part_of_a_host_name(name):
-    with pytest.raises(Unusable, match=re.escape("metadata.name")):
+    with pytest.raises(InvalidField, match=re.escape("metadata.name")):
         rosproxy(rosproxy_obj(name=name))
 
 
@@ -207,7 +207,7 @@ def test_the_longest_name():
 def test_what_is_left_of_one_that_can_not_be_used():
     obj = rosproxy_obj({"ports": 0}, status={"masterURI": "http://10.96.7.7:11311"})
 
-    found = invalid(obj, Unusable("spec.ports: 0"))
+    found = invalid(obj, InvalidField("spec.ports: 0"))
 
     assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
     assert found.text == "spec.ports: 0"
@@ -240,7 +240,7 @@ def _refusal(obj: Any) -> str:
     """Why it is refused, empty if it is not."""
     try:
         rosproxy(obj)
-    except Unusable as error:
+    except InvalidField as error:
         return invalid(obj, error).text
     return ""
 

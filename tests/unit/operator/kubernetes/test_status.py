@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner.conditions import LONGEST
 from rosproxy_operator.kubernetes.planner.model import (
-    Answer,
     InvalidRosProxy,
     NodeState,
+    ProxyReport,
     Reference,
     Selector,
     Stuck,
@@ -144,7 +144,7 @@ def test_a_controller_that_has_just_started_changes_nothing():
 
 
 def test_what_was_known_of_the_master_holds_on_until_a_proxy_has_told():
-    down = state(proxy=proxy(ready=False), answer=Answer(True, False, "refused"))
+    down = state(proxy=proxy(ready=False), answer=ProxyReport(True, False, "refused"))
     first = status(down)
 
     found = status(replace(down, answer=None), of=rosproxy(status=first), stamp=LATER)
@@ -226,7 +226,7 @@ def test_names_are_harmless():
 
 
 _answers = st.none() | st.builds(
-    Answer,
+    ProxyReport,
     st.booleans(),
     st.booleans(),
     st.just("refused"),

@@ -23,29 +23,36 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import kopf_log, watch
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.event_filter import EventFilter
-from rosproxy_operator.kubernetes.watch import Watch
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
-from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, Directory
+from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from rosproxy_operator.settings import KubernetesSettings
 from tests.unit.operator.kubernetes.api_server import ApiServer
-from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
+from tests.unit.operator.kubernetes.builders_api import (
+    NAMESPACE,
+    pod_obj,
+    rosproxy_obj,
+    service_obj,
+)
 
 PAIR = certificates.make(["localhost"], certificates.now())
 INJECT = {"rosproxy.io/inject": "true"}
 
 
 class Woken:
-    """A controller that only counts."""
+    """A controller that only counts, and makes the Service once it is woken, if it is to."""
 
     def __init__(self) -> None:
-        self.concern = EventFilter()
+        self.makes: Callable[[], object] = lambda: None
+        self.event_filter = EventFilter()
         self.times = 0
         self.reason: str | None = None
 
     def wake(self) -> None:
         self.times += 1
+        self.makes()
 
     def dead(self) -> str | None:
         return self.reason
@@ -57,12 +64,12 @@ class Running:
     def __init__(self, server: ApiServer, api: Api) -> None:
         self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
         self.liveness, self.webhook = free_port(), free_port()
-        keeper = CertificateRotation(Directory(""), self.metrics)
-        keeper.pair = PAIR
+        rotation = CertificateRotation(CertificateDirectory(""), self.metrics)
+        rotation.pair = PAIR
         settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
-        serving = WebhookServer(HostPort("127.0.0.1", self.webhook), keeper)
-        self.wirer = Injector(api, self.metrics)
-        self.watch = Watch(settings, self.controller, self.wirer, serving, self.metrics)
+        serving = WebhookServer(HostPort("127.0.0.1", self.webhook), rotation)
+        self.injector = Injector(api, self.metrics, self.controller.wake)
+        self.watch = ClusterWatch(settings, self.controller, self.injector, serving, self.metrics)
 
     async def health(self) -> tuple[int, str]:
         return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
@@ -212,8 +219,13 @@ async def test_a_missing_rule_is_told_once(
     assert 'resources ["nodes"], verbs ["list"]' in told[0].getMessage()
 
 
+def put_rosproxy(server: ApiServer) -> None:
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    server.put("services", service_obj(), NAMESPACE)
+
+
 async def test_a_pod_is_wired(running: Running) -> None:
-    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    put_rosproxy(running.server)
     pod = pod_obj("talker", INJECT)
     found = await running.admit(pod)
     assert "warnings" not in found
@@ -228,7 +240,37 @@ async def test_a_pod_is_wired(running: Running) -> None:
     assert running.metrics.admissions.labels("wired")._value.get() == 1
 
 
-async def test_a_dry_run_creates_nothing(running: Running) -> None:
+async def test_a_pod_that_comes_before_its_service_waits_for_the_controller(
+    running: Running,
+) -> None:
+    server = running.server
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    running.controller.makes = lambda: server.put("services", service_obj(), NAMESPACE)
+    assert "patch" in await running.admit(pod_obj("talker", INJECT))
+    assert {method for method, _, _ in server.requests} == {"GET"}
+
+
+async def test_a_pod_whose_service_does_not_come_is_admitted(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.5)
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in found["warnings"][0]
+    assert running.controller.times > 0
+
+
+async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> None:
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    running.server.put("services", service_obj(labels={}), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "is not the operator's: delete or rename it" in found["warnings"][0]
+
+
+async def test_a_dry_run_waits_for_no_service(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
     running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     found = await running.admit(pod_obj("talker", INJECT), dryRun=True)
     assert "has no cluster IP yet" in found["warnings"][0]
@@ -247,7 +289,7 @@ async def test_a_pod_is_admitted_whatever_the_api_server_says(
 
 
 async def test_an_api_server_that_is_just_starting_is_asked_again(running: Running) -> None:
-    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    put_rosproxy(running.server)
     running.server.refuse("GET", "rosproxies", 429, "storage is (re)initializing")
     asyncio.get_running_loop().call_later(0.4, running.server.refusals.clear)
     assert "patch" in await running.admit(pod_obj("talker", INJECT))
@@ -258,8 +300,7 @@ async def test_a_pod_waits_for_a_service_that_is_just_made(
 ) -> None:
     """Before kube-proxy knows it, a connection would be lost for two minutes."""
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.5)
-    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
-    await running.admit(pod_obj("first", INJECT))
+    put_rosproxy(running.server)
     (service,) = running.server.all("services")
     made = datetime.now(UTC) + timedelta(seconds=3600)
     service["metadata"]["creationTimestamp"] = made.isoformat()
@@ -287,7 +328,7 @@ async def test_a_mistake_of_ours_admits_the_pod(
 
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.parse_pod", broken)
     found = await running.admit(pod_obj("talker", INJECT))
-    assert "the controller failed: RuntimeError('oops')" in found["warnings"][0]
+    assert "the operator failed: RuntimeError('oops')" in found["warnings"][0]
 
 
 async def test_what_kopf_cannot_serve_is_admitted_too(running: Running) -> None:
@@ -307,7 +348,7 @@ def test_everything_that_would_surprise_is_off(tmp_path: Path) -> None:
     import kopf
 
     settings = kopf.OperatorSettings()
-    one = Watch(KubernetesSettings(), Woken(), None, None, ClusterMetrics())
+    one = ClusterWatch(KubernetesSettings(), Woken(), None, None, ClusterMetrics())
     one.configure(settings)
     assert not settings.posting.enabled
     assert settings.scanning.disabled

@@ -7,10 +7,9 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import names, objects
 from rosproxy_operator.kubernetes.planner import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.kubernetes.planner.model import Finding, Name, ProxyPod
-from rosproxy_operator.kubernetes.planner.plan import Plan
+from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Name, ProxyPlace, ProxyPod
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
-from rosproxy_operator.kubernetes.planner.state import Place
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     SETTINGS,
@@ -48,8 +47,8 @@ class World:
             self.cluster.add_node(name, ip)
         self.cluster.add_rosproxy("robot", spec())
         self.pods = 0
-        self.held: dict[Place, PortRange] = {}
-        self.may_move: set[Place] = set()
+        self.held: dict[ProxyPlace, PortRange] = {}
+        self.may_move: set[ProxyPlace] = set()
 
     @property
     def nodes(self) -> list[str]:
@@ -69,11 +68,11 @@ class World:
 
     # what the controller does
 
-    def in_status(self, place: Place) -> PortRange | None:
+    def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)
         return parse_rosproxy.rosproxy(rosproxy).former.get(place.node) if rosproxy else None
 
-    def seen(self) -> Plan:
+    def seen(self) -> ClusterPlan:
         """A look, which must not take a pod for gone that runs."""
         found = self.controller.look()
         pods = self.cluster.state.pods.values()
@@ -82,7 +81,7 @@ class World:
         assert not here & {ip for some in found.gone.values() for ip in some}, "it runs"
         return found
 
-    def carry_out(self, found: Plan, most: int | None = None) -> None:
+    def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
         for action in found.actions:
             if isinstance(action, CreateProxy):
                 self.check_new_range(action)
@@ -101,7 +100,7 @@ class World:
     # what must hold
 
     def check_new_range(self, action: CreateProxy) -> None:
-        place = Place(action.of, action.node)
+        place = ProxyPlace(action.of, action.node)
         text = action.body["metadata"]["annotations"][names.PORT_RANGE]
         first, last = map(int, text.split("-"))
         assert self.is_lawful(action.of, PortRange(first, last))
@@ -138,19 +137,19 @@ class World:
                 and name_of(pod) != names.proxy_id(place.of, place.node)
             ]
             taken = {port for pod in others for port in objects.pod(pod).host_ports}
-            refused = {port for node, port in self.controller.memory.taken if node == place.node}
+            refused = {port for node, port in self.controller.state.taken if node == place.node}
             if any(port in ports for port in taken | refused):
                 self.may_move.add(place)
         for _, proxy in self.proxies():
             if proxy.stuck is not None:
-                self.may_move.add(Place(proxy.of, proxy.on))
+                self.may_move.add(ProxyPlace(proxy.of, proxy.on))
 
     def check(self) -> None:
         """What holds at any moment."""
         self.note_conflicts()
-        there: list[Place] = []
+        there: list[ProxyPlace] = []
         for pod, proxy in self.proxies():
-            place = Place(proxy.of, proxy.on)
+            place = ProxyPlace(proxy.of, proxy.on)
             if not ended(pod) and not deleting(pod):
                 there.append(place)
             if pod["status"]["phase"] == "Running" and place.of in self.cluster.state.rosproxies:
@@ -185,7 +184,7 @@ class World:
         assert self.cluster.made <= 40, "it is done over and over again"
         self.check_all_is_as_wished(found)
 
-    def check_all_is_as_wished(self, found: Plan) -> None:
+    def check_all_is_as_wished(self, found: ClusterPlan) -> None:
         state = self.cluster.state
         rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
         wanted = set()
@@ -199,7 +198,7 @@ class World:
                 and not pod.deleting
                 and on_node(of, objects.node(node))
             ):
-                wanted.add(Place(of.id, pod.node))
+                wanted.add(ProxyPlace(of.id, pod.node))
         unready = {node for node in self.nodes if not self.cluster.is_ready(node)}
         self.check_proxies(found, {place for place in wanted if place.node not in unready}, unready)
         services = [one for one in state.services.values() if is_own(one)]
@@ -207,8 +206,8 @@ class World:
         assert owners == sorted(one.uid for one in rosproxies)
         self.check_addresses(unready)
 
-    def check_proxies(self, found: Plan, wanted: set[Place], unready: set[str]) -> None:
-        there = {Place(one.of, one.on): (pod, one) for pod, one in self.proxies()}
+    def check_proxies(self, found: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
+        there = {ProxyPlace(one.of, one.on): (pod, one) for pod, one in self.proxies()}
         assert {place for place in there if place.node not in unready} <= wanted
         for place in wanted:
             rosproxy = self.cluster.state.rosproxies[place.of]["spec"]
@@ -229,19 +228,21 @@ class World:
             if publish and not self.told(found, place, "PortConflict"):
                 assert env["ROSPROXY_PUBLISH_MASTER"] == str(publish)
 
-    def obstacles(self, found: Plan, place: Place) -> bool:
+    def obstacles(self, found: ClusterPlan, place: ProxyPlace) -> bool:
         reasons = ("MasterUnknown", "NoAdvertiseHost", "NameTaken")
         fatal = self.told(found, place, "PortsExhausted", fatal=True)
         return fatal or any(self.told(found, place, reason) for reason in reasons)
 
-    def told(self, found: Plan, place: Place, reason: str, fatal: bool | None = None) -> bool:
+    def told(
+        self, found: ClusterPlan, place: ProxyPlace, reason: str, fatal: bool | None = None
+    ) -> bool:
         return any(
             one.reason == reason
             and one.of == place.of
             and place.node in f"{one.subject} {one.text}".split(": ")[0] + one.text
             and fatal in (None, one.fatal)
             for one in found.problems
-            if isinstance(one, Finding)
+            if isinstance(one, ClusterFinding)
         )
 
     def check_addresses(self, unready: set[str]) -> None:

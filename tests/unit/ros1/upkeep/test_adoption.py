@@ -1,4 +1,4 @@
-"""Nodes that registered around the proxy: who they are, where, and what is taken back."""
+"""Nodes that registered around the proxy: who they are, where, and why they are shut down."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,10 +10,11 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.upkeep.adoption import policy
-from rosproxy.ros1.upkeep.adoption.policy import Stray
+from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
+from rosproxy.ros1.upkeep.registration.policy import known_as
 from tests.unit.builders import add_node, add_registration, make_addressing
 
-PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
 C1 = Arrival("10.0.0.5", frozenset({"c1", "3f2a91c0b7de"}))
 C2 = Arrival("10.0.0.6", frozenset({"c2", "twin"}))
 C3 = Arrival("10.0.0.7", frozenset({"c3", "twin"}))
@@ -48,32 +49,32 @@ FOUND = [
 @pytest.mark.parametrize(("uri", "expected"), FOUND)
 def test_whose_uri_may_mean_a_container(uri: str, expected: tuple[HostPort, ...]) -> None:
     graph = Graph({"/n": [held("/a")]}, {"/n": uri})
-    found = policy.find(graph, [C1, C2, C3], make_addressing())
-    assert found == ([Stray("/n", uri, expected, (held("/a"),))] if expected else [])
+    found = policy.find_direct(graph, [C1, C2, C3], make_addressing())
+    assert found == ([DirectNode("/n", uri, expected, (held("/a"),))] if expected else [])
 
 
 def test_a_container_named_as_the_advertised_host_is_no_way_to_the_proxys_own_nodes() -> None:
     uris = {"/ours": "http://robot-host:45003/10.0.0.5:40001/", "/its": "http://robot-host:50000/"}
     graph = Graph({name: [held("/a", name)] for name in uris}, uris)
     arrival = Arrival("10.0.0.5", frozenset({"robot-host"}))
-    found = policy.find(graph, [arrival], make_addressing())
-    assert [stray.caller_id for stray in found] == ["/its"]
+    found = policy.find_direct(graph, [arrival], make_addressing())
+    assert [node.caller_id for node in found] == ["/its"]
 
 
 def test_a_container_on_two_networks_is_looked_for_on_both() -> None:
     graph = Graph({"/n": [held("/a")]}, {"/n": "http://c1:40001/"})
     both = [C1, Arrival("10.1.0.5", C1.names), C1]
-    (stray,) = policy.find(graph, both, make_addressing())
-    assert stray.places == places("10.0.0.5:40001", "10.1.0.5:40001")
+    (found,) = policy.find_direct(graph, both, make_addressing())
+    assert found.places == places("10.0.0.5:40001", "10.1.0.5:40001")
 
 
-def stray(caller_id: str, topics: Sequence[str], *where: str, kind: Kind = PUB) -> Stray:
+def direct(caller_id: str, topics: Sequence[str], *where: str, kind: Kind = PUB) -> DirectNode:
     registrations = tuple(held(topic, caller_id, kind) for topic in topics)
-    return Stray(caller_id, "http://twin:40001/", places(*where), registrations)
+    return DirectNode(caller_id, "http://twin:40001/", places(*where), registrations)
 
 
 SIX, SEVEN = "10.0.0.6:40001", "10.0.0.7:40001"
-SETTLED = [
+LOCATED = [
     # what a node has at the master, what the nodes at its places say, where it is
     (["/a"], {SIX: ["/a"]}, SIX),
     (["/a", "/rosout"], {SIX: ["/a", "/rosout"]}, SIX),
@@ -90,13 +91,13 @@ SETTLED = [
 ]
 
 
-@pytest.mark.parametrize(("topics", "said", "expected"), SETTLED)
-def test_where_a_stray_is(
+@pytest.mark.parametrize(("topics", "said", "expected"), LOCATED)
+def test_where_a_node_is(
     topics: list[str], said: Mapping[str, list[str]], expected: str | None
 ) -> None:
-    one = stray("/n", topics, SIX, SEVEN)
+    one = direct("/n", topics, SIX, SEVEN)
     answers = {places(where)[0]: topics for where, topics in said.items()}
-    found, doubts = policy.settle([one], answers)
+    found, doubts = policy.locate([one], answers)
     if expected is None:
         assert found == {}
         assert list(doubts) == ["/n"]
@@ -106,137 +107,46 @@ def test_where_a_stray_is(
 
 
 def test_a_service_is_no_topic() -> None:
-    one = stray("/n", ["/add"], SIX, kind=SRV)
-    assert policy.settle([one], {places(SIX)[0]: ["/add"]})[0] == {}
+    one = direct("/n", ["/add"], SIX, kind=SRV)
+    assert policy.locate([one], {places(SIX)[0]: ["/add"]})[0] == {}
 
 
 def test_doubts_tell_what_was_found() -> None:
-    one = stray("/n", ["/a"], SIX, SEVEN)
+    one = direct("/n", ["/a"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
-    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in policy.settle([one], {})[1]["/n"]
-    assert "is another" in policy.settle([one], {six: ["/b"]})[1]["/n"]
-    either = policy.settle([one], {six: ["/a"], seven: ["/a"]})[1]["/n"]
+    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in policy.locate([one], {})[1]["/n"]
+    assert "is another" in policy.locate([one], {six: ["/b"]})[1]["/n"]
+    either = policy.locate([one], {six: ["/a"], seven: ["/a"]})[1]["/n"]
     assert "could be at 10.0.0.6:40001 and 10.0.0.7:40001; left alone" in either
 
 
 def test_two_containers_with_the_same_names_and_ports() -> None:
-    first, second = stray("/n1", ["/a"], SIX, SEVEN), stray("/n2", ["/b"], SIX, SEVEN)
+    first, second = direct("/n1", ["/a"], SIX, SEVEN), direct("/n2", ["/b"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
-    found, doubts = policy.settle([first, second], {six: ["/b", "/rosout"], seven: ["/a"]})
+    found, doubts = policy.locate([first, second], {six: ["/b", "/rosout"], seven: ["/a"]})
     assert found == {seven: [first], six: [second]}
     assert not doubts
 
 
 def test_two_names_of_one_process() -> None:
-    both = [stray("/manager", ["/a"], SIX), stray("/nodelet", ["/b"], SIX)]
+    both = [direct("/manager", ["/a"], SIX), direct("/nodelet", ["/b"], SIX)]
     (six,) = places(SIX)
-    assert policy.settle(both, {six: ["/a", "/b"]}) == ({six: both}, {})
+    assert policy.locate(both, {six: ["/a", "/b"]}) == ({six: both}, {})
 
 
 def test_by_what_uris_an_endpoint_may_be_known() -> None:
     endpoint = add_node(make_addressing(), "http://c1:40001/", "10.0.0.5", True)
     endpoint.former_uris.add("http://robot-host:45000/c1:40001/10.0.0.4/")
-    assert policy.known_as(endpoint, "http://c1:40001/")
-    assert policy.known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.4/")
-    assert not policy.known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.5/")
-    assert not policy.known_as(endpoint, "http://c1:40002/")
+    assert known_as(endpoint, "http://c1:40001/")
+    assert known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.4/")
+    assert not known_as(endpoint, "http://robot-host:45000/c1:40001/10.0.0.5/")
+    assert not known_as(endpoint, "http://c1:40002/")
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
 def test_a_loopback_address_is_everybodys_own(host: str) -> None:
     endpoint = add_node(make_addressing(), f"http://{host}:40001/", "10.0.0.5", False)
-    assert not policy.known_as(endpoint, endpoint.uri)
-
-
-PARAMETERS = ["/n/rate", "/n/gain/p", "/robot/name", "/nn/x", "/use_sim_time"]
-
-
-def test_the_parameters_that_a_node_is_most_likely_subscribed_to() -> None:
-    assert policy.own_keys("/n", PARAMETERS) == [
-        "/rosout_disable_topics_generation",
-        "/n/diagnostic_period",
-        "/n/rate",
-        "/n",
-        "/n/gain/p",
-        "/n/gain",
-    ]
-
-
-def test_all_other_parameters_and_namespaces() -> None:
-    others = policy.other_keys("/n", PARAMETERS)
-    assert set(others) == {"/", "/robot/name", "/robot", "/nn/x", "/nn", "/use_sim_time"}
-    assert len(others) == 6
-
-
-def test_what_is_taken_back_and_in_which_order() -> None:
-    uris = {"/n": "http://c1:40001/", "/m": "http://c1:40001"}
-    known = {
-        "/n": [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB)],
-        "/m": [held("/c", "/m", SUB), held("/lost", "/m", SRV)],
-        "/other": [held("/a", "/other")],
-    }
-    services = {"/add": "rosrpc://c1:50001", "/lost": None}
-    assert policy.take_back(uris, known, services) == [
-        ("unregisterSubscriber", ["/n", "/b", "http://c1:40001/"]),
-        ("unregisterSubscriber", ["/m", "/c", "http://c1:40001"]),
-        ("unregisterPublisher", ["/n", "/a", "http://c1:40001/"]),
-        ("unregisterService", ["/n", "/add", "rosrpc://c1:50001"]),
-    ]
-
-
-def test_what_is_put_back() -> None:
-    known = [Registration(PUB, "/a", "/n", "std_msgs/String"), held("/add", kind=SRV)]
-    services = {"/add": "rosrpc://c1:50001", "/lost": None}
-    assert policy.put_back("http://c1:40001/", [*known, held("/lost", kind=SRV)], services) == [
-        ("registerPublisher", ["/n", "/a", "std_msgs/String", "http://c1:40001/"]),
-        ("registerService", ["/n", "/add", "rosrpc://c1:50001", "http://c1:40001/"]),
-    ]
-
-
-def test_parameters_are_released_one_after_the_other() -> None:
-    ask = ("lookupNode", ["/rosproxy", "/n"])
-    assert policy.release("/n", "http://c1:1/", ["/x", "/y"], "/rosproxy") == [
-        ask,
-        ("unsubscribeParam", ["/n", "http://c1:1/", "/x"]),
-        ask,
-        ("unsubscribeParam", ["/n", "http://c1:1/", "/y"]),
-        ask,
-    ]
-
-
-RELEASED = [
-    # the answers to lookupNode, the parameters that were subscribed to at most
-    ([None, None, None], []),
-    (["U", None, None], ["/x"]),
-    (["U", "U", None], ["/x", "/y"]),
-    (["U", "U", "U"], None),
-    (["other", "other", "other"], None),  # somebody else has the name by now
-]
-
-
-@pytest.mark.parametrize(("answers", "expected"), RELEASED)
-def test_what_a_node_was_subscribed_to(
-    answers: list[str | None], expected: list[str] | None
-) -> None:
-    values = [answers[0], 1, answers[1], 1, answers[2]]
-    assert policy.released(["/x", "/y"], values) == expected
-
-
-def test_topics_that_a_node_no_longer_has() -> None:
-    addressing = make_addressing()
-    endpoint = add_node(addressing)
-    for kind, name, since in [
-        (PUB, "/kept", 1.0),
-        (PUB, "/dropped", 1.0),
-        (PUB, "/new", 9.0),
-        (SUB, "/kept", 1.0),
-        (SUB, "/dropped", 1.0),
-        (SRV, "/add", 1.0),
-        (PARAM, "/rate", 1.0),
-    ]:
-        addressing.registry.register(endpoint, held(name, kind=kind, since=since))
-    gone = policy.vanished(endpoint, ["/kept"], {"/kept": "type"}, before=5.0)
-    assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
+    assert not known_as(endpoint, endpoint.uri)
 
 
 def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
@@ -245,13 +155,13 @@ def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
     add_registration(addressing, endpoint, PUB, "/a")
     ours, other = addressing.advertised_uri(endpoint), "http://laptop:1/"
     endpoint.settles_at = 5.0
-    assert policy.outdated("/a", [other], addressing, now=4.0)
-    assert policy.outdated("/a", [], addressing, now=4.0)
-    assert not policy.outdated("/a", [other, ours], addressing, now=4.0)
-    assert not policy.outdated("/a", [other], addressing, now=5.0)
-    assert not policy.outdated("/b", [other], addressing, now=4.0)
+    assert policy.is_outdated("/a", [other], addressing, now=4.0)
+    assert policy.is_outdated("/a", [], addressing, now=4.0)
+    assert not policy.is_outdated("/a", [other, ours], addressing, now=4.0)
+    assert not policy.is_outdated("/a", [other], addressing, now=5.0)
+    assert not policy.is_outdated("/b", [other], addressing, now=4.0)
     addressing.registry.unregister(PUB, "/a", "/talker")
-    assert not policy.outdated("/a", [other], addressing, now=4.0)
+    assert not policy.is_outdated("/a", [other], addressing, now=4.0)
 
 
 REASONS = [
@@ -268,30 +178,30 @@ REASONS = [
 
 @pytest.mark.parametrize(("caller_id", "reason", "name"), REASONS)
 def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) -> None:
-    assert policy.accused(caller_id, reason) == name
+    assert policy.renamed_node(caller_id, reason) == name
 
 
 LITERAL, ADVERTISED = "http://c1:40001/", "http://robot-host:45000/c1:40001/10.0.0.5/"
-JUDGED = [
-    # registered around the proxy before? what the master has, the verdict
-    (False, ADVERTISED, policy.Verdict.SETTLED),
-    (True, ADVERTISED, policy.Verdict.SETTLED),
-    (False, LITERAL, policy.Verdict.ASTRAY),
-    (True, LITERAL, policy.Verdict.ASTRAY),
-    (False, None, policy.Verdict.GUILTY),
-    (True, None, policy.Verdict.ASTRAY),
-    (False, "http://laptop:1/", policy.Verdict.GUILTY),
-    (True, "http://laptop:1/", policy.Verdict.GUILTY),
-    (True, "http://robot-host:45001/c2:40001/10.0.0.6/", policy.Verdict.GUILTY),
+CAUSES = [
+    # registered around the proxy before? what the master has, the cause
+    (False, ADVERTISED, ShutdownCause.ADOPTED_AGAIN),
+    (True, ADVERTISED, ShutdownCause.ADOPTED_AGAIN),
+    (False, LITERAL, ShutdownCause.REGISTERED_DIRECTLY),
+    (True, LITERAL, ShutdownCause.REGISTERED_DIRECTLY),
+    (False, None, ShutdownCause.NAME_TAKEN),
+    (True, None, ShutdownCause.REGISTERED_DIRECTLY),
+    (False, "http://laptop:1/", ShutdownCause.NAME_TAKEN),
+    (True, "http://laptop:1/", ShutdownCause.NAME_TAKEN),
+    (True, "http://robot-host:45001/c2:40001/10.0.0.6/", ShutdownCause.NAME_TAKEN),
 ]
 
 
-@pytest.mark.parametrize(("direct", "uri", "verdict"), JUDGED)
-def test_who_is_to_be_shut_down(direct: bool, uri: str | None, verdict: policy.Verdict) -> None:
+@pytest.mark.parametrize(("direct", "uri", "cause"), CAUSES)
+def test_who_is_to_be_shut_down(direct: bool, uri: str | None, cause: ShutdownCause) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing, LITERAL, "10.0.0.5", True)
     assert addressing.advertised_uri(endpoint) == ADVERTISED
     if direct:
         endpoint.former_uris.add(LITERAL)
     assert endpoint.direct is direct
-    assert policy.judge(endpoint, uri, ADVERTISED) is verdict
+    assert policy.shutdown_cause(endpoint, uri, ADVERTISED) is cause

@@ -211,33 +211,3 @@ def test_a_node_bears_out_what_the_master_says_of_it(
         add_registration(addressing, endpoint, PUB, name)
     add_registration(addressing, endpoint, SRV, "/chatter")
     assert policy.confirmed_by(endpoint, said) is confirmed
-
-
-LOST = [
-    # ours, the master's, what is lost
-    ([], [], []),
-    ([held("/a")], [held("/a")], []),
-    ([held("/a")], [], [held("/a")]),
-    ([held("/a")], [held("/a", "/other")], [held("/a")]),
-    ([held("/a")], [held("/a", kind=SUB)], [held("/a")]),
-    ([held("/a"), held("/b")], [held("/a")], [held("/b")]),
-    ([held("/a", since=9.9)], [], [held("/a", since=9.9)]),
-    ([held("/a", since=10.0)], [], []),  # made while the master was being asked
-    ([held("/a", since=11.0)], [], []),
-    # parameters are not in the master's state: lost if their node is
-    ([held("/p", kind=PARAM)], [], []),
-    ([held("/a"), held("/p", kind=PARAM)], [held("/a")], []),
-    ([held("/a"), held("/p", kind=PARAM)], [], [held("/a"), held("/p", kind=PARAM)]),
-    ([held("/a"), held("/b"), held("/p", kind=PARAM)], [held("/b")], [held("/a")]),
-    ([held("/a"), held("/p", "/m", PARAM)], [], [held("/a")]),
-]
-
-
-@pytest.mark.parametrize(("ours", "masters", "lost"), LOST)
-def test_what_the_master_has_lost(
-    ours: list[Registration], masters: list[Registration], lost: list[Registration]
-) -> None:
-    state: dict[str, list[Registration]] = {}
-    for one in masters:
-        state.setdefault(one.caller_id, []).append(one)
-    assert policy.lost(ours, state, before=10.0) == lost

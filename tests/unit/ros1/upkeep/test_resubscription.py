@@ -130,9 +130,9 @@ def test_bus_info_of_another_form_tells_nothing(value: Any) -> None:
 def test_a_subscriber_by_udpros_is_not_silent_and_one_by_tcpros_may_be() -> None:
     endpoint = publisher("/t")
     bus = {endpoint: [BusRow("/t", "/a", "UDPROS"), BusRow("/t", "/b", "TCPROS")]}
-    assert names(policy.silent(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
-    assert names(policy.silent(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == ["/a"]
-    assert names(policy.silent(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
+    assert names(policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
+    assert names(policy.unconnected(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == ["/a"]
+    assert names(policy.unconnected(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
 
 
 FORWARDED = [
@@ -160,7 +160,7 @@ def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_s
     endpoint.fast_peers = peers
     bus = {endpoint: [BusRow("/t", name, "TCPROS") for name in named]}
     left = subscribed(endpoint, "/a", "/b", "/c")
-    assert names(policy.silent(left, bus, HOSTS)) == found
+    assert names(policy.unconnected(left, bus, HOSTS)) == found
 
 
 def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
@@ -168,20 +168,20 @@ def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
     first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
     first.fast_peers = {LAPTOP: 5}
     left = [*subscribed(first, "/a"), *subscribed(second, "/a")]
-    assert policy.silent(left, {}, HOSTS) == subscribed(second, "/a")
+    assert policy.unconnected(left, {}, HOSTS) == subscribed(second, "/a")
 
 
 def test_a_host_that_is_not_found_has_no_connections() -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = {LAPTOP: 2}
-    assert names(policy.silent(subscribed(endpoint, "/a", "/d"), {}, HOSTS)) == ["/d"]
+    assert names(policy.unconnected(subscribed(endpoint, "/a", "/d"), {}, HOSTS)) == ["/d"]
 
 
 def test_a_udpros_subscriber_needs_no_connection_in_the_kernel() -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = {LAPTOP: 1}
     bus = {endpoint: [BusRow("/t", "/a", "UDPROS")]}
-    assert policy.silent(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
+    assert policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
 
 
 def test_only_the_publishers_without_connection_are_withdrawn() -> None:

@@ -1,39 +1,35 @@
-"""Nodes that registered around the proxy, and how the master is made to know them through it.
+"""Nodes that registered around the proxy: which they are, where, and which calls are due to it.
 
 A container may start while its master's name still leads to the real master. Its nodes then
-register with their own URIs, which outside can't reach. To register such a node anew in the
-leased form would end it: the master calls ``shutdown`` at the former URI of a name whose URI
-changes (rosmaster/registrations.py, _register_node_api). So everything that the name holds is
-taken back first, with the strings that were registered.
+register with their own URIs, which outside can't reach: they are *direct*. Such a node is adopted:
+everything that it holds is taken back and registered anew in the form that outside can use.
 
 Its connection to the real master stays open (both client libraries keep it), so that later calls
-of such a node may go around the proxy as well.
+of such a node may go around the proxy as well. Then the master drops what the name had before and
+calls ``shutdown`` at the node, through the proxy, as it does if another node has taken the name.
+`shutdown_cause` tells the two apart.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
 from rosproxy.admin.requests import Arrival
-from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.upkeep.policy import MethodCall, registering, unregistering
+from rosproxy.ros1.upkeep.registration.policy import known_as
 
-EVERYBODYS_PARAMETERS = ("/rosout_disable_topics_generation",)
-"""roscpp and rospy subscribe to it with their first log message; it need not exist."""
-_REASON = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
+_NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
 """rosmaster/registrations.py, shutdown_node_task."""
-_ORDER = (Kind.SUBSCRIBER, Kind.PUBLISHER, Kind.SERVICE, Kind.PARAM)
-"""Subscribers go first, so that they are not told that the publishers go."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stray:
+class DirectNode:
     """A node that is registered with its own URI, and the places where it may be."""
 
     caller_id: str
@@ -48,7 +44,17 @@ class Stray:
         return names - {"/rosout"} or names
 
 
-def find(graph: Graph, arrived: Iterable[Arrival], addressing: Addressing) -> list[Stray]:
+class ShutdownCause(Enum):
+    """Why the master calls ``shutdown`` at a node."""
+
+    NAME_TAKEN = "another node has its name"
+    REGISTERED_DIRECTLY = "it registered around the proxy"
+    ADOPTED_AGAIN = "it registered around the proxy, and is registered anew already"
+
+
+def find_direct(
+    graph: Graph, arrived: Iterable[Arrival], addressing: Addressing
+) -> list[DirectNode]:
     """The nodes of a master whose URI may mean one of the containers that have arrived."""
     found, containers = [], list(arrived)
     for name, uri in graph.uris.items():
@@ -58,143 +64,49 @@ def find(graph: Graph, arrived: Iterable[Arrival], addressing: Addressing) -> li
         called = dict.fromkeys(c.address for c in containers if c.is_called(where.host))
         if called:
             places = tuple(HostPort(address, where.port) for address in called)
-            found.append(Stray(name, uri, places, tuple(graph.held.get(name, ()))))
+            found.append(DirectNode(name, uri, places, tuple(graph.held.get(name, ()))))
     return found
 
 
-def settle(
-    strays: Iterable[Stray], topics: Mapping[HostPort, Iterable[str]]
-) -> tuple[dict[HostPort, list[Stray]], dict[str, str]]:
-    """Where each stray is, and why some are left alone, by name.
+def locate(
+    nodes: Iterable[DirectNode], topics: Mapping[HostPort, Iterable[str]]
+) -> tuple[dict[HostPort, list[DirectNode]], dict[str, str]]:
+    """Where each node is, and why some are left alone, by name.
 
     ``topics`` are those that the node at a place names itself; places without a node are missing.
     """
-    found: dict[HostPort, list[Stray]] = {}
+    found: dict[HostPort, list[DirectNode]] = {}
     doubts: dict[str, str] = {}
-    for stray in strays:
-        merits = {p: _merit(stray, set(topics[p])) for p in stray.places if p in topics}
-        borne_out = {place: merit for place, merit in merits.items() if merit is not None}
-        best = [p for p, merit in borne_out.items() if merit == max(borne_out.values())]
+    for node in nodes:
+        scores = {p: _score(node, set(topics[p])) for p in node.places if p in topics}
+        likely = {place: score for place, score in scores.items() if score is not None}
+        best = [place for place, score in likely.items() if score == max(likely.values())]
         if len(best) == 1:
-            found.setdefault(best[0], []).append(stray)
+            found.setdefault(best[0], []).append(node)
         else:
-            doubts[stray.caller_id] = _doubt(stray, best, topics)
+            doubts[node.caller_id] = _doubt(node, best, topics)
     return found, doubts
 
 
-def known_as(endpoint: Endpoint, uri: str) -> bool:
-    """Whether a URI at the master is a former one of this endpoint, or its node's own.
-
-    A loopback address is everybody's own.
-    """
-    own = uri == endpoint.uri and not is_loopback(endpoint.node.host)
-    return own or uri in endpoint.former_uris
-
-
-class Verdict(Enum):
-    """What a ``shutdown`` that the master sends to a node is about."""
-
-    GUILTY = "another node has its name"
-    ASTRAY = "it registered around the proxy"
-    SETTLED = "it did, and is registered anew already"
-
-
-def accused(caller_id: str, reason: str) -> str | None:
-    """The name whose URI has changed, if that is why the master calls ``shutdown``."""
-    found = _REASON.match(reason)
+def renamed_node(caller_id: str, reason: str) -> str | None:
+    """The name whose URI has changed, if that is why somebody calls ``shutdown``."""
+    found = _NEW_URI.match(reason)
     return found[1] if found and caller_id == "/master" else None
 
 
-def judge(endpoint: Endpoint, uri: str | None, advertised: str) -> Verdict:
-    """Whether a name of an endpoint, which the master has by a URI now, is to be shut down."""
+def shutdown_cause(endpoint: Endpoint, uri: str | None, advertised: str) -> ShutdownCause:
+    """Why a name of an endpoint, which the master has by a URI now, is to be shut down.
+
+    The master calls at the URI that the name had before. If the new one is a former URI of the
+    same node, or is the endpoint's own by now, no other node has taken the name.
+    """
     if uri == advertised:
-        return Verdict.SETTLED
-    if uri is None:
-        return Verdict.ASTRAY if endpoint.direct else Verdict.GUILTY
-    return Verdict.ASTRAY if known_as(endpoint, uri) else Verdict.GUILTY
+        return ShutdownCause.ADOPTED_AGAIN
+    itself = endpoint.direct if uri is None else known_as(endpoint, uri)
+    return ShutdownCause.REGISTERED_DIRECTLY if itself else ShutdownCause.NAME_TAKEN
 
 
-def own_keys(caller_id: str, parameters: Iterable[str]) -> list[str]:
-    """The parameters that a node is most likely subscribed to; the master does not tell.
-
-    The period is diagnostic_updater's; it need not exist.
-    """
-    own = [key for key in _with_namespaces(parameters) if f"{key}/".startswith(f"{caller_id}/")]
-    return list(dict.fromkeys([*EVERYBODYS_PARAMETERS, f"{caller_id}/diagnostic_period", *own]))
-
-
-def other_keys(caller_id: str, parameters: Sequence[str]) -> list[str]:
-    """All other parameters and namespaces that a node can be subscribed to."""
-    known = set(own_keys(caller_id, parameters))
-    return [key for key in ["/", *_with_namespaces(parameters)] if key not in known]
-
-
-def take_back(
-    uris: Mapping[str, str],
-    held: Mapping[str, Sequence[Registration]],
-    services: Mapping[str, str | None],
-) -> list[MethodCall]:
-    """The calls that end what names hold with their ``uris``; ``services`` are the services' URIs.
-
-    The master takes the strings only exactly as they were registered.
-    """
-    wanted = [one for name in uris for one in held.get(name, ())]
-    wanted.sort(key=lambda one: _ORDER.index(one.kind))
-    return [
-        unregistering(one, uris[one.caller_id], services.get(one.name) or "")
-        for one in wanted
-        if one.kind is not Kind.SERVICE or services.get(one.name)
-    ]
-
-
-def put_back(
-    uri: str, held: Iterable[Registration], services: Mapping[str, str | None]
-) -> list[MethodCall]:
-    """The calls that make registrations with ``uri`` again."""
-    return [
-        registering(one, uri, services.get(one.name) or "")
-        for one in held
-        if one.kind is not Kind.SERVICE or services.get(one.name)
-    ]
-
-
-def release(caller_id: str, uri: str, keys: Iterable[str], asker: str) -> list[MethodCall]:
-    """Calls that end one parameter subscription after the other, and ask each time what is left.
-
-    There is nothing to see of such a subscription, apart from the name that stays known.
-    """
-    ask: MethodCall = ("lookupNode", [asker, caller_id])
-    calls = [ask]
-    for key in keys:
-        calls += [("unsubscribeParam", [caller_id, uri, key]), ask]
-    return calls
-
-
-def released(keys: Sequence[str], values: Sequence[object]) -> list[str] | None:
-    """The parameters that the name was subscribed to at most, from the results of `release`.
-
-    None if it is known still. The last one is sure; those before it may have been.
-    """
-    gone = next((i for i, value in enumerate(values[::2]) if value is None), None)
-    return None if gone is None else list(keys[:gone])
-
-
-def vanished(
-    endpoint: Endpoint, published: Iterable[str], subscribed: Iterable[str], before: float
-) -> list[Registration]:
-    """The topics registered before a time that the node no longer has.
-
-    It may have unregistered them around the proxy, where its own URI meant nothing.
-    """
-    topics = {Kind.PUBLISHER: set(published), Kind.SUBSCRIBER: set(subscribed)}
-    return [
-        held
-        for held in endpoint.registrations.values()
-        if held.kind in topics and held.name not in topics[held.kind] and held.since < before
-    ]
-
-
-def outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float) -> bool:
+def is_outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float) -> bool:
     """Whether a ``publisherUpdate`` lacks a publisher that is being registered anew.
 
     A newer one follows; a subscriber inside need not drop its connection in between.
@@ -208,28 +120,17 @@ def outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float
     )
 
 
-def _merit(stray: Stray, topics: set[str]) -> int | None:
-    """How well a node's own topics bear out that it is the stray; None if not at all."""
-    shared = stray.topics & topics
-    return len(shared) - len(stray.topics - topics) if shared else None
+def _score(node: DirectNode, topics: set[str]) -> int | None:
+    """How well the topics of whoever answers at a place fit a node; None if not at all."""
+    shared = node.topics & topics
+    return len(shared) - len(node.topics - topics) if shared else None
 
 
-def _doubt(stray: Stray, best: list[HostPort], topics: Mapping[HostPort, Iterable[str]]) -> str:
-    places = ", ".join(str(place) for place in stray.places)
+def _doubt(node: DirectNode, best: list[HostPort], topics: Mapping[HostPort, Iterable[str]]) -> str:
+    places = ", ".join(str(place) for place in node.places)
     if best:
         either = " and ".join(str(place) for place in best)
-        return f"registered as {stray.uri} around the proxy: could be at {either}; left alone"
-    if any(place in topics for place in stray.places):
-        return f"registered as {stray.uri} around the proxy: the node at {places} is another"
-    return f"registered as {stray.uri} around the proxy: no node answers at {places}"
-
-
-def _with_namespaces(parameters: Iterable[str]) -> Iterator[str]:
-    seen: set[str] = set()
-    for name in parameters:
-        parts = name.strip("/").split("/")
-        for count in range(len(parts), 0, -1):
-            key = "/" + "/".join(parts[:count])
-            if key not in seen:
-                seen.add(key)
-                yield key
+        return f"registered as {node.uri} around the proxy: could be at {either}; left alone"
+    if any(place in topics for place in node.places):
+        return f"registered as {node.uri} around the proxy: the node at {places} is another"
+    return f"registered as {node.uri} around the proxy: no node answers at {places}"

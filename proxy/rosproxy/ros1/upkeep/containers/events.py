@@ -1,22 +1,30 @@
-"""News of containers, and the end of a proxy: what a controller tells the admin endpoint."""
+"""What an operator tells of containers, and the end of a proxy: ``POST /containers``, ``/retire``.
+
+*gone*: nodes at these addresses that don't answer are unregistered at once, and their ports refuse.
+*moved*: nodes that answer at the new address keep their ports, and subscribers are told. *arrived*:
+nodes that registered around the proxy before it could be reached are adopted (`adoption`).
+"""
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 from rosproxy.admin import requests
+from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import NodeClient, SelfDescription
+from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import policy
-from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.recovery.recovery import Recovery
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
@@ -30,40 +38,41 @@ RETIRE_TIMEOUT = 3.0
 """Seconds that registrations under way get to end before a proxy retires."""
 
 
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """What news is acted on with; ``cut`` ends the TCPROS connections through a port."""
+class RelayedPorts(Protocol):
+    """What relays TCPROS for the endpoints."""
+
+    def cut(self, port: int) -> None:
+        """End the connections through a port."""
+
+
+@dataclass(slots=True)
+class ContainerEvents:
+    """Acts on what an operator knows of containers before any time-out can tell."""
 
     context: Context
     leases: Leases
     nodes: NodeClient
-    upkeep: Registrar
-    strays: Adopter
-    recovered: Callable[[], Awaitable[None]]
-    cut: Callable[[int], None]
+    registrar: Registrar
+    adopter: Adopter
+    recovery: Recovery
+    relayed: RelayedPorts
+    plane: KernelPlane
+    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-
-class ContainerEvents:
-    """Acts on what a controller knows of containers before any time-out can tell."""
-
-    def __init__(self, parts: Parts) -> None:
-        self._parts, self._context = parts, parts.context
-        self._one_at_a_time = asyncio.Lock()
-
-    async def hear(self, body: Any) -> dict[str, Any]:
+    async def handle(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
         All of it is safe to be told again. Raises BodyError, Unreachable, MasterError; the latter
         two once all has been tried.
         """
         news = requests.read_news(body)
+        failed: list[Exception] = []
         async with self._one_at_a_time:
-            await self._parts.recovered()
-            self._context.read_networks()
-            failed: list[Exception] = []
-            moved = await _tried(self._move(news.moved), failed)
-            unregistered = await _tried(self._bury(news.gone), failed)
-            adopted = await _tried(self._adopt(news.arrived), failed)
+            await self.recovery.ensure()
+            self.context.read_networks()
+            moved = await _try(self._move(news.moved), failed)
+            unregistered = await _try(self._remove(news.gone), failed)
+            adopted = await _try(self._adopt(news.arrived), failed)
         if failed:
             raise failed[0]
         return {"unregistered": unregistered, "moved": moved, "adopted": adopted}
@@ -74,122 +83,109 @@ class ContainerEvents:
         Raises BodyError, Unreachable, MasterError.
         """
         requests.read_nothing(body)
-        self._context.retired = True
+        self.context.retired = True
         async with self._one_at_a_time:
-            await self._parts.recovered()
-            await self._none_under_way()
-            endpoints = list(self._context.registry)
+            await self.recovery.ensure()
+            end, registry = self.context.now() + RETIRE_TIMEOUT, self.context.registry
+            while any(e.pending for e in registry) and self.context.now() < end:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+            endpoints = list(registry)
             count = await self._unregister(e for e in endpoints if not e.health.cleaned)
             for endpoint in endpoints:
-                self._parts.cut(endpoint.port)
-                self._parts.leases.end(endpoint)
+                self._cut(endpoint)
+                self.leases.end(endpoint)
         log.info("retired: %d nodes unregistered; waiting to be stopped", count)
         return {"unregistered": count}
 
-    async def _none_under_way(self) -> None:
-        end, registry = self._context.now() + RETIRE_TIMEOUT, self._context.registry
-        while any(e.pending for e in registry) and self._context.now() < end:  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
-
-    async def _bury(self, addresses: Sequence[str]) -> int:
+    async def _remove(self, addresses: Sequence[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
-        found = policy.at(self._context.registry, addresses)
-        return await self._bury_all(found, self._context.now() - YOUNG)
+        found = policy.at(self.context.registry, addresses)
+        return await self._remove_dead(found, self.context.now() - YOUNG)
 
-    async def _bury_all(self, found: Sequence[Endpoint], since: float) -> int:
+    async def _remove_dead(self, found: Sequence[Endpoint], since: float) -> int:
         """Unregister those that don't answer; who is silent and registered ``since``, later."""
-        probe = self._parts.nodes.probe
-        answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in found))
+        answers = await asyncio.gather(*(self.nodes.probe(e.slave, GONE_TIMEOUT) for e in found))
         outcomes = {e: answer.probe for e, answer in zip(found, answers, strict=True)}
         dead = policy.dead(outcomes, since)
         for endpoint in dead:
             self._close(endpoint)
-        for endpoint in set(found) - set(dead):
+        alive = [endpoint for endpoint in found if endpoint not in dead]
+        for endpoint in alive:
             endpoint.health.checked = None  # another process may have the address by now
-        spared = [e for e in found if e not in dead and outcomes[e] is ProbeResult.SILENT]
-        if spared:
-            self._context.tasks.spawn(self._bury_later(spared), "second chance of silent nodes")
+        silent = [e for e in alive if outcomes[e] is ProbeResult.SILENT]
+        if silent:
+            self.context.tasks.spawn(self._remove_later(silent), "second chance of silent nodes")
         return await self._unregister(e for e in dead if not e.health.cleaned)
 
-    async def _bury_later(self, spared: Sequence[Endpoint]) -> None:
-        """Look again at silent nodes that were spared; upkeep unregisters what can't be now."""
+    async def _remove_later(self, silent: Sequence[Endpoint]) -> None:
+        """Look again at silent nodes; the prober unregisters what can't be now."""
         await asyncio.sleep(SECOND_CHANCE)
         async with self._one_at_a_time:
-            there = [e for e in spared if self._context.registry.by_port.get(e.port) is e]
-            await _tried(self._bury_all(there, float("inf")), [])
+            there = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
+            await _try(self._remove_dead(there, float("inf")), [])
 
-    def _close(self, endpoint: Endpoint) -> None:
-        """Let a port refuse whose node has ended, and end what is still connected to it."""
-        endpoint.health.end(self._context.now())
-        self._parts.leases.close(endpoint)
-        self._parts.cut(endpoint.port)
-        self._context.problems.solved_at(endpoint.port)
+    async def _move(self, moved: Mapping[str, str]) -> int:
+        """Take in that containers have other addresses now; how many nodes that concerns."""
+        registry, addressing = self.context.registry, self.context.addressing
+        candidates = policy.movable(registry, moved, addressing.networks)
+        found = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
+        infos = {e: info for e, info in zip(candidates, found, strict=True) if info}
+        before = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}
+        places = {e: policy.new_place(e, candidates[e]) for e in infos}
+        there = registry.move(places)
+        for endpoint in there:
+            self._settle(endpoint, before[endpoint], infos[endpoint])
+        await self.registrar.resettle(there)
+        for endpoint in set(infos) - set(there):
+            # The node has registered from its new address already, and holds another port there.
+            successor = registry.at(places[endpoint].address, endpoint.node.port)
+            self._close(endpoint)
+            await self.registrar.clean_up(endpoint)
+            if successor is not None:
+                await self.registrar.register_missing(successor, infos[endpoint])
+        return sum(len(endpoint.caller_ids) for endpoint in there)
+
+    async def _inspect(self, endpoint: Endpoint, address: str) -> NodeInfo | None:
+        """What the node of an endpoint says, if it is the one that answers at another address."""
+        info = await self.nodes.inspect(HostPort(address, endpoint.node.port))
+        same = info is not None and policy.is_same_process(endpoint, info.pid, info.topics)
+        return info if same else None
+
+    def _settle(self, endpoint: Endpoint, before: str, info: NodeInfo) -> None:
+        """Serve a node at its new address; the master has the former URI yet."""
+        endpoint.former_uris.add(before)
+        endpoint.former_uris.discard(self.context.addressing.advertised_uri(endpoint))
+        endpoint.unsettled = True
+        endpoint.mark_alive(info.pid, info.tcpros_port, self.context.now())
+        self._cut(endpoint)
+        self.context.problems.solved_at(endpoint.port)
+        self.leases.open(endpoint)
+        log.info("%s is at %s now", endpoint.label, endpoint.place.address)
+
+    async def _adopt(self, arrived: Sequence[requests.Arrival]) -> int:
+        return len((await self.adopter.adopt(arrived)).names) if arrived else 0
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:
         """Unregister nodes; how many names that were."""
         held = [endpoint for endpoint in endpoints if endpoint.registrations]
-        await asyncio.gather(*(self._parts.upkeep.clean_up(endpoint) for endpoint in held))
+        await asyncio.gather(*map(self.registrar.clean_up, held))
         return sum(len(endpoint.caller_ids) for endpoint in held)
 
-    async def _move(self, moved: Mapping[str, str]) -> int:
-        """Take in that containers have other addresses now; how many nodes that concerns."""
-        registry, addressing = self._context.registry, self._context.addressing
-        candidates = policy.movable(registry, moved, addressing.networks)
-        found = await asyncio.gather(*(self._seen(e, new) for e, new in candidates.items()))
-        sights = {e: sight for e, sight in zip(candidates, found, strict=True) if sight}
-        before = {endpoint: addressing.advertised_uri(endpoint) for endpoint in sights}
-        places = {e: policy.new_place(e, candidates[e]) for e in sights}
-        there = registry.move(places)
-        for endpoint in there:
-            self._settle_in(endpoint, before[endpoint], sights[endpoint])
-        await self._parts.upkeep.resettle(there)
-        for endpoint in set(sights) - set(there):
-            await self._give_way(endpoint, places[endpoint], sights[endpoint])
-        return sum(len(endpoint.caller_ids) for endpoint in there)
+    def _close(self, endpoint: Endpoint) -> None:
+        """Let a port refuse whose node has ended, and end what is still connected to it."""
+        endpoint.health.end(self.context.now())
+        self.leases.close(endpoint)
+        self._cut(endpoint)
+        self.context.problems.solved_at(endpoint.port)
 
-    async def _seen(self, endpoint: Endpoint, address: str) -> "_Sight | None":
-        """The node of an endpoint if it answers at another address."""
-        where = HostPort(address, endpoint.node.port)
-        answer = await self._parts.nodes.probe(where)
-        said = await self._parts.nodes.describe(where) if answer.pid is not None else None
-        if said is None or not policy.is_same_process(endpoint, answer.pid, said.topics):
-            return None
-        return _Sight(answer.pid, said)
-
-    def _settle_in(self, endpoint: Endpoint, before: str, sight: "_Sight") -> None:
-        endpoint.former_uris.add(before)
-        endpoint.former_uris.discard(self._context.addressing.advertised_uri(endpoint))
-        endpoint.unsettled = endpoint.trusted = True
-        endpoint.tcpros_port = sight.said.tcpros_port
-        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
-        endpoint.health.pid, endpoint.health.cleaned = sight.pid, False
-        self._parts.cut(endpoint.port)
-        self._context.problems.solved_at(endpoint.port)
-        self._parts.leases.open(endpoint)
-        log.info("%s is at %s now", endpoint.label, endpoint.place.address)
-
-    async def _give_way(self, endpoint: Endpoint, place: Place, sight: "_Sight") -> None:
-        """The node has registered from its new address already, and holds another port there."""
-        there = self._context.registry.at(place.address, endpoint.node.port)
-        self._close(endpoint)
-        await self._parts.upkeep.clean_up(endpoint)
-        if there is not None:
-            await self._parts.upkeep.adopt(there, sight.said)
-
-    async def _adopt(self, arrived: Sequence[requests.Arrival]) -> int:
-        return len((await self._parts.strays.adopt(arrived)).names) if arrived else 0
+    def _cut(self, endpoint: Endpoint) -> None:
+        """End the connections to a node, also those that the kernel forwards."""
+        self.relayed.cut(endpoint.port)
+        self.plane.cut(endpoint)
 
 
-@dataclass(frozen=True, slots=True)
-class _Sight:
-    """A node that has moved: its pid and what it says of itself."""
-
-    pid: int | None
-    said: SelfDescription
-
-
-async def _tried(work: Awaitable[int], failed: list[Exception]) -> int:
-    """A result; 0 if the master could not be asked, which is noted."""
+async def _try(work: Awaitable[int], failed: list[Exception]) -> int:
+    """A result; 0 if the master could not be asked, which is noted in ``failed``."""
     try:
         return await work
     except (Unreachable, MasterError) as error:

@@ -1,4 +1,9 @@
-"""Which endpoints the news of containers concerns."""
+"""Which endpoints it concerns that containers are gone or have other addresses.
+
+An operator knows it before any time-out can tell, but its events may be late, or about an address
+that another container has by now. So each is a hint, and the node itself is asked before anything
+is done.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
@@ -16,7 +21,7 @@ def at(endpoints: Iterable[Endpoint], addresses: Collection[str]) -> list[Endpoi
 def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
     """Those of the endpoints at addresses that are gone whose node does not answer.
 
-    Where one answers, the address is in use again, or the news was wrong. One that is silent but
+    Where one answers, the address is in use again, or the event was late. One that is silent but
     has registered ``since`` then is spared: a container that is restarted has its address
     again, and a node that is just starting may take its time.
     """

@@ -1,8 +1,9 @@
 """Rebuilding the registry from what the master holds, after a start without memory.
 
 The advertised URIs at the master carry the inside addresses. Anybody can write such a URI to the
-master, so what is found there is only a claim: the shell asks the node itself before it serves it
-(see `confirmed_by`).
+master, so what is found there is only a claim. Where several claim one port, or one node, the one
+that its node bears out best is kept (`settle`); the node of one that is kept is asked before it is
+served (`confirmed_by`).
 """
 
 from collections import Counter
@@ -95,20 +96,3 @@ def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
     """
     telling = endpoint.topics - _EVERYBODYS
     return bool((telling or endpoint.topics) & topics)
-
-
-def lost(
-    ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
-) -> list[Registration]:
-    """Which of our registrations the master no longer has.
-
-    Those made after ``before``, the time at which the master was asked, don't count; nor do
-    parameter subscriptions, which the master's state leaves out, unless their node is unknown.
-    """
-    known = {held.key for held_list in state.values() for held in held_list}
-    gone = [h for h in ours if h.since < before and h.kind is not Kind.PARAM]
-    missing = [held for held in gone if held.key not in known]
-    lost_nodes = {held.caller_id for held in missing} - set(state)
-    return missing + [
-        held for held in ours if held.kind is Kind.PARAM and held.caller_id in lost_nodes
-    ]

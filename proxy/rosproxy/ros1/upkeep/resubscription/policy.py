@@ -2,7 +2,12 @@
 
 roscpp never tries again after a connection that was refused at once
 (transport_publisher_link.cpp, onRetryTimer), nor after a requestTopic that got no answer
-(subscription.cpp, pendingConnectionDone): such a subscriber is silent until its publishers change.
+(subscription.cpp, pendingConnectionDone); rospy does not try again at all. Such a subscriber hears
+nothing until its list of publishers changes.
+
+Nobody can be asked for the connections that are missing, so they are what is left of all
+subscriptions at the master, once those are taken off that are served: by a relay of the proxy, by
+UDPROS, by the kernel, or directly, without the proxy.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -96,10 +101,10 @@ def read_bus(rows: Any) -> list[BusRow]:
     return found
 
 
-def silent(
+def unconnected(
     left: Iterable[Subscription], bus: Mapping[Endpoint, Sequence[BusRow]], addresses: Addresses
 ) -> list[Subscription]:
-    """Those of the ones without relay that no other way serves.
+    """Those of the subscriptions without relay that no other way serves either.
 
     UDPROS is known by the publisher's own word. It is not asked for TCPROS: it takes connections
     for open whose other end has vanished. What the kernel forwards is known by hosts alone.

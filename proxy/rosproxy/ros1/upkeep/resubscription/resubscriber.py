@@ -1,9 +1,25 @@
-"""Finding subscribers without a connection, and having them make a new one."""
+"""A subscriber that hears nothing though its publisher is there: having it connect again.
+
+After the proxy was away, or a port has refused for a time, subscribers may have given up for good
+(see `policy`). There is one cure for roscpp and rospy: a ``publisherUpdate`` without the publisher,
+then one with it. The proxy sends the first itself (`_withdraw`), and only to subscribers without a
+connection, since it costs the others theirs. For the second one publisher of each topic is
+registered again, which makes the master tell all of the topic's subscribers.
+
+Inside subscribers can have missed publishers outside in the same way. Registering a subscriber
+again yields its publishers, which it is then handed.
+
+`announce` does this for endpoints that a fresh proxy has found at the master, `remind` for a node
+that answers again. Both have the endpoints looked at again later (`look`): what a subscriber does
+in the meantime takes up to three minutes.
+"""
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Protocol
 
+from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.master_graph import locate, read_registrations
@@ -12,9 +28,11 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
+from rosproxy.ros1.upkeep.registration.policy import one_publisher_per_topic
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscription import policy
 from rosproxy.ros1.upkeep.resubscription.policy import BusRow, Connection, Subscription
-from rosproxy.ros1.upkeep.resubscription.publisher_updates import PARALLEL_CALLS, PublisherUpdates
 
 log = logging.getLogger(__name__)
 
@@ -25,51 +43,86 @@ Before the first a proxy that is replaced by force has ended, and roscpp's first
 Before the last two rospy gives up a connection whose other end has vanished without a word: its
 keep-alive probes begin after 60 seconds, and are answered by a reset, or for 90 more by nothing.
 """
-SILENT_TICK = 1.0
-"""Seconds between looks whether it is time for any."""
+RESUBSCRIBE_TICK = 1.0
+"""Seconds between checks whether it is time to look at any."""
 
-Missed = Mapping[tuple[str, str], set[Endpoint]]
-"""Topics and subscribers with the endpoints to which these have no connection."""
+
+class RelayedTopics(Protocol):
+    """What relays TCPROS for the endpoints."""
+
+    def topic_connections(self) -> set[Connection]:
+        """The subscribers' connections that are relayed now."""
 
 
 class Resubscriber:
-    """Looks after the subscribers of publishers that were out of reach for a time.
-
-    ``connections`` gives those that relays serve, ``look`` takes in those that the kernel forwards.
-    """
+    """Looks after the subscribers of publishers that were out of reach for a time."""
 
     def __init__(
         self,
         context: Context,
+        registrar: Registrar,
         updates: PublisherUpdates,
-        connections: Callable[[], set[Connection]],
-        look: Callable[[], Awaitable[None]],
+        relayed: RelayedTopics,
+        plane: KernelPlane,
     ) -> None:
-        self._context, self._updates = context, updates
-        self._connections, self._look = connections, look
+        self._context, self._registrar, self._updates = context, registrar, updates
+        self._relayed, self._plane = relayed, plane
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
 
     def watch(self, endpoints: Iterable[Endpoint]) -> None:
-        """Have endpoints looked after some times from now on."""
+        """Have endpoints looked at some times from now on."""
         now = self._context.now()
         for endpoint in endpoints:
             self._looks[endpoint] = [now + after for after in LOOKS]
 
-    def due(self) -> list[Endpoint]:
-        """The endpoints for which it is time; each is told once per look."""
+    async def announce(self, endpoints: Iterable[Endpoint]) -> None:
+        """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
+        found = list(endpoints)
+        self.watch(found)
+        await self._withdraw(found, ask=False)
+        held = [(e, held) for e in found for held in e.registrations.values()]
+        subscribers = [one for one in held if one[1].kind is Kind.SUBSCRIBER]
+        await self._registrar.register([*one_publisher_per_topic(found), *subscribers])
+
+    async def remind(self, endpoint: Endpoint) -> None:
+        """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
+
+        A subscriber whose requestTopic was refused does not ask again by itself: it is told of
+        its publishers once more when one registers. Connections that have lasted stay.
+        """
+        self.watch([endpoint])
+        topics = (Kind.PUBLISHER, Kind.SUBSCRIBER)
+        held = [one for one in endpoint.registrations.values() if one.kind in topics]
+        await self._registrar.register([(endpoint, one) for one in held])
+
+    async def look(self) -> None:
+        """Have subscribers connect that have lost a publisher in spite of `announce`."""
+        endpoints = [] if self._context.retired else self._due()
+        try:
+            topics = await self._withdraw(endpoints) if endpoints else set()
+            if topics:
+                log.info("subscribers of %d topics had no connection; told anew", len(topics))
+                held = one_publisher_per_topic(endpoints)
+                await self._registrar.register([one for one in held if one[1].name in topics])
+        except (Unreachable, MasterError) as error:
+            log.debug("looking for subscribers without a connection: %s", error)
+
+    def _due(self) -> list[Endpoint]:
+        """The endpoints for which it is time; each is named once per look."""
         now, found = self._context.now(), []
         for endpoint, times in list(self._looks.items()):
+            left = [time for time in times if time > now]
             if self._context.registry.by_port.get(endpoint.port) is not endpoint:
-                del self._looks[endpoint]
-            elif times[0] <= now:
+                left = []
+            elif len(left) < len(times):
                 found.append(endpoint)
-                self._looks[endpoint] = [time for time in times if time > now]
-                if not self._looks[endpoint]:
-                    del self._looks[endpoint]
+            self._looks[endpoint] = left
+            if not left:
+                del self._looks[endpoint]
         return [e for e in found if e.trusted and not (e.health.down or e.health.cleaned)]
 
-    async def withdraw(self, endpoints: Iterable[Endpoint], ask: bool = True) -> set[str]:
+    async def _withdraw(self, endpoints: Iterable[Endpoint], ask: bool = True) -> set[str]:
         """Tell subscribers without connection that these publishers have gone; the topics.
 
         They make a new connection once they are told that the publishers are there again. Unless
@@ -78,32 +131,32 @@ class Resubscriber:
         """
         held = await read_registrations(self._context.upstream)
         wanted = policy.subscriptions(held, endpoints, self._context.addressing)
-        left = policy.without_relay(wanted, self._connections())
+        left = policy.without_relay(wanted, self._relayed.topic_connections())
         if not left:
             return set()
-        graph = await self._located(held, left)
-        left = self._relayed(graph, left)
-        bus = await self._buses(left) if ask else {}
+        graph = await self._locate(held, left)
+        left = self._through_proxy(graph, left)
+        bus = await self._read_buses(left) if ask else {}
         if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
-            await self._look()
-        addresses = await self._addresses(graph, left)
-        left = policy.without_relay(left, self._connections())
-        return await self._tell(graph, policy.silent(left, bus, addresses))
+            await self._plane.look()
+        addresses = await self._resolve_hosts(graph, left)
+        left = policy.without_relay(left, self._relayed.topic_connections())
+        return await self._send_without(graph, policy.unconnected(left, bus, addresses))
 
-    async def _located(
+    async def _locate(
         self, held: Mapping[str, list[Registration]], left: Sequence[Subscription]
     ) -> Graph:
         """What is registered, with the URIs of those whom it is about."""
         topics = {one.topic for one in left}
-        publishers = (
+        publishers = {
             node
             for node, registrations in held.items()
             if any(one.kind is Kind.PUBLISHER and one.name in topics for one in registrations)
-        )
-        names = {one.caller_id for one in left}.union(publishers)
+        }
+        names = publishers | {one.caller_id for one in left}
         return await locate(self._context.upstream, held, names)
 
-    def _relayed(self, graph: Graph, left: Iterable[Subscription]) -> list[Subscription]:
+    def _through_proxy(self, graph: Graph, left: Iterable[Subscription]) -> list[Subscription]:
         """Those whose subscribers reach the publisher through the proxy."""
         addressing, subscribers = self._context.addressing, {one.caller_id for one in left}
         uris = {node: graph.uris[node] for node in subscribers if node in graph.uris}
@@ -119,46 +172,54 @@ class Resubscriber:
 
         return [one for one in left if is_relayed(one)]
 
-    async def _buses(self, left: Iterable[Subscription]) -> dict[Endpoint, list[BusRow]]:
+    async def _read_buses(self, left: Iterable[Subscription]) -> dict[Endpoint, list[BusRow]]:
+        """What the publishers themselves say of their connections."""
+
+        async def read(endpoint: Endpoint) -> list[BusRow]:
+            upstream, timeout = self._context.upstream, self._context.settings.probe_timeout
+            async with self._limit:
+                try:
+                    rows = await upstream.call_node(endpoint.slave, timeout, "getBusInfo")
+                except (Unreachable, MasterError) as error:
+                    log.debug("%s does not tell its connections: %s", endpoint.label, error)
+                    return []
+            return policy.read_bus(rows)
+
         endpoints = list(dict.fromkeys(one.endpoint for one in left))
-        said = await asyncio.gather(*(self._bus(endpoint) for endpoint in endpoints))
-        return dict(zip(endpoints, said, strict=True))
+        found = await asyncio.gather(*map(read, endpoints))
+        return dict(zip(endpoints, found, strict=True))
 
-    async def _bus(self, endpoint: Endpoint) -> list[BusRow]:
-        upstream, within = self._context.upstream, self._context.settings.probe_timeout
-        async with self._limit:
-            try:
-                return policy.read_bus(
-                    await upstream.ask_node(endpoint.slave, within, "getBusInfo")
-                )
-            except (Unreachable, MasterError) as error:
-                log.debug("%s does not tell its connections: %s", endpoint.label, error)
-                return []
-
-    async def _addresses(self, graph: Graph, left: Iterable[Subscription]) -> dict[str, list[str]]:
+    async def _resolve_hosts(
+        self, graph: Graph, left: Iterable[Subscription]
+    ) -> dict[str, list[str]]:
         """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
+
+        async def find(uri: str) -> list[str]:
+            endpoint = self._context.addressing.stands_for(uri)
+            where = endpoint.slave if endpoint else parse_slave_uri(uri)
+            return await resolve(self._context.upstream.reach(where).host) if where else []
+
         nodes = sorted({one.caller_id for one in left if one.endpoint.fast_peers})
-        found = await asyncio.gather(*(self._resolve(graph.uris[node]) for node in nodes))
+        found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, found, strict=True))
 
-    async def _resolve(self, uri: str) -> list[str]:
-        endpoint = self._context.addressing.stands_for(uri)
-        where = endpoint.slave if endpoint else parse_slave_uri(uri)
-        return await resolve(self._context.upstream.reach(where).host) if where else []
-
-    async def _tell(self, graph: Graph, found: Iterable[Subscription]) -> set[str]:
+    async def _send_without(self, graph: Graph, found: Iterable[Subscription]) -> set[str]:
+        """Send each subscriber its publishers without those that it misses; the topics."""
         missed: dict[tuple[str, str], set[Endpoint]] = {}
         for one in found:
             missed.setdefault((one.topic, one.caller_id), set()).add(one.endpoint)
-        answered = await asyncio.gather(*self._tellings(graph, missed))
-        told = [one for one, heard in zip(missed, answered, strict=True) if heard]
-        for topic, node in told:
-            log.debug("%s has no connection for %s; it is told anew", node, topic)
-        return {topic for topic, _ in told}
-
-    def _tellings(self, graph: Graph, missed: Missed) -> Iterable[Awaitable[bool]]:
-        publishers = graph.by_topic(Kind.PUBLISHER)
-        for (topic, node), endpoints in missed.items():
-            uris = publishers.get(topic, [])
-            left = policy.publishers_left(uris, endpoints, self._context.addressing)
-            yield self._updates.tell(graph.uris[node], topic, left)
+        publishers, addressing = graph.by_topic(Kind.PUBLISHER), self._context.addressing
+        calls = (
+            self._updates.send(
+                graph.uris[node],
+                topic,
+                policy.publishers_left(publishers.get(topic, []), endpoints, addressing),
+            )
+            for (topic, node), endpoints in missed.items()
+        )
+        topics = set()
+        for (topic, node), heard in zip(missed, await asyncio.gather(*calls), strict=True):
+            if heard:
+                log.debug("%s has no connection for %s; it is told anew", node, topic)
+                topics.add(topic)
+        return topics

@@ -1,0 +1,200 @@
+"""The loop of an operator, for any engine: look, act, and wait for a reason to look again.
+
+A reason is an event (`wake`), a time (`wake_in`, or what the look returned), or the resync. A look
+is level-triggered: it sees everything, so an event says no more than that there was one, and a
+burst of them costs one look. A look that fails is repeated after a pause that grows. Events do not
+shorten it, since what could not be asked does not get better by being asked more often, but `retry`
+does: the engine is back.
+
+The loop knows nothing of what is looked at. All times are those of the event loop's clock, so that
+tests can let it jump.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+
+from rosproxy_operator.common.metrics import CommonMetrics
+
+log = logging.getLogger(__name__)
+
+PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Seconds until an engine is asked again that did not answer; the last is repeated."""
+BEAT = 1.0
+"""Seconds between two signs of life of the event loop."""
+LONGEST_BEAT = 20.0
+"""Seconds after which an event loop that shows none hangs."""
+
+Look = Callable[[], Awaitable[float | None]]
+"""Looks and acts; returns in how many seconds to look again at the latest. Raises LookFailed."""
+
+
+class LookFailed(Exception):
+    """A look was not possible; the message is one line. ``away``: the engine can't be asked."""
+
+    def __init__(self, message: str, away: bool = False) -> None:
+        super().__init__(message)
+        self.away = away
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """The times of a loop, in seconds.
+
+    ``resync`` is the longest and ``debounce`` the least time between two looks. ``longest`` is
+    what a look may take before it is given up; ``engine`` says what is looked at.
+    """
+
+    engine: str
+    resync: float
+    debounce: float
+    longest: float
+
+
+class ControlLoop:
+    """Looks again and again. `wake`, `wake_in` and `retry` belong to the event loop's thread."""
+
+    def __init__(self, pace: Pace, metrics: CommonMetrics) -> None:
+        self._pace, self._metrics = pace, metrics
+        self._woken, self._back = asyncio.Event(), asyncio.Event()
+        self._timer: asyncio.TimerHandle | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._failures = 0
+        self._error: str | None = "has not looked yet"
+        self._again_in: float | None = None
+        self._looking_since: float | None = None
+        self._looked_at = self._beat_at = 0.0
+
+    async def run(self, look: Look) -> None:
+        """Look until cancelled, whatever becomes of it: a mistake of ours must not end it."""
+        async with self._alive():
+            while True:
+                try:
+                    await self._try(look)
+                except Exception as error:
+                    if not self._failures:
+                        log.exception("a look failed; going on")
+                    self._failed(LookFailed(f"the operator failed: {error!r}"))
+                await self._pause(self._pace.resync)
+
+    async def run_until(
+        self, look: Look, settled: Callable[[], bool], seconds: float, resync: float = 1.0
+    ) -> None:
+        """Look until one that succeeded has ``settled`` everything, for so many seconds at most.
+
+        Raises LookFailed if the engine is away.
+        """
+        async with self._alive():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    while not (await self._try(look, patient=False) and settled()):
+                        await self._pause(resync)
+
+    @property
+    def woken(self) -> bool:
+        """Whether there is a reason for another look."""
+        return self._woken.is_set()
+
+    def wake(self) -> None:
+        """Look again soon."""
+        self._woken.set()
+
+    def wake_threadsafe(self) -> None:
+        """The same from any thread, also before the loop runs or after it has ended."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the event loop has ended
+                self._loop.call_soon_threadsafe(self._woken.set)
+
+    def wake_in(self, seconds: float) -> None:
+        """Look again in so many seconds, instead of what was said so before."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = asyncio.get_running_loop().call_later(seconds, self._woken.set)
+
+    def retry(self) -> None:
+        """Look again soon, also after a failure: the engine is back."""
+        self._woken.set()
+        self._back.set()
+
+    def dead(self) -> str | None:
+        """Why the loop is not alive; None if it is. May be asked from any thread."""
+        if self._loop is None:
+            return None
+        now, since = self._loop.time(), self._looking_since
+        if now - self._beat_at > LONGEST_BEAT:
+            return f"the event loop has not run for {now - self._beat_at:.0f} s"
+        if since is not None and now - since > self._pace.longest:
+            return f"looking at the {self._pace.engine} for {now - since:.0f} s"
+        return None
+
+    def unready(self) -> str | None:
+        """Why the last look was no success; None if it was."""
+        return self._error
+
+    async def _try(self, look: Look, patient: bool = True) -> bool:
+        """One look; whether it succeeded. Raises LookFailed only if the engine is away."""
+        self._woken.clear()
+        self._back.clear()
+        self._looking_since = asyncio.get_running_loop().time()
+        try:
+            async with asyncio.timeout(self._pace.longest):
+                self._again_in = await look()
+        except TimeoutError:
+            took = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
+            self._failed(LookFailed(took, away=True))
+        except LookFailed as error:
+            self._failed(error)
+            if error.away and not patient:
+                raise
+        else:
+            self._succeeded()
+        finally:
+            self._looking_since, self._looked_at = None, asyncio.get_running_loop().time()
+        return not self._failures
+
+    def _succeeded(self) -> None:
+        if self._failures:
+            log.info("looking works again")
+        self._failures, self._error = 0, None
+        self._metrics.looks.labels("ok").inc()
+        self._metrics.up.set(1)
+
+    def _failed(self, error: LookFailed) -> None:
+        if str(error) != self._error:
+            log.log(logging.WARNING if error.away else logging.ERROR, "%s", error)
+        self._failures += 1
+        self._error = str(error)
+        self._metrics.looks.labels("unavailable" if error.away else "failed").inc()
+        self._metrics.up.set(0 if error.away else 1)
+
+    async def _pause(self, resync: float) -> None:
+        """Wait until it is time for another look."""
+        if self._failures:
+            reason, seconds = self._back, PAUSES[min(self._failures, len(PAUSES)) - 1]
+        else:
+            reason = self._woken
+            seconds = resync if self._again_in is None else min(resync, self._again_in)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await reason.wait()
+        now = asyncio.get_running_loop().time()
+        await asyncio.sleep(self._looked_at + self._pace.debounce - now)
+
+    @contextlib.asynccontextmanager
+    async def _alive(self) -> AsyncIterator[None]:
+        self._loop = asyncio.get_running_loop()
+        self._beat_at = self._loop.time()
+        beating = asyncio.create_task(self._beat(self._loop))
+        try:
+            yield
+        finally:
+            beating.cancel()
+            if self._timer is not None:
+                self._timer.cancel()
+
+    async def _beat(self, loop: asyncio.AbstractEventLoop) -> None:
+        while True:
+            self._beat_at = loop.time()
+            await asyncio.sleep(BEAT)

@@ -1,6 +1,0 @@
-"""Text for people, as all controllers tell it."""
-
-
-def bounded(text: str, most: int) -> str:
-    """A text of at most so many characters."""
-    return text if len(text) <= most else f"{text[: most - 1]}…"

@@ -1,0 +1,184 @@
+"""What a proxy is to be told of the containers on its networks."""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from ipaddress import IPv4Network, ip_address
+
+from rosproxy.net.addresses import is_address
+from rosproxy_operator.docker.planner.model import STARTED, Container, HostState, Member, Proxy
+from rosproxy_operator.docker.planner.specs import master
+
+AGAIN = (0.0, 1.0, 3.0, 10.0)
+"""Seconds after a container's arrival at which its proxy is told: nodes take time to register."""
+AWAY = 2.0
+"""Seconds for which a running container may be off a network before its address counts as gone."""
+MOVING = 5.0
+"""Seconds for which a proxy is told of a move, until it has found the nodes at the new address."""
+Place = tuple[str, str]
+"""A container's id and a network."""
+_SHARED = "container:"
+_HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
+"""What a node can call its host in a URI; aliases may be anything."""
+
+
+@dataclass(frozen=True, slots=True)
+class ContainerArrival:
+    """A labelled container on a network of its proxy, since one start of it (``endpoint``)."""
+
+    container: str
+    network: str
+    address: str
+    endpoint: str
+    names: frozenset[str] = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkFacts:
+    """What one look says to one proxy.
+
+    ``addresses`` are those of running containers on its networks, by container id and network;
+    ``taken`` those of all containers and gateways. ``subnets`` are those of its networks,
+    ``running`` the ids of all containers that run. ``master_address`` is empty if there is nothing
+    to be told.
+    """
+
+    master_address: str = ""
+    addresses: Mapping[Place, str] = field(default_factory=dict)
+    taken: frozenset[str] = frozenset()
+    subnets: tuple[IPv4Network, ...] = ()
+    arrivals: frozenset[ContainerArrival] = frozenset()
+    running: frozenset[str] = frozenset()
+
+
+class Places:
+    """Where containers are, as far as their proxy knows, and where they were just now.
+
+    A container that is disconnected and connected again under another address has moved, and its
+    nodes live on. Times are monotonic.
+    """
+
+    def __init__(self) -> None:
+        self._at: dict[Place, str] = {}
+        self._absent: dict[Place, float] = {}
+        self._moves: dict[str, tuple[str, float]] = {}
+
+    def look(self, known: NetworkFacts, now: float) -> None:
+        """Compare with what the last look has found."""
+        missing = [place for place in self._at if place not in known.addresses]
+        self._absent = {place: self._absent.get(place, now) for place in missing}
+        for place, since in list(self._absent.items()):
+            if place[0] not in known.running or now >= since + AWAY:
+                del self._at[place], self._absent[place]
+        taken = set(known.addresses.values())
+        for place, address in known.addresses.items():
+            before = self._at.get(place, address)
+            if before != address:
+                self._moves[before] = address, now
+        self._follow(known, now)
+        self._at |= known.addresses
+        self._moves = {
+            old: (new, since)
+            for old, (new, since) in self._moves.items()
+            if now < since + MOVING and old not in taken
+        }
+
+    def _follow(self, known: NetworkFacts, now: float) -> None:
+        """Let nodes of a network that their container has left be found on one that it is on."""
+        for container, network in list(self._absent):
+            elsewhere = [
+                ((container, other) in self._at, address)
+                for (found, other), address in known.addresses.items()
+                if found == container
+            ]
+            if elsewhere:
+                left = self._at.pop((container, network))
+                self._moves[left] = min(elsewhere)[1], now
+                del self._absent[container, network]
+
+    @property
+    def held(self) -> frozenset[str]:
+        """The addresses that nobody has, but whose containers may come back or have moved."""
+        return frozenset(self._at[place] for place in self._absent) | self._moves.keys()
+
+    @property
+    def until(self) -> float | None:
+        """When the first of them is given up; None if there is none."""
+        times = [since + AWAY for since in self._absent.values()]
+        times += [since + MOVING for _, since in self._moves.values()]
+        return min(times, default=None)
+
+    def moved(self, nodes: Collection[str]) -> dict[str, str]:
+        """Old address to new one, of those where the proxy still believes its ``nodes`` to be."""
+        return {old: new for old, (new, _) in self._moves.items() if old in nodes}
+
+
+def facts(
+    observed: HostState, proxy: Proxy, members: Iterable[Member], master_address: str
+) -> NetworkFacts:
+    """What a look says to a proxy. ``members`` are those of all proxies."""
+    box = observed.sandbox_of(proxy)
+    joined = {a.network for a in box.container.attachments if a.address} if box else set()
+    by_id = {container.id: container for container in observed.containers}
+    mine = [by_id[m.id] for m in members if m.key == proxy.key and m.id in by_id]
+    running = [container for container in observed.containers if container.state in STARTED]
+    return NetworkFacts(
+        master_address="" if is_address(master(proxy.key).host) else master_address,
+        addresses={
+            (container.id, a.network): a.address
+            for container in running
+            for a in container.attachments
+            if a.network in joined and a.address
+        },
+        taken=observed.addresses | {network.gateway for network in observed.networks},
+        subnets=tuple(
+            subnet
+            for network in observed.networks
+            if network.name in joined
+            for subnet in network.subnets
+        ),
+        arrivals=frozenset(
+            arrival for container in mine for arrival in _arrivals(container, by_id, joined)
+        ),
+        running=frozenset(container.id for container in running),
+    )
+
+
+def gone(
+    nodes: Collection[str], taken: Collection[str], subnets: Collection[IPv4Network]
+) -> list[str]:
+    """The addresses of a proxy's nodes that no container has any more.
+
+    ``taken`` are those of all containers and gateways, ``subnets`` those of the networks that the
+    proxy is on or was on: other addresses are none of the engine's.
+    """
+    return sorted(address for address in set(nodes) - set(taken) if _inside(address, subnets))
+
+
+def _arrivals(
+    container: Container, by_id: Mapping[str, Container], joined: set[str]
+) -> list[ContainerArrival]:
+    """A container's places; of one that shares another's network, the other's."""
+    host = by_id.get(container.network_mode.removeprefix(_SHARED), container)
+    if container.state not in STARTED or host.state not in STARTED:
+        return []
+    own = {container.name, container.hostname, container.id[:12], host.hostname}
+    return [
+        ContainerArrival(
+            container.id,
+            a.network,
+            a.address,
+            a.endpoint,
+            frozenset(name for name in a.names | own if _HOST_NAME.fullmatch(name)),
+        )
+        for a in host.attachments
+        if a.network in joined and a.address
+    ]
+
+
+def _inside(host: str, subnets: Iterable[IPv4Network]) -> bool:
+    try:
+        address = ip_address(host)
+    except ValueError:
+        return False
+    return any(address in subnet for subnet in subnets)

@@ -1,0 +1,223 @@
+"""TCP and HTTP as the fakes speak them, over asyncio streams.
+
+A fake master or node is an XML-RPC server, and a node a TCPROS server besides. Both are a
+:class:`FakeTcpServer`: it knows its connections and ends them all when it stops. The HTTP server
+reads requests and leaves the whole response to a function, so that a test can have an answer as
+odd as it likes. `call` is the client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import socket
+import struct
+import xmlrpc.client
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+from urllib.parse import urlsplit
+
+Where = tuple[str, int]
+"""Host and port."""
+ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+
+CALL_SECONDS = 5.0
+"""How long a call may take in all."""
+
+
+class End(Enum):
+    """What to do instead of answering."""
+
+    RESET = "reset the connection"
+    CLOSE = "close the connection"
+    HANG = "never answer"
+
+
+Answer = bytes | End
+"""A whole HTTP response, or none."""
+
+
+@dataclass
+class FakeRequest:
+    """An HTTP request; header names in lower case."""
+
+    verb: str
+    path: str
+    headers: dict[str, str] = field(default_factory=dict)
+    body: bytes = b""
+    source: str = ""
+
+    @property
+    def call(self) -> tuple[str, tuple[Any, ...]]:
+        """Method and parameters of an XML-RPC call."""
+        params, method = xmlrpc.client.loads(self.body)
+        return str(method), params
+
+
+Respond = Callable[[FakeRequest], Awaitable[Answer]]
+
+
+def ok(body: bytes, *headers: str) -> bytes:
+    """A whole response with status 200; `headers` are whole lines."""
+    lines = ["HTTP/1.1 200 OK", "Content-Type: text/xml", *headers]
+    if not any(line.lower().startswith(("content-length:", "transfer-enc")) for line in headers):
+        lines.append(f"Content-Length: {len(body)}")
+    return "\r\n".join([*lines, "", ""]).encode() + body
+
+
+def value(result: Any) -> bytes:
+    """A whole response that holds an XML-RPC value, or a Fault."""
+    held = result if isinstance(result, xmlrpc.client.Fault) else (result,)
+    return ok(xmlrpc.client.dumps(held, methodresponse=True).encode())
+
+
+def where(uri: str) -> Where:
+    """Host and port of a URI; raises ValueError when it lacks one."""
+    parts = urlsplit(uri)
+    if not parts.hostname or not parts.port:
+        raise ValueError(f"no host and port in {uri!r}")
+    return parts.hostname, parts.port
+
+
+def bracketed(host: str) -> str:
+    """A host as it stands in a URI."""
+    return f"[{host}]" if ":" in host else host
+
+
+def is_free(port: int, address: str = "") -> bool:
+    """Whether a port could be bound; 0 asks whether there is such an address."""
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
+
+
+def free_ports(count: int, address: str = "") -> int:
+    """The first of `count` ports in a row that nobody uses; below the ephemeral range."""
+    while True:
+        first = random.randrange(15000, 32000 - count)  # noqa: S311
+        if all(is_free(port, address) for port in range(first, first + count)):
+            return first
+
+
+async def call(
+    address: Where | str, method: str, *params: Any, source: str = "", host: str = ""
+) -> Any:
+    """The value of an XML-RPC call. Raises Fault, ValueError, OSError, EOFError, TimeoutError.
+
+    `source` is the address to call from; `host` what to call the peer, where that isn't `address`.
+    """
+    target = where(address) if isinstance(address, str) else address
+    body = xmlrpc.client.dumps(params, method).encode()
+    host = host or f"{bracketed(target[0])}:{target[1]}"
+    head = f"POST / HTTP/1.1\r\nHost: {host}\r\nContent-Length: {len(body)}\r\n\r\n"
+    async with asyncio.timeout(CALL_SECONDS):
+        reader, writer = await connect(target, source)
+        try:
+            writer.write(head.encode() + body)
+            answer = (await reader.readuntil(b"\r\n\r\n")).lower()
+            size = int(answer.partition(b"content-length:")[2].split(b"\r\n")[0])
+            return xmlrpc.client.loads(await reader.readexactly(size))[0][0]
+        finally:
+            writer.close()
+
+
+async def connect(
+    address: Where, source: str = ""
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Open a connection, from `source` if it is of the same family. Raises OSError."""
+    local = (source, 0) if source and ":" not in address[0] else None
+    return await asyncio.open_connection(*address, local_addr=local)
+
+
+class FakeTcpServer:
+    """A server that ends its connections when it stops, as a process does that ends.
+
+    `admits` tells of a peer's address whether it may connect. `connections` counts all that came.
+    """
+
+    def __init__(self, serve: ServeConnection) -> None:
+        self._serve = serve
+        self._server: asyncio.Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.admits: Callable[[str], bool] = lambda _peer: True
+        self.connections = 0
+        self.address: Where = ("", 0)
+
+    @property
+    def listening(self) -> bool:
+        """Whether it takes connections."""
+        return self._server is not None
+
+    async def start(self, address: str, port: int = 0) -> None:
+        """Listen; on a free port if none is given."""
+        self._server = await asyncio.start_server(self._accept, address, port, backlog=256)
+        self.address = self._server.sockets[0].getsockname()[:2]
+
+    def stop_listening(self) -> None:
+        """Take no more connections; those that are open stay."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+
+    async def stop(self) -> None:
+        """Stop listening and close all connections."""
+        self.stop_listening()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for _ in range(10):  # let connections end that were accepted in this moment
+            await asyncio.sleep(0)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        peer = writer.get_extra_info("peername")
+        if task is None or peer is None or self._server is None or not self.admits(peer[0]):
+            writer.transport.abort()
+            return
+        self._tasks.add(task)
+        self.connections += 1
+        try:
+            await self._serve(reader, writer)
+        except (OSError, EOFError, asyncio.CancelledError):
+            pass  # the peer, or who stopped the server, ended it
+        finally:
+            self._tasks.discard(task)
+            writer.close()
+
+
+class FakeHttpServer(FakeTcpServer):
+    """An HTTP server with keep-alive."""
+
+    def __init__(self, respond: Respond) -> None:
+        super().__init__(self._converse)
+        self._respond = respond
+
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            answer = await self._respond(await _read(reader, writer))
+            if answer is End.HANG:
+                await asyncio.Event().wait()
+            if answer is End.RESET:
+                sock = writer.get_extra_info("socket")
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            if isinstance(answer, End):
+                return
+            writer.write(answer)
+            await writer.drain()
+            if b"Connection: close\r\n" in answer:
+                return
+
+
+async def _read(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> FakeRequest:
+    head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+    first, *lines = head.split("\r\n")
+    verb, path, _ = first.split(" ")
+    pairs = (line.partition(":") for line in lines if line)
+    headers = {name.lower(): text.strip() for name, _, text in pairs}
+    body = await reader.readexactly(int(headers.get("content-length", 0)))
+    return FakeRequest(verb, path, headers, body, writer.get_extra_info("peername")[0])

@@ -1,0 +1,292 @@
+"""A small ROS master, with rosmaster's own bookkeeping.
+
+One node name has one slave URI: whoever registers it from elsewhere takes the former node's
+registrations away, and that one is told to shut down. A service has one provider, the last one.
+Only the very string that was registered is unregistered. Subscribers hear of every change of a
+topic's publishers or of a parameter (rosmaster/master_api.py, registrations.py). Unlike
+rosmaster, it takes names as they are, and a parameter's key for its whole name.
+
+For tests, `answers` replaces the answer to a method, `delay` holds all answers up, and `calls` and
+`requests` are what came.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import xmlrpc.client
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from rosproxy.demo.fake_http import (
+    Answer,
+    FakeHttpServer,
+    FakeRequest,
+    bracketed,
+    call,
+    value,
+)
+
+Triple = tuple[int, str, Any]
+Provider = tuple[str, str]
+"""caller_id, and the node's slave URI or (for a service) the service's URI."""
+
+UNSET: dict[str, Any] = {}
+"""What subscribers are told of a parameter that is not there."""
+ODD_PARAMETERS = (TypeError, AttributeError, LookupError, ValueError)
+CALL_ERRORS = (OSError, EOFError, ValueError, xmlrpc.client.Error)
+"""What a call may raise: the peer is gone, out of reach, or talks nonsense."""
+
+
+class FakeMaster:
+    """A ROS master; see the module.
+
+    `nodes` are the slave URIs by node name; `tables` hold the providers of each topic, service and
+    parameter. Switch `calls_back` off for one that can't reach any node.
+    """
+
+    def __init__(self, address: str, port: int = 0) -> None:
+        self.http = FakeHttpServer(self._respond)
+        self.http.address = address, port
+        self.pid = 4711
+        self.answers: dict[str, Answer] = {}
+        self.delay = 0.0
+        self.calls_back = True
+        self.requests: list[FakeRequest] = []
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+        self._outbox: dict[str, deque[tuple[Any, ...]]] = {}
+        self._callbacks: set[asyncio.Task[None]] = set()
+        self._methods = self._graph_methods() | self._other_methods()
+        self.forget()
+
+    @property
+    def uri(self) -> str:
+        """Its URI."""
+        host, port = self.http.address
+        return f"http://{bracketed(host)}:{port}"
+
+    async def start(self, address: str = "") -> None:
+        """Listen; on the same port as before, and on the same address unless another is given."""
+        await self.http.start(address or self.http.address[0], self.http.address[1])
+
+    async def stop(self) -> None:
+        """Go down."""
+        for task in self._callbacks:
+            task.cancel()
+        await asyncio.gather(*self._callbacks, return_exceptions=True)
+        self._outbox.clear()
+        await self.http.stop()
+
+    async def restart(self) -> None:
+        """Die and come back as a new process without memory."""
+        await self.stop()
+        self.forget()
+        self.pid += 1
+        await self.start()
+
+    def forget(self) -> None:
+        """Lose all state, as a master does that is started anew."""
+        kinds = ("publishers", "subscribers", "services", "params")
+        self.nodes: dict[str, str] = {}
+        self.tables: dict[str, dict[str, list[Provider]]] = {kind: {} for kind in kinds}
+        self.types: dict[str, str] = {}
+        self.params: dict[str, Any] = {}
+
+    def holds(self, kind: str, name: str) -> list[str]:
+        """The URIs registered for a topic, service or parameter, oldest first."""
+        return [api for _, api in self.tables[kind].get(name, [])]
+
+    def named(self, *methods: str) -> list[tuple[Any, ...]]:
+        """The parameters of all calls of these methods."""
+        return [params for method, params in self.calls if method in methods]
+
+    def register(self, kind: str, key: str, caller: str, api: str) -> None:
+        """Note a publisher, a subscriber, or who subscribes to a parameter."""
+        self._admit(caller, api)
+        providers = self.tables[kind].setdefault(key, [])
+        if (caller, api) not in providers:
+            providers.append((caller, api))
+
+    def _admit(self, caller: str, api: str) -> None:
+        """Note a node's URI; the former node of this name loses everything."""
+        former = self.nodes.get(caller, api)
+        self.nodes[caller] = api
+        if former != api:
+            for kind, table in self.tables.items():
+                for key, providers in [*table.items()]:
+                    self._keep(kind, key, [one for one in providers if one[0] != caller])
+            self._notify(
+                former, "shutdown", f"[{caller}] Reason: new node registered with same name"
+            )
+
+    def _keep(self, kind: str, key: str, providers: list[Provider]) -> None:
+        if providers:
+            self.tables[kind][key] = providers
+        else:
+            del self.tables[kind][key]
+
+    def _unregister(self, kind: str, key: str, caller: str, api: str) -> Triple:
+        providers = self.tables[kind].get(key, [])
+        if caller not in self.nodes:
+            return 1, f"[{caller}] is not a registered node", 0
+        if (caller, api) not in providers:
+            return 1, f"[{caller}] is not a known provider of [{key}]", 0
+        self._keep(kind, key, [one for one in providers if one != (caller, api)])
+        if not any(
+            one[0] == caller
+            for table in self.tables.values()
+            for row in table.values()
+            for one in row
+        ):
+            del self.nodes[caller]
+        return 1, f"Unregistered [{caller}] as provider of [{key}]", 1
+
+    # Calling nodes back
+
+    def _notify(self, uri: str, method: str, *params: Any) -> None:
+        """Have a node called in the background: one call at a time, in order."""
+        waiting = self._outbox.setdefault(uri, deque())
+        waiting.append((method, "/master", *params))
+        if len(waiting) == 1:
+            task = asyncio.ensure_future(self._call_back(uri, waiting))
+            self._callbacks.add(task)
+            task.add_done_callback(self._callbacks.discard)
+
+    async def _call_back(self, uri: str, waiting: deque[tuple[Any, ...]]) -> None:
+        while waiting:
+            with suppress(*CALL_ERRORS):
+                await call(uri, *waiting[0], source=self.http.address[0])
+            waiting.popleft()
+
+    def _announce_publishers(self, topic: str) -> None:
+        for uri in self.holds("subscribers", topic):
+            self._notify(uri, "publisherUpdate", topic, self.holds("publishers", topic))
+
+    def _announce_param(self, key: str, held: Any, but_not: str = "") -> None:
+        for caller, uri in self.tables["params"].get(key, []) if self.calls_back else ():
+            if caller != but_not:
+                self._notify(uri, "paramUpdate", key, held)
+
+    # Answering
+
+    async def _respond(self, request: FakeRequest) -> Answer:
+        self.requests.append(request)
+        await asyncio.sleep(self.delay)
+        method, params = request.call
+        if method in self.answers:
+            return self.answers[method]
+        try:
+            if method == "system.multicall":
+                return value([self._element(item) for item in params[0]])
+            return value(self._run(method, params))
+        except xmlrpc.client.Fault as fault:
+            return value(fault)
+        except ODD_PARAMETERS as error:
+            return value(xmlrpc.client.Fault(1, repr(error)))
+
+    def _element(self, item: dict[str, Any]) -> Any:
+        try:
+            return [self._run(item["methodName"], tuple(item["params"]))]
+        except xmlrpc.client.Fault as fault:
+            return {"faultCode": fault.faultCode, "faultString": fault.faultString}
+
+    def _run(self, method: str, params: tuple[Any, ...]) -> Triple:
+        self.calls.append((method, params))
+        if method not in self._methods:
+            raise xmlrpc.client.Fault(1, f'method "{method}" is not supported')
+        try:
+            return self._methods[method](*params)
+        except ODD_PARAMETERS as error:
+            return -1, repr(error), 0
+
+    def _graph_methods(self) -> dict[str, Callable[..., Triple]]:
+        def unregister(kind: str) -> Callable[[str, str, str], Triple]:
+            return lambda caller, key, api: self._unregister(kind, key, caller, api)
+
+        return {
+            "registerPublisher": self._register_publisher,
+            "registerSubscriber": self._register_subscriber,
+            "registerService": self._register_service,
+            "unregisterPublisher": self._unregister_publisher,
+            "unregisterSubscriber": unregister("subscribers"),
+            "unregisterService": unregister("services"),
+            "lookupNode": self._look_up_node,
+            "lookupService": self._look_up_service,
+            "getSystemState": self._system_state,
+            "getTopicTypes": lambda _: (1, "topic types", [[*item] for item in self.types.items()]),
+        }
+
+    def _other_methods(self) -> dict[str, Callable[..., Triple]]:
+        return {
+            "getPid": lambda _: (1, "", self.pid),
+            "getUri": lambda _: (1, self.uri, f"{self.uri}/"),
+            "setParam": self._set_param,
+            "getParam": self._get_param,
+            "deleteParam": self._delete_param,
+            "getParamNames": lambda _: (1, "parameter names", sorted(self.params)),
+            "subscribeParam": self._subscribe_param,
+            "unsubscribeParam": lambda caller, api, key: self._unregister(
+                "params", key, caller, api
+            ),
+        }
+
+    def _register_publisher(self, caller: str, topic: str, kind: str, api: str) -> Triple:
+        self.register("publishers", topic, caller, api)
+        if kind != "*" or topic not in self.types:  # a publisher decides on the type
+            self.types[topic] = kind
+        self._announce_publishers(topic)
+        return (
+            1,
+            f"Registered [{caller}] as publisher of [{topic}]",
+            self.holds("subscribers", topic),
+        )
+
+    def _register_subscriber(self, caller: str, topic: str, kind: str, api: str) -> Triple:
+        self.register("subscribers", topic, caller, api)
+        if kind != "*":
+            self.types.setdefault(topic, kind)
+        return 1, f"Subscribed to [{topic}]", self.holds("publishers", topic)
+
+    def _unregister_publisher(self, caller: str, topic: str, api: str) -> Triple:
+        answer = self._unregister("publishers", topic, caller, api)
+        if answer[2]:
+            self._announce_publishers(topic)
+        return answer
+
+    def _register_service(self, caller: str, service: str, service_api: str, api: str) -> Triple:
+        self._admit(caller, api)
+        self.tables["services"][service] = [(caller, service_api)]
+        return 1, f"Registered [{caller}] as provider of [{service}]", 1
+
+    def _look_up_node(self, _caller: str, node: str) -> Triple:
+        uri = self.nodes.get(node)
+        return (1, "node api", uri) if uri else (-1, f"unknown node [{node}]", "")
+
+    def _look_up_service(self, _caller: str, service: str) -> Triple:
+        uris = self.holds("services", service)
+        return (1, f"rosrpc URI: [{uris[0]}]", uris[0]) if uris else (-1, "no provider", "")
+
+    def _system_state(self, _caller: str) -> Triple:
+        tables = [self.tables[kind] for kind in ("publishers", "subscribers", "services")]
+        state = [[[key, [name for name, _ in row]] for key, row in one.items()] for one in tables]
+        return 1, "current system state", state
+
+    def _set_param(self, caller: str, key: str, held: Any) -> Triple:
+        self.params[key] = held
+        self._announce_param(key, held, but_not=caller)
+        return 1, f"parameter {key} set", 0
+
+    def _get_param(self, _caller: str, key: str) -> Triple:
+        return (1, key, self.params[key]) if key in self.params else (-1, "not set", 0)
+
+    def _delete_param(self, _caller: str, key: str) -> Triple:
+        if key not in self.params:
+            return -1, f"parameter [{key}] is not set", 0
+        del self.params[key]
+        self._announce_param(key, UNSET)
+        return 1, f"parameter {key} deleted", 0
+
+    def _subscribe_param(self, caller: str, api: str, key: str) -> Triple:
+        self.register("params", key, caller, api)
+        return 1, f"Subscribed to parameter [{key}]", self.params.get(key, UNSET)

@@ -1,0 +1,164 @@
+"""A small ROS node: slave API and TCPROS server, and what it calls at its master.
+
+It lives at `address` and calls itself `host`, which nobody need be able to resolve. What it says
+on a TCPROS connection after the header is up to `stream`: the tests have it echo, the
+demonstration's nodes (:mod:`.players`) publish and serve.
+
+For tests, `answers` replaces the answer to a slave API method (a function gets the parameters),
+`delay` holds all answers up, and `hang` never answers; `calls` are the calls that came, `requests`
+the same on the wire, `headers` those of all TCPROS connections.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from rosproxy.demo.fake_http import (
+    Answer,
+    End,
+    FakeHttpServer,
+    FakeRequest,
+    FakeTcpServer,
+    Where,
+    bracketed,
+    call,
+    value,
+)
+from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
+
+Header = dict[str, str]
+Stream = Callable[["FakeNode", asyncio.StreamReader, asyncio.StreamWriter, Header], Awaitable[None]]
+
+STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1"}
+"""The fields of a connection header that name the one message type in use here."""
+
+
+async def read_header(reader: asyncio.StreamReader) -> Header:
+    """The next TCPROS connection header; raises HeaderError, EOFError, OSError."""
+    size = int.from_bytes(await reader.readexactly(4), "little")
+    return decode_header(await reader.readexactly(size))
+
+
+async def echo(
+    node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, _header: Header
+) -> None:
+    """Answer a TCPROS header and send back all that follows, until the peer ends it."""
+    writer.write(encode_header({"callerid": node.name, "md5sum": "*", "node_uri": node.uri}))
+    while data := await reader.read(65536):
+        writer.write(data)
+        await writer.drain()
+
+
+class FakeNode:
+    """A ROS node; see the module."""
+
+    def __init__(self, name: str, address: str, host: str = "") -> None:
+        self.name, self.address, self.host = name, address, host or address
+        self.slave = FakeHttpServer(self._respond)
+        self.tcpros = FakeTcpServer(self._serve)
+        self.stream: Stream = echo
+        self.pid = 100
+        # Every ROS node offers it; a proxy that starts anew asks for it to find the TCPROS port.
+        self.published = {"/rosout": "rosgraph_msgs/Log"}
+        self.subscribed: dict[str, str] = {}
+        self.hang = False
+        self.delay = 0.0
+        self.answers: dict[str, Answer | Callable[..., Answer]] = {}
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+        self.requests: list[FakeRequest] = []
+        self.headers: list[Header] = []
+
+    @property
+    def uri(self) -> str:
+        """What it calls itself."""
+        return f"http://{bracketed(self.host)}:{self.slave.address[1]}/"
+
+    @property
+    def service_api(self) -> str:
+        """Where it says its services are."""
+        return f"rosrpc://{bracketed(self.host)}:{self.tcpros_port}"
+
+    @property
+    def tcpros_port(self) -> int:
+        """The port of its TCPROS server."""
+        return self.tcpros.address[1]
+
+    async def start(self) -> None:
+        """Listen; the slave API on the same port as before if there was one."""
+        await self.slave.start(self.address, self.slave.address[1])
+        await self.start_tcpros()
+
+    async def start_tcpros(self) -> None:
+        """Listen for TCPROS on another port than before."""
+        await self.tcpros.start(self.address)
+
+    async def stop(self) -> None:
+        """End, without a word to anybody."""
+        await self.stop_tcpros()
+        await self.slave.stop()
+
+    async def stop_tcpros(self) -> None:
+        """Close the TCPROS server and all its connections."""
+        await self.tcpros.stop()
+
+    async def call(self, master: Where | str, method: str, *params: Any) -> Any:
+        """Call its master, under its own name and from its own address."""
+        return await call(master, method, self.name, *params, source=self.address)
+
+    async def publish(self, master: Where | str, topic: str = "/chatter") -> list[Any]:
+        """Register as a publisher; the ROS triple."""
+        self.published[topic] = STRING["type"]
+        return await self._register(master, "registerPublisher", topic, STRING["type"])
+
+    async def subscribe(self, master: Where | str, topic: str = "/chatter") -> list[Any]:
+        """Register as a subscriber; the ROS triple."""
+        self.subscribed[topic] = STRING["type"]
+        return await self._register(master, "registerSubscriber", topic, STRING["type"])
+
+    async def serve(self, master: Where | str, service: str = "/add") -> list[Any]:
+        """Register a service; the ROS triple."""
+        return await self._register(master, "registerService", service, self.service_api)
+
+    async def _register(self, master: Where | str, method: str, *params: str) -> list[Any]:
+        triple: list[Any] = await self.call(master, method, *params, self.uri)
+        return triple
+
+    def updates(self, topic: str = "/chatter") -> list[list[str]]:
+        """The publishers of each publisherUpdate that came for a topic."""
+        return [p[2] for method, p in self.calls if method == "publisherUpdate" and p[1] == topic]
+
+    async def _respond(self, request: FakeRequest) -> Answer:
+        self.requests.append(request)
+        await asyncio.sleep(self.delay)
+        method, params = request.call
+        if self.hang:
+            return End.HANG
+        self.calls.append((method, params))
+        answer = self.answers.get(method)
+        if answer is None:
+            return value(self.run(method, params))
+        return answer(*params) if callable(answer) else answer
+
+    def run(self, method: str, params: tuple[Any, ...]) -> list[Any]:
+        """Answer a slave API call: the ROS triple."""
+        lists = {"getPublications": self.published, "getSubscriptions": self.subscribed}
+        if method in lists:
+            return [1, "topics", [list(item) for item in lists[method].items()]]
+        if method == "getPid":
+            return [1, "", self.pid]
+        if method == "requestTopic" and len(params) == 3 and isinstance(params[1], str):
+            return self._request_topic(params[1])
+        return [1, "", 0]
+
+    def _request_topic(self, topic: str) -> list[Any]:
+        if topic not in self.published:
+            return [-1, f"Not a publisher of [{topic}]", []]
+        where = f"{self.host}:{self.tcpros_port}"
+        return [1, f"ready on {where}", ["TCPROS", self.host, self.tcpros_port]]
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        header = await read_header(reader)
+        self.headers.append(header)
+        await self.stream(self, reader, writer, header)

@@ -1,0 +1,104 @@
+"""The real proxy, as a process of its own: `python -m rosproxy run`."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from asyncio.subprocess import DEVNULL, PIPE, STDOUT, Process
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic
+
+START_SECONDS = 15.0
+"""How long it may take to start; a slow machine is no reason to fail."""
+STOP_SECONDS = 3.0
+"""How long it may take to end when asked to, before it is killed."""
+
+
+class DemoError(Exception):
+    """Something that keeps the demonstration from going on; the text is for the user."""
+
+
+def clean_environment(**more: str) -> dict[str, str]:
+    """The environment, without anything that is meant for a proxy or for ROS."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "ROSPROXY_"))}
+    return kept | more
+
+
+class ProxyProcess:
+    """A proxy with the given options; leaving the context ends it.
+
+    `state` is one of "not started", "starting", "ready", "killed", "ended"; `log` holds its last
+    lines.
+    """
+
+    def __init__(self, options: Sequence[str]) -> None:
+        self.options = options
+        self.state = "not started"
+        self.log: deque[str] = deque(maxlen=40)
+        self._process: Process | None = None
+        self._reader: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> ProxyProcess:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    async def start(self) -> float:
+        """Start it and wait until it is ready; the seconds that took. Raises DemoError."""
+        began = monotonic()
+        self.state = "starting"
+        ready = asyncio.Event()
+        # In a session of its own, so that Ctrl-C ends the demonstration and not the proxy.
+        self._process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "rosproxy", "run", *self.options),
+            stdin=DEVNULL,
+            stdout=PIPE,
+            stderr=STDOUT,
+            start_new_session=True,
+            env=clean_environment(PYTHONPATH=str(Path(__file__).parents[2])),
+        )
+        self._reader = asyncio.create_task(self._read(self._process, ready))
+        with suppress(TimeoutError):
+            await asyncio.wait_for(ready.wait(), START_SECONDS)
+        if self.state != "ready":
+            raise DemoError(f"the proxy isn't ready, but {self.state}")
+        return monotonic() - began
+
+    async def kill(self) -> None:
+        """End it with SIGKILL."""
+        if self._process is not None and self.state == "ready":
+            self._process.kill()
+            await self._wait("killed")
+
+    async def stop(self) -> None:
+        """Ask it to end, and kill it if it doesn't."""
+        if self._process is None:
+            return
+        with suppress(ProcessLookupError):
+            self._process.terminate()
+        try:
+            await asyncio.wait_for(self._process.wait(), STOP_SECONDS)
+        except TimeoutError:
+            self._process.kill()
+        await self._wait("ended")
+
+    async def _wait(self, state: str) -> None:
+        if self._process is not None and self._reader is not None:
+            await self._process.wait()
+            await self._reader
+        self.state = state
+
+    async def _read(self, process: Process, ready: asyncio.Event) -> None:
+        if process.stdout is not None:
+            async for line in process.stdout:
+                self.log.append(line.decode("utf-8", "replace").rstrip())
+                if " ready: " in self.log[-1]:
+                    self.state = "ready"
+                    ready.set()
+        self.state = "ended"
+        ready.set()

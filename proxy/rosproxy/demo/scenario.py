@@ -1,0 +1,350 @@
+"""What the demonstration shows, act by act, and whether it worked.
+
+All of 127.0.0.0/8 is loopback on Linux, so each side gets a network of its own there without root:
+outside is 127.0.1.0/24, inside is 127.0.2.0/24. As with NAT, inside nodes turn away every
+connection from an outside address, announce host names that no resolver knows, and leave for
+outside from the host's address. The proxy, which lives on both sides, is a plain process without
+any restriction. A system that knows 127.0.0.1 alone (macOS) has both sides there, and only the
+names are left to separate them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from ipaddress import ip_address, ip_network
+from time import monotonic
+from typing import Any
+
+from rosproxy.demo.fake_http import free_ports, is_free, where
+from rosproxy.demo.fake_master import CALL_ERRORS, FakeMaster
+from rosproxy.demo.players import Adder, Listener, Player, Talker, in_words
+from rosproxy.demo.proxy_process import DemoError, ProxyProcess
+
+PATIENCE = 10.0
+"""Seconds that anything may take, so that what is slow can be told from what never comes."""
+RECOVERY_SECONDS = 2.0
+"""How long after a restarted proxy is ready messages and service calls may take to pass again."""
+IN_FLIGHT_SECONDS = 0.1
+"""A message written this shortly before the proxy was killed may still have been inside of it."""
+LEASES = 8
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Who lives where. `outside_network` is the one that inside turns away: empty for none."""
+
+    host: str = "127.0.1.1"
+    robot: str = "127.0.1.10"
+    proxy_inside: str = "127.0.2.1"
+    inside: tuple[str, ...] = ("127.0.2.11", "127.0.2.12", "127.0.2.13")
+    inside_network: str = "127.0.2.0/24"
+    outside_network: str = "127.0.1.0/24"
+
+    def source_from_inside(self, host: str, own: str) -> str:
+        """The address from which an inside node leaves for `host`."""
+        return own if ip_address(host) in ip_network(self.inside_network) else self.host
+
+    def admits(self, peer: str) -> bool:
+        """Whether inside nodes take connections from `peer`."""
+        return not self.outside_network or (
+            ip_address(peer) not in ip_network(self.outside_network)
+        )
+
+
+LOOPBACK = "127.0.0.1"
+NAMES_ONLY = Layout(LOOPBACK, LOOPBACK, LOOPBACK, (LOOPBACK,) * 3, f"{LOOPBACK}/32", "")
+
+
+def detect() -> Layout:
+    """Choose the best layout that this system can do."""
+    wanted = Layout()
+    addresses = (wanted.host, wanted.robot, wanted.proxy_inside, *wanted.inside)
+    return wanted if all(is_free(0, address) for address in addresses) else NAMES_ONLY
+
+
+@dataclass(frozen=True)
+class Check:
+    """One promise of the proxy and whether it was kept."""
+
+    promise: str
+    kept: bool
+    detail: str
+
+
+@dataclass
+class Scenario:
+    """Plays the acts; `checks`, `events` (time and text) and `act` tell how far it is."""
+
+    seconds: float
+    layout: Layout = field(default_factory=detect)
+    checks: list[Check] = field(default_factory=list)
+    events: list[tuple[float, str]] = field(default_factory=list)
+    act: str = ""
+    began: float = field(default_factory=monotonic)
+
+    def __post_init__(self) -> None:
+        robot = self.layout.robot
+        self.master = FakeMaster(robot)
+        self.talker = Talker("/inside/talker", *self._inside("talker", 0), topic="/from_inside")
+        self.listener = Listener(
+            "/inside/listener", *self._inside("listener", 1), topic="/from_outside"
+        )
+        self.adder = Adder("/inside/adder", *self._inside("adder", 2), service="/inside/add")
+        self.inside: tuple[Talker | Listener | Adder, ...] = (
+            self.talker,
+            self.listener,
+            self.adder,
+        )
+        self.far_talker = Talker("/outside/talker", robot, topic="/from_outside")
+        self.far_listener = Listener("/outside/listener", robot, topic="/from_inside")
+        self.far_adder = Adder("/outside/adder", robot, service="/outside/add")
+        self.outside: tuple[Talker | Listener | Adder, ...] = (
+            self.far_talker,
+            self.far_listener,
+            self.far_adder,
+        )
+        for number, node in enumerate((*self.inside, *self.outside)):
+            node.pid = 101 + number
+        for node in self.inside:
+            node.slave.admits = node.tcpros.admits = self.layout.admits
+        self.proxy = ProxyProcess(())
+        self.seen: dict[str, str] = {}
+        self._talking: dict[Talker, asyncio.Task[None]] = {}
+
+    def _inside(self, name: str, number: int) -> tuple[str, str, Callable[[str], str]]:
+        own = self.layout.inside[number]
+        return own, f"{name}.inside", lambda host: self.layout.source_from_inside(host, own)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all was shown and worked."""
+        return all(check.kept for check in self.checks)
+
+    def clock(self) -> float:
+        """The seconds since the demonstration began."""
+        return monotonic() - self.began
+
+    def tell(self, text: str) -> None:
+        """Note that something happened now."""
+        self.events.append((self.clock(), text))
+
+    async def play(self) -> None:
+        """Play all acts; a failure that ends them early is a failed check."""
+        async with AsyncExitStack() as ending:
+            try:
+                await self._play(ending)
+            except (DemoError, *CALL_ERRORS) as problem:
+                detail = in_words(problem)
+                self.checks.append(Check("the demonstration runs to its end", False, detail))
+                self.tell(f"stopped: {detail}")
+            self.act = "done"
+
+    async def _play(self, ending: AsyncExitStack) -> None:
+        self.act = "the master and the outside nodes start"
+        if not self.layout.outside_network:
+            self.tell("no 127.0.2.x addresses here: the sides are separated by host names alone")
+        await self.master.start()
+        ending.push_async_callback(self.master.stop)
+        self.tell(f"ROS master at {self.master.uri}, outside")
+        self.proxy = await ending.enter_async_context(ProxyProcess(self.proxy_options()))
+        for node in (*self.outside, *self.inside):
+            await node.start()
+            ending.push_async_callback(node.stop)
+        ending.callback(self._fall_silent)
+        for node in self.outside:
+            await node.register(self.master.uri)
+        self._let_talk(self.far_talker)
+        await self._try_without_proxy()
+        await self._connect_through_proxy()
+        await self._traffic_until(self.seconds * 0.5)
+        calls = await self._call_both_ways()
+        self._check("service calls cross both ways before the kill", *calls)
+        addresses = await self._addresses_of_inside()
+        killed = await self._kill_and_restart()
+        self._check_addresses(addresses, await self._addresses_of_inside())
+        await self._traffic_until(self.seconds - 0.7)
+        calls = await self._call_both_ways()
+        self._check("service calls cross both ways after the restart", *calls)
+        await self._count(killed)
+
+    async def _try_without_proxy(self) -> None:
+        self.act = "without rosproxy: inside registers at the master"
+        talker, listener = self.talker, self.far_listener
+        await talker.register(self.master.uri)
+        self._let_talk(talker)
+        await self._until(lambda: listener.problem, "the direct attempt")
+        await asyncio.sleep(min(1.0, self.seconds / 10))
+        told = f"{talker.uri}: {listener.problem}"
+        reached = bool(listener.received)
+        if self.layout.outside_network:
+            address = talker.address, talker.slave.address[1]
+            reached |= await self._reaches(listener, address)
+            told += f"; {address[0]}:{address[1]}: {'reached' if reached else 'turned away'}"
+        self.tell(f"without rosproxy: {told}")
+        self._check("without the proxy nothing crosses", not reached, told)
+        await talker.call(self.master.uri, "unregisterPublisher", talker.topic, talker.uri)
+        self._talking.pop(talker).cancel()
+
+    async def _reaches(self, node: Player, address: tuple[str, int]) -> bool:
+        try:
+            await node.ask(f"http://{address[0]}:{address[1]}/", "getPid")
+        except CALL_ERRORS:
+            return False
+        return True
+
+    def proxy_options(self) -> list[str]:
+        """The command line of the proxy, with ports that are free now."""
+        first = free_ports(LEASES + 2)
+        return [
+            f"--master-uri={self.master.uri}",
+            f"--advertise-host={self.layout.host}",
+            f"--inside-network={self.layout.inside_network}",
+            f"--master-port={first}",
+            f"--admin-bind={LOOPBACK}:{first + 1}",
+            f"--port-range={first + 2}-{first + 1 + LEASES}",
+            "--data-plane=splice",
+        ]
+
+    async def _connect_through_proxy(self) -> None:
+        self.act = "rosproxy and the inside nodes start"
+        self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
+        for node in self.inside:
+            await node.register(self._inside_master())
+        self.seen = {node.name: f"{node.host}:{node.slave.address[1]}" for node in self.outside}
+        self.seen |= await self._addresses_of_inside()
+        self._let_talk(self.talker)
+        listeners = self.listener, self.far_listener
+        await self._until(lambda: all(one.received for one in listeners), "both sides hear")
+        self.tell("both listeners hear the other side")
+        await self._call_both_ways()
+
+    def _inside_master(self) -> str:
+        port = next(o for o in self.proxy.options if o.startswith("--master-port=")).split("=")[1]
+        return f"http://{self.layout.proxy_inside}:{port}/"
+
+    async def _traffic_until(self, moment: float) -> None:
+        self.act = "messages cross the boundary in both directions"
+        await asyncio.sleep(max(1.0, moment - self.clock()))
+
+    async def _call_both_ways(self) -> tuple[bool, str]:
+        """Call each side's service from the other."""
+        told = []
+        for way, caller, master, service in (
+            ("outside calls inside", self.far_listener, self.master.uri, self.adder.service),
+            ("inside calls outside", self.listener, self._inside_master(), self.far_adder.service),
+        ):
+            try:
+                result = f"2 + 3 = {await caller.add(master, service, 2, 3)}"
+            except CALL_ERRORS as problem:
+                result = in_words(problem)
+            told.append(f"{way}: {result}")
+        self.tell("service calls, " + ", ".join(told))
+        return all(one.endswith(": 2 + 3 = 5") for one in told), ", ".join(told)
+
+    async def _addresses_of_inside(self) -> dict[str, str]:
+        """Where outside finds each inside node; that the right one answers there is asked."""
+        found = {}
+        for node in self.inside:
+            uri = await self.far_listener.ask(self.master.uri, "lookupNode", node.name)
+            pid = await self.far_listener.ask(uri, "getPid")
+            host, port = where(uri)
+            found[node.name] = f"{host}:{port}" + ("" if pid == node.pid else " (another node)")
+        return found
+
+    async def _kill_and_restart(self) -> float:
+        """Kill the proxy and start it again; return when it was killed."""
+        self.act = "SIGKILL; no node is restarted"
+        killed = monotonic()
+        await self.proxy.kill()
+        self.tell("rosproxy killed with SIGKILL")
+        await asyncio.sleep(min(1.5, self.seconds / 10))
+        heard = len(self.far_listener.received)
+        self.act = "restart: same command, no state on disk"
+        self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
+        ready = monotonic()
+        answered = asyncio.create_task(self._first_answer())
+        try:
+            received = self.far_listener.received
+            await self._until(lambda: len(received) > heard, "messages flow again")
+            await self._until(answered.done, "the service answers again")
+        finally:
+            answered.cancel()
+        took = received[heard][1] - ready, answered.result() - ready
+        detail = (
+            f"first message {took[0]:.2f} s, first service call {took[1]:.2f} s after it was ready;"
+            f" the whole outage took {max(took) + ready - killed:.2f} s"
+        )
+        self.tell(detail)
+        promise = f"recovered in less than {RECOVERY_SECONDS:g} s"
+        self._check(promise, max(took) < RECOVERY_SECONDS, detail)
+        return killed
+
+    async def _first_answer(self) -> float:
+        """Call the inside adder from outside until it answers; return when it did."""
+        while True:
+            try:
+                await self.far_listener.add(self.master.uri, self.adder.service, 20, 22)
+            except CALL_ERRORS:
+                await asyncio.sleep(0.02)
+            else:
+                return monotonic()
+
+    def _check_addresses(self, before: dict[str, str], after: dict[str, str]) -> None:
+        told = [", ".join(f"{name} {at}" for name, at in one.items()) for one in (before, after)]
+        same = before == after and "another" not in told[0]
+        detail = told[0] if same else f"before the kill: {told[0]}; afterwards: {told[1]}"
+        self._check("the same ports serve the same nodes", same, detail)
+
+    async def _count(self, killed: float) -> None:
+        self.act = "the talkers stop; counting"
+        self._fall_silent()
+        await asyncio.sleep(0.2)  # what is on the way arrives
+        self._check(
+            "every message inside to outside arrived once",
+            *count(self.talker, self.far_listener, killed),
+        )
+        self._check(
+            "every message outside to inside arrived once",
+            *count(self.far_talker, self.listener, killed),
+        )
+
+    def _check(self, promise: str, kept: bool, detail: str) -> None:
+        self.checks.append(Check(promise, kept, detail))
+
+    def _let_talk(self, talker: Talker) -> None:
+        self._talking[talker] = asyncio.create_task(talker.talk())
+
+    def _fall_silent(self) -> None:
+        for task in self._talking.values():
+            task.cancel()
+
+    async def _until(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait until `condition` holds; raises DemoError after PATIENCE."""
+        end = monotonic() + PATIENCE
+        while not condition():
+            if monotonic() > end:
+                raise DemoError(f"{what}: not within {PATIENCE:g} s")
+            await asyncio.sleep(0.01)
+
+
+def count(talker: Talker, listener: Listener, killed: float) -> tuple[bool, str]:
+    """Whether each message arrived once, but for those on the way as the proxy was killed."""
+    received = [number for number, _ in listener.received]
+    missing = talker.sent.keys() - set(received)
+    cut_off = {
+        number
+        for number in missing
+        if -IN_FLIGHT_SECONDS <= talker.sent[number] - killed <= IN_FLIGHT_SECONDS
+    }
+    lost, twice = len(missing - cut_off), len(received) - len(set(received))
+    strange = len(set(received) - talker.sent.keys())
+    told = f"sent {len(talker.sent)}, received {len(received)}"
+    if cut_off:
+        told += f", {len(cut_off)} on the way when the proxy was killed"
+    if unheard := talker.number - len(talker.sent):
+        told += f", {unheard} published while nobody was connected"
+    told += f"; lost {lost}, duplicated {twice}"
+    return bool(received) and not (lost or twice or strange), told

@@ -1,0 +1,123 @@
+"""Looking after each node by its pulse: probe, unregister the dead, free the ports of the unused.
+
+Every few seconds a node that nobody called is asked for its pid. Two failures in a row make its
+port refuse, so that a dead node looks dead; after the time of ``--cleanup-after`` it is
+unregistered at the master. A node that answers again is served again, and registered again if need
+be. Another pid than before means another process: what the former one left is taken back.
+
+What follows from a probe: `Health.note` says how the node is, `policy` what is due, and the
+`Registrar` and the rooms beside this one do it.
+"""
+
+import asyncio
+import logging
+
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.health import Change, ProbeResult
+from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.upkeep.prober import policy
+from rosproxy.ros1.upkeep.recovery.recovery import Recovery
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscription.resubscriber import Resubscriber
+
+log = logging.getLogger(__name__)
+
+PROBE_TICK = 0.25
+"""Seconds between looks at all endpoints."""
+PARALLEL_PROBES = 64
+
+
+class Prober:
+    """Looks after all endpoints."""
+
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases,
+        nodes: NodeClient,
+        registrar: Registrar,
+        resubscriber: Resubscriber,
+        recovery: Recovery,
+    ) -> None:
+        self._context, self._leases, self._nodes = context, leases, nodes
+        self._registrar, self._resubscriber, self._recovery = registrar, resubscriber, recovery
+        self._probing: set[Endpoint] = set()
+        self._limit = asyncio.Semaphore(PARALLEL_PROBES)
+
+    async def look(self) -> None:
+        """Look after all endpoints once."""
+        if self._context.retired:
+            return
+        now, interval = self._context.now(), self._context.settings.probe_interval
+        busy = self._probing | self._recovery.verifying
+        for endpoint in self._context.registry:
+            if endpoint not in busy and policy.is_due(endpoint, now, interval):
+                self._probing.add(endpoint)
+                self._context.tasks.spawn(self._probe(endpoint), f"probe of {endpoint.uri}")
+            self._end_if_unused(endpoint)
+
+    async def _probe(self, endpoint: Endpoint) -> None:
+        try:
+            async with self._limit:
+                await self._look_after(endpoint)
+        except (Unreachable, MasterError) as error:
+            log.debug("upkeep of %s has to wait: %s", endpoint.label, error)
+        finally:
+            self._probing.discard(endpoint)
+
+    async def _look_after(self, endpoint: Endpoint) -> None:
+        """Probe an endpoint's node and act on the result."""
+        where, health = endpoint.slave, endpoint.health
+        answer = await self._nodes.probe(where)
+        if endpoint.slave != where:
+            return  # it has moved meanwhile
+        failing = health.failures > 0
+        change = health.note(answer.probe, self._context.now())
+        if answer.probe is ProbeResult.ANSWERED:
+            await self._answered(endpoint, answer.pid)
+            if failing:
+                self._context.problems.solved_at(endpoint.port)
+        elif change is Change.DOWN:
+            self._report_down(endpoint, answer.reason)
+            self._leases.close(endpoint)
+        after = self._context.settings.cleanup_after
+        if policy.is_to_be_unregistered(endpoint, self._context.now(), after):
+            await self._registrar.clean_up(endpoint)
+
+    async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
+        health = endpoint.health
+        if not endpoint.trusted:
+            await self._recovery.verify_and_announce(endpoint)
+            return
+        if health.cleaned:
+            await self._registrar.come_back(endpoint, pid)
+        elif health.pid not in (None, pid):
+            await self._registrar.unregister_left_over(endpoint)
+        elif endpoint.direct:
+            await self._registrar.reconcile(endpoint)
+        health.pid = pid
+        if not self._leases.is_open(endpoint):
+            log.info("%s answers again", endpoint.label)
+            self._leases.open(endpoint)
+            await self._resubscriber.remind(endpoint)
+
+    def _report_down(self, endpoint: Endpoint, reason: str) -> None:
+        if endpoint.registrations:
+            log.warning("%s does not answer: %s", endpoint.label, reason)
+            self._context.problems.add(endpoint.label, f"does not answer: {reason}", endpoint.port)
+
+    def _end_if_unused(self, endpoint: Endpoint) -> None:
+        """End the lease of an endpoint that nobody has needed for long enough."""
+        now = self._context.now()
+        if not policy.is_unused(endpoint):
+            endpoint.idle_since = None
+            return
+        if endpoint.idle_since is None:
+            endpoint.idle_since = now
+        lasts = policy.lease_lasts(endpoint, self._context.settings.linger)
+        if now - endpoint.idle_since >= lasts:
+            log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
+            self._leases.end(endpoint)

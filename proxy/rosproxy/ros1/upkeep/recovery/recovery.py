@@ -1,0 +1,190 @@
+"""After a start: finding at the master which nodes are behind this proxy, and on which ports.
+
+The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
+graph once, finds the URIs that this proxy advertised (`policy.claims`), and rebuilds the endpoints
+on the ports that they had. Calls that register wait for it: a node that registered before would
+get another port, and the master would shut it down for having moved.
+
+What the master says is only a claim, since anybody can write to it. Until the node itself has
+borne it out (`_verify`), the endpoint's port is held but refuses. Then subscribers are made to
+connect again (`Resubscriber.announce`). A node that does not answer yet is verified when a probe
+finds it (`Prober`).
+
+If ports are others after a start, look here: the log names each claim that was refused, and why.
+"""
+
+import asyncio
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.net.addresses import HostPort, is_inside
+from rosproxy.net.resolver import resolve
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.master_graph import read_graph
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.upkeep.recovery import policy
+from rosproxy.ros1.upkeep.recovery.policy import Claim
+from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscription.resubscriber import Resubscriber
+
+log = logging.getLogger(__name__)
+
+PARALLEL_INSPECTIONS = 64
+
+
+class Recovery:
+    """Rebuilds the registry from what the master holds.
+
+    ``verifying`` are the endpoints whose nodes are being asked just now.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases,
+        nodes: NodeClient,
+        registrar: Registrar,
+        resubscriber: Resubscriber,
+        plane: KernelPlane,
+    ) -> None:
+        self._context, self._leases, self._nodes = context, leases, nodes
+        self._registrar, self._resubscriber, self._plane = registrar, resubscriber, plane
+        self.verifying: set[Endpoint] = set()
+        self._done = False
+        self._one_at_a_time = asyncio.Lock()
+        self._failures = 0
+        self._unannounced: list[Endpoint] = []
+        self._announcing = asyncio.Lock()
+
+    async def ensure(self) -> None:
+        """Have the registry rebuilt from the master, once. Raises Unreachable.
+
+        All who wait for the same attempt share its failure: a master that hangs would keep the
+        last of them waiting for as many attempts as there are callers.
+        """
+        failures = self._failures
+        async with self._one_at_a_time:
+            if self._done:
+                return
+            if self._failures != failures:
+                raise Unreachable("the master has not told its state")
+            try:
+                await self._recover()
+            except (Unreachable, MasterError) as error:
+                self._failures += 1
+                raise Unreachable(str(error)) from None
+            self._done = True
+
+    async def verify_and_announce(self, endpoint: Endpoint) -> None:
+        """Serve a recovered endpoint if its node bears it out. Raises Unreachable, MasterError."""
+        await self._verify(endpoint)
+        if self._leases.is_open(endpoint):
+            await self._announce(endpoint)
+
+    async def _recover(self) -> None:
+        self._context.refresh_networks()
+        graph = await read_graph(self._context.upstream)
+        claims = await self._settle(policy.claims(graph, self._context.addressing))
+        endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
+        self._plane.recovered(endpoints)
+        if endpoints:
+            log.info("recovering %d nodes from the master", len(endpoints))
+            self._context.tasks.spawn(self._resume(endpoints), "recovery")
+
+    async def _settle(self, found: Sequence[Claim]) -> list[Claim]:
+        """One claim per port: where several are made, the nodes themselves are asked first."""
+
+        async def topics_at(claim: Claim) -> frozenset[str] | None:
+            if not is_inside(claim.address, self._context.addressing.networks):
+                return None
+            info = await self._nodes.inspect(HostPort(*claim.key))
+            return frozenset(info.topics) if info else None
+
+        contested = policy.contested(found)
+        answers = await asyncio.gather(*map(topics_at, contested))
+        for claim in contested:
+            log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
+        said = {found.index(c): topics for c, topics in zip(contested, answers, strict=True)}
+        return policy.settle(found, said)
+
+    def _restore(self, claim: Claim) -> Endpoint | None:
+        """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
+        address = claim.address
+        if not is_inside(address, self._context.addressing.networks):
+            log.warning(
+                "port %d: the master has %s for it, which is not in an inside network; refused",
+                claim.port,
+                address,
+            )
+            return None
+        place = Place(address, named=claim.inside.node.host == address, confirmed=False)
+        registry = self._context.registry
+        endpoint = registry.restore(claim.uri, claim.inside.node, place, claim.port)
+        if endpoint is None:
+            log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
+            return None
+        for held in claim.registrations:
+            registry.register(endpoint, held)
+        return endpoint
+
+    async def _resume(self, endpoints: Iterable[Endpoint]) -> None:
+        """Serve recovered endpoints, then make up for the calls that were missed.
+
+        None waits for another that does not answer, and none is probed meanwhile.
+        """
+        limit, resumed = asyncio.Semaphore(PARALLEL_INSPECTIONS), set(endpoints)
+
+        async def resume(endpoint: Endpoint) -> None:
+            try:
+                async with limit:
+                    await self._verify(endpoint)
+            finally:
+                self.verifying.discard(endpoint)
+            if self._leases.is_open(endpoint):
+                await self._announce(endpoint)
+
+        self.verifying |= resumed
+        try:
+            await asyncio.gather(*map(resume, resumed))
+            log.info("recovered %d nodes", sum(e.trusted for e in resumed))
+        except (Unreachable, MasterError) as error:
+            log.warning("recovery is incomplete: %s", error)
+
+    async def _verify(self, endpoint: Endpoint) -> None:
+        info = await self._nodes.inspect(endpoint.slave)
+        if info is None or endpoint.trusted:
+            return
+        if not policy.confirmed_by(endpoint, info.topics):
+            log.warning("%s: the node there has none of its topics; not served", endpoint.label)
+            await self._registrar.clean_up(endpoint)
+            self._leases.end(endpoint)
+            return
+        endpoint.tcpros_port, endpoint.trusted = info.tcpros_port, True
+        if endpoint.health.pid is None:
+            endpoint.health.pid = info.pid
+        self._leases.open(endpoint)
+        await self._note_whether_named(endpoint)
+        await self._registrar.register_missing(endpoint, info)
+
+    async def _note_whether_named(self, endpoint: Endpoint) -> None:
+        """Find out whether neighbours can use a recovered node's host name."""
+        address = endpoint.place.address
+        addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
+        if endpoint.place.address == address:
+            endpoint.place = replace(endpoint.place, named=address in addresses)
+
+    async def _announce(self, endpoint: Endpoint) -> None:
+        """Announce an endpoint, together with those that came up during the one before.
+
+        Each time the whole graph is read: one by one, that would grow with the square of nodes.
+        """
+        self._unannounced.append(endpoint)
+        async with self._announcing:
+            found, self._unannounced = self._unannounced, []
+            if found:
+                await self._resubscriber.announce(found)

@@ -1,0 +1,1 @@
+"""Making and taking back registrations at the master on behalf of nodes."""

@@ -1,0 +1,222 @@
+"""Which registrations the proxy makes and takes back at the master on behalf of nodes.
+
+The master takes a registration back only with exactly the strings that it was made with; anything
+else leaves a stale entry. And it calls ``shutdown`` at the former URI of a name whose URI changes
+(rosmaster/registrations.py, _register_node_api). So a name that the master has by a former URI of
+the same node is freed first, of everything that it holds, and then registered anew.
+
+The rest compares three views of a node: what the registry has, what the master has, and what the
+node itself says (`NodeInfo`). A node can be asked for its topics, but not for services and
+parameters.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from rosproxy.net.addresses import is_loopback
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.graph import NodeInfo
+
+MethodCall = tuple[str, list[Any]]
+"""A method and its parameters, the caller_id first."""
+Held = tuple[Endpoint, Registration]
+"""A registration and the endpoint that has it."""
+
+COMMON_PARAMETER = "/rosout_disable_topics_generation"
+"""roscpp and rospy subscribe to it with their first log message; it need not exist."""
+
+_REGISTERING_ORDER = (Kind.PUBLISHER, Kind.SERVICE, Kind.SUBSCRIBER, Kind.PARAM)
+"""Subscribers come after publishers, so that they are handed all of them at once."""
+_FREEING_ORDER = (Kind.SUBSCRIBER, Kind.PUBLISHER, Kind.SERVICE, Kind.PARAM)
+"""Subscribers go first, so that they are not told that the publishers go."""
+
+
+def register_call(held: Registration, uri: str, service: str) -> MethodCall:
+    """The call that makes a registration with a slave URI, and for a service with its URI."""
+    match held.kind:
+        case Kind.PUBLISHER:
+            return "registerPublisher", [held.caller_id, held.name, held.type, uri]
+        case Kind.SUBSCRIBER:
+            return "registerSubscriber", [held.caller_id, held.name, held.type, uri]
+        case Kind.SERVICE:
+            return "registerService", [held.caller_id, held.name, service, uri]
+        case Kind.PARAM:
+            return "subscribeParam", [held.caller_id, uri, held.name]
+
+
+def unregister_call(held: Registration, uri: str, service: str) -> MethodCall:
+    """The call that takes back a registration that was made with these URIs."""
+    match held.kind:
+        case Kind.PUBLISHER:
+            return "unregisterPublisher", [held.caller_id, held.name, uri]
+        case Kind.SUBSCRIBER:
+            return "unregisterSubscriber", [held.caller_id, held.name, uri]
+        case Kind.SERVICE:
+            return "unregisterService", [held.caller_id, held.name, service]
+        case Kind.PARAM:
+            return "unsubscribeParam", [held.caller_id, uri, held.name]
+
+
+def to_register(held: Iterable[Held]) -> list[Held]:
+    """Those of some registrations that have not ended meanwhile, in the order to make them."""
+    current = [(e, one) for e, one in held if e.registrations.get(one.key) is one]
+    return sorted(current, key=lambda item: _REGISTERING_ORDER.index(item[1].kind))
+
+
+def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[Held]:
+    """One publisher of each topic that some endpoints' nodes publish.
+
+    Registering it makes the master tell all subscribers of the topic who its publishers are.
+    """
+    topics: dict[str, Held] = {}
+    for endpoint in endpoints:
+        for held in endpoint.registrations.values():
+            if held.kind is Kind.PUBLISHER:
+                topics.setdefault(held.name, (endpoint, held))
+    return list(topics.values())
+
+
+def known_as(endpoint: Endpoint, uri: str) -> bool:
+    """Whether a URI at the master is a former one of this endpoint, or its node's own.
+
+    A loopback address is everybody's own.
+    """
+    own = uri == endpoint.uri and not is_loopback(endpoint.node.host)
+    return own or uri in endpoint.former_uris
+
+
+def free_calls(
+    uris: Mapping[str, str],
+    held: Mapping[str, Sequence[Registration]],
+    services: Mapping[str, str],
+) -> list[MethodCall]:
+    """The calls that end what names hold with their ``uris``; ``services`` are the services' URIs.
+
+    Parameter subscriptions, which the master does not tell of, come after (`release_calls`).
+    """
+    wanted = [one for name in uris for one in _held_by(name, held, services)]
+    wanted.sort(key=lambda one: _FREEING_ORDER.index(one.kind))
+    return [unregister_call(one, uris[one.caller_id], services.get(one.name, "")) for one in wanted]
+
+
+def restore_calls(
+    uris: Mapping[str, str],
+    held: Mapping[str, Sequence[Registration]],
+    services: Mapping[str, str],
+) -> list[MethodCall]:
+    """The calls that make again what `free_calls` ended."""
+    return [
+        register_call(one, uri, services.get(one.name, ""))
+        for name, uri in uris.items()
+        for one in _held_by(name, held, services)
+    ]
+
+
+def release_calls(caller_id: str, uri: str, asker: str) -> list[MethodCall]:
+    """The calls that end the parameter subscription that every node has, and tell what is left.
+
+    There is nothing to see of such a subscription, apart from the name that stays known.
+    """
+    ask: MethodCall = ("lookupNode", [asker, caller_id])
+    return [ask, ("unsubscribeParam", [caller_id, uri, COMMON_PARAMETER]), ask]
+
+
+def released_parameters(values: Sequence[object]) -> list[str] | None:
+    """The parameters that a name was subscribed to, from the results of `release_calls`.
+
+    None if the name is known still.
+    """
+    before, _, after = values
+    if after is not None:
+        return None
+    return [] if before is None else [COMMON_PARAMETER]
+
+
+def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
+    """Which of an endpoint's registrations a process that is gone has left behind.
+
+    A topic is, if the node does not name it; a whole node name is, if another has registered
+    since and none of its topics, apart from everybody's /rosout, holds. Registrations made after
+    ``before`` are not.
+    """
+    topics, everything = info.by_kind, list(endpoint.registrations.values())
+    newest = max(everything, key=lambda held: held.since, default=None)
+    alive = {
+        held.caller_id
+        for held in everything
+        if held is newest or (held.name != "/rosout" and held.name in topics.get(held.kind, ()))
+    }
+    return [
+        held
+        for held in everything
+        if held.since < before
+        and (held.caller_id not in alive or held.name not in topics.get(held.kind, (held.name,)))
+    ]
+
+
+def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[Registration]:
+    """Which of an endpoint's registrations hold for a node that has come back.
+
+    Topics count if the node itself names them; services and parameters, which it can't be asked
+    for, only if it is the ``same_process`` and at least one topic holds.
+    """
+    topics, everything = info.by_kind, list(endpoint.registrations.values())
+    kept = [held for held in everything if held.name in topics.get(held.kind, ())]
+    if not (kept and same_process):
+        return kept
+    return kept + [held for held in everything if held.kind not in topics]
+
+
+def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
+    """The topics registered before a time that the node no longer has.
+
+    A node that registers around the proxy unregisters there too, where its URI means nothing.
+    """
+    topics = info.by_kind
+    return [
+        held
+        for held in endpoint.registrations.values()
+        if held.name not in topics.get(held.kind, (held.name,)) and held.since < before
+    ]
+
+
+def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
+    """The topics that a node has, with their types, and the master does not know of.
+
+    rospy gives up a registration for which it found no master. Nothing is said of a slave API
+    that several node names share.
+    """
+    names = endpoint.caller_ids
+    if len(names) != 1:
+        return []
+    return [
+        Registration(kind, topic, names[0], type_)
+        for kind, topics in info.by_kind.items()
+        for topic, type_ in topics.items()
+        if (kind, topic, names[0]) not in endpoint.registrations
+    ]
+
+
+def lost(
+    ours: Sequence[Registration], state: Mapping[str, list[Registration]], before: float
+) -> list[Registration]:
+    """Which of our registrations the master no longer has.
+
+    Those made after ``before``, the time at which the master was asked, don't count; nor do
+    parameter subscriptions, which the master's state leaves out, unless their node is unknown.
+    """
+    known = {held.key for registrations in state.values() for held in registrations}
+    gone = [h for h in ours if h.since < before and h.kind is not Kind.PARAM]
+    missing = [held for held in gone if held.key not in known]
+    lost_nodes = {held.caller_id for held in missing} - set(state)
+    return missing + [
+        held for held in ours if held.kind is Kind.PARAM and held.caller_id in lost_nodes
+    ]
+
+
+def _held_by(
+    name: str, held: Mapping[str, Sequence[Registration]], services: Mapping[str, str]
+) -> Iterator[Registration]:
+    """What a name holds, without services whose URI is not known (any more)."""
+    yield from (o for o in held.get(name, ()) if o.kind is not Kind.SERVICE or o.name in services)

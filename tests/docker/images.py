@@ -1,0 +1,60 @@
+"""The images that tests use, built on this machine without a registry.
+
+    python -m tests.docker.images
+
+builds those that nearly all tests need, while other things go on. Tests build them anew: Docker
+knows what has not changed.
+"""
+
+import hashlib
+import os
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+from tests.docker.engine import ROOT, build, run, running_engine
+
+PROXY, OPERATOR, ROS = "rosproxy:test", "rosproxy-operator:test", "rosproxy-test-ros:latest"
+HAPROXY = "rosproxy-test-haproxy:latest"
+_HERE = ROOT / "tests/docker"
+
+
+@cache
+def base_image() -> str:
+    """Debian without a registry; ROSPROXY_TEST_BASE_IMAGE names another base."""
+    chosen = os.environ.get("ROSPROXY_TEST_BASE_IMAGE")
+    if chosen:
+        return chosen
+    script = ROOT / "scripts/base-image.sh"
+    name = f"rosproxy-test-base:{hashlib.sha256(script.read_bytes()).hexdigest()[:12]}"
+    run(script, name, seconds=600)
+    return name
+
+
+def build_image(name: str) -> str:
+    """Build one of the images above; its name."""
+    recipes: dict[str, tuple[str | Path, ...]] = {
+        # As a user builds them, on the base that is at hand.
+        PROXY: ("--target", "proxy", ROOT),
+        OPERATOR: ("--target", "operator", ROOT),
+        # A machine with ROS 1 on it.
+        ROS: ("--file", _HERE / "ros.Dockerfile", ROOT / "tests/ros/nodes"),
+        HAPROXY: ("--file", _HERE / "haproxy.Dockerfile", _HERE),
+    }
+    return build(name, "--build-arg", f"BASE_IMAGE={base_image()}", *recipes[name])
+
+
+def main() -> None:
+    """Build the images of proxy, operator and robot."""
+    log = Path(tempfile.mkdtemp()) / "dockerd.log"
+    with running_engine(log), ThreadPoolExecutor() as pool:
+        base_image()
+        robot = pool.submit(build_image, ROS)
+        for name in (PROXY, OPERATOR):  # which have their first steps in common
+            build_image(name)
+        robot.result()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,228 @@
+"""Calls to the master on behalf of nodes: the reverse of what the nodes' own calls were."""
+
+from collections.abc import Iterable
+
+import pytest
+
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import NodeInfo
+from rosproxy.ros1.upkeep.registration import policy
+from tests.unit.builders import (
+    add_node,
+    add_registration,
+    exchange,
+    make_addressing,
+    make_asker,
+    py_call,
+    py_reply,
+)
+
+PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+
+
+def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
+    return Registration(kind, name, caller_id, since=since)
+
+
+def said(published: Iterable[str], subscribed: Iterable[str] = ()) -> NodeInfo:
+    """What a node says of itself; the type of /a is t/a."""
+    types = [{name: f"t{name}" for name in names} for names in (published, subscribed)]
+    return NodeInfo(7, types[0], types[1], tcpros_port=None)
+
+
+OWN, SERVICE = "http://10.0.0.5:40001/", "rosrpc://10.0.0.5:50001"
+BY_NODE = [
+    # how the node registers and unregisters
+    (
+        py_call("registerPublisher", "/n", "/a", "std_msgs/String", OWN),
+        py_call("unregisterPublisher", "/n", "/a", OWN),
+    ),
+    (
+        py_call("registerSubscriber", "/n", "/a", "*", OWN),
+        py_call("unregisterSubscriber", "/n", "/a", OWN),
+    ),
+    (
+        py_call("registerService", "/n", "/s", SERVICE, OWN),
+        py_call("unregisterService", "/n", "/s", SERVICE),
+    ),
+    (py_call("subscribeParam", "/n", OWN, "/k"), py_call("unsubscribeParam", "/n", OWN, "/k")),
+]
+
+
+@pytest.mark.parametrize(("register", "unregister"), BY_NODE)
+def test_the_proxy_calls_the_master_exactly_as_the_node_did(
+    register: bytes, unregister: bytes
+) -> None:
+    addressing, node = make_addressing(), make_asker("10.0.0.5")
+    done = exchange(addressing, node, register, py_reply([1, "", []]))
+    endpoint = addressing.registry.by_port[45000]
+    (held,) = endpoint.registrations.values()
+    uris = addressing.advertised_uri(endpoint), addressing.advertised_service(endpoint)
+    method, params = policy.register_call(held, *uris)
+    assert py_call(method, *params) == done.sent
+    method, params = policy.unregister_call(held, *uris)
+    assert py_call(method, *params) == exchange(addressing, node, unregister, py_reply([])).sent
+
+
+HELD = [(PUB, "/a"), (SUB, "/b"), (SRV, "/s"), (PARAM, "/p")]
+
+
+@pytest.mark.parametrize(
+    ("published", "subscribed", "same_process", "kept"),
+    [
+        ({"/a"}, {"/b"}, True, HELD),
+        ({"/a"}, {"/b"}, False, HELD[:2]),  # another process: only what it names itself
+        ({"/a"}, set(), True, [HELD[0], *HELD[2:]]),
+        ({"/b"}, {"/a"}, True, []),  # the kinds are not the same
+        (set(), set(), True, []),
+        ({"/rosout"}, set(), True, []),
+    ],
+)
+def test_what_still_holds_of_a_node_that_is_back(
+    published: set[str], subscribed: set[str], same_process: bool, kept: list[tuple[Kind, str]]
+) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for kind, name in HELD:
+        add_registration(addressing, endpoint, kind, name)
+    found = policy.still_held(endpoint, said(published, subscribed), same_process)
+    assert [(held.kind, held.name) for held in found] == kept
+
+
+OLD = [(PUB, "/rosout", "/old", 1.0), (PUB, "/a", "/old", 1.0), (SRV, "/s", "/old", 1.0)]
+NEW = [(PUB, "/rosout", "/new", 5.0), (SUB, "/b", "/new", 5.0)]
+LEFT_OVER = [
+    # registered, published, subscribed, left over
+    ([], {"/x"}, {"/y"}, []),
+    (OLD, {"/rosout", "/a"}, set(), []),
+    (OLD, {"/rosout"}, set(), [OLD[1]]),  # the topic has gone, the node has not
+    ([*OLD, *NEW], {"/rosout"}, {"/b"}, OLD),  # another node on the same port
+    ([*OLD, *NEW], {"/rosout", "/a"}, {"/b"}, []),  # two names in one process
+    ([*OLD, (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),  # is being made right now
+]
+
+
+@pytest.mark.parametrize(("registered", "published", "subscribed", "left"), LEFT_OVER)
+def test_what_a_process_that_is_gone_has_left_behind(
+    registered: list[tuple[Kind, str, str, float]],
+    published: set[str],
+    subscribed: set[str],
+    left: list[tuple[Kind, str, str, float]],
+) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for kind, name, caller_id, since in registered:
+        addressing.registry.register(endpoint, Registration(kind, name, caller_id, since=since))
+    found = policy.left_over(endpoint, said(published, subscribed), before=10.0)
+    assert [held.key for held in found] == [row[:3] for row in left]
+
+
+def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    assert policy.unregistered(endpoint, said({"/a"})) == []  # whose would they be?
+    add_registration(addressing, endpoint, PUB, "/a", "/n")
+    found = policy.unregistered(endpoint, said({"/a", "/b"}, {"/a"}))
+    assert found == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
+    add_registration(addressing, endpoint, SUB, "/c", "/m")
+    assert policy.unregistered(endpoint, said({"/b"})) == []
+
+
+def test_what_is_taken_back_and_in_which_order() -> None:
+    uris = {"/n": "http://c1:40001/", "/m": "http://c1:40001"}
+    known = {
+        "/n": [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB)],
+        "/m": [held("/c", "/m", SUB), held("/lost", "/m", SRV)],
+        "/other": [held("/a", "/other")],
+    }
+    services = {"/add": "rosrpc://c1:50001"}
+    assert policy.free_calls(uris, known, services) == [
+        ("unregisterSubscriber", ["/n", "/b", "http://c1:40001/"]),
+        ("unregisterSubscriber", ["/m", "/c", "http://c1:40001"]),
+        ("unregisterPublisher", ["/n", "/a", "http://c1:40001/"]),
+        ("unregisterService", ["/n", "/add", "rosrpc://c1:50001"]),
+    ]
+
+
+def test_what_is_put_back() -> None:
+    known = [Registration(PUB, "/a", "/n", "std_msgs/String"), held("/add", kind=SRV)]
+    known += [held("/lost", kind=SRV)]
+    services = {"/add": "rosrpc://c1:50001"}
+    assert policy.restore_calls({"/n": "http://c1:40001/"}, {"/n": known}, services) == [
+        ("registerPublisher", ["/n", "/a", "std_msgs/String", "http://c1:40001/"]),
+        ("registerService", ["/n", "/add", "rosrpc://c1:50001", "http://c1:40001/"]),
+    ]
+
+
+def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
+    ask = ("lookupNode", ["/rosproxy", "/n"])
+    parameter = "/rosout_disable_topics_generation"
+    assert policy.release_calls("/n", "http://c1:1/", "/rosproxy") == [
+        ask,
+        ("unsubscribeParam", ["/n", "http://c1:1/", parameter]),
+        ask,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        # the answers to lookupNode, the parameters that were subscribed to at most
+        (None, None, []),
+        ("U", None, [policy.COMMON_PARAMETER]),
+        ("U", "U", None),
+        ("other", "other", None),  # somebody else has the name by now
+    ],
+)
+def test_what_a_node_was_subscribed_to(
+    before: str | None, after: str | None, expected: list[str] | None
+) -> None:
+    assert policy.released_parameters([before, 1, after]) == expected
+
+
+def test_topics_that_a_node_no_longer_has() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    for kind, name, since in [
+        (PUB, "/kept", 1.0),
+        (PUB, "/dropped", 1.0),
+        (PUB, "/new", 9.0),
+        (SUB, "/kept", 1.0),
+        (SUB, "/dropped", 1.0),
+        (SRV, "/add", 1.0),
+        (PARAM, "/rate", 1.0),
+    ]:
+        addressing.registry.register(endpoint, held(name, kind=kind, since=since))
+    gone = policy.vanished(endpoint, said(["/kept"], ["/kept"]), before=5.0)
+    assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
+
+
+LOST = [
+    # ours, the master's, what is lost
+    ([], [], []),
+    ([held("/a")], [held("/a")], []),
+    ([held("/a")], [], [held("/a")]),
+    ([held("/a")], [held("/a", "/other")], [held("/a")]),
+    ([held("/a")], [held("/a", kind=SUB)], [held("/a")]),
+    ([held("/a"), held("/b")], [held("/a")], [held("/b")]),
+    ([held("/a", since=9.9)], [], [held("/a", since=9.9)]),
+    ([held("/a", since=10.0)], [], []),  # made while the master was being asked
+    ([held("/a", since=11.0)], [], []),
+    # parameters are not in the master's state: lost if their node is
+    ([held("/p", kind=PARAM)], [], []),
+    ([held("/a"), held("/p", kind=PARAM)], [held("/a")], []),
+    ([held("/a"), held("/p", kind=PARAM)], [], [held("/a"), held("/p", kind=PARAM)]),
+    ([held("/a"), held("/b"), held("/p", kind=PARAM)], [held("/b")], [held("/a")]),
+    ([held("/a"), held("/p", "/m", PARAM)], [], [held("/a")]),
+]
+
+
+@pytest.mark.parametrize(("ours", "masters", "lost"), LOST)
+def test_what_the_master_has_lost(
+    ours: list[Registration], masters: list[Registration], lost: list[Registration]
+) -> None:
+    state: dict[str, list[Registration]] = {}
+    for one in masters:
+        state.setdefault(one.caller_id, []).append(one)
+    assert policy.lost(ours, state, before=10.0) == lost
