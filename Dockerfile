@@ -1,5 +1,6 @@
-# The proxy's image:       docker build --target proxy -t rosproxy .
-# The controllers' image:  docker build --target operator -t rosproxy-operator .
+# The proxy's image:     docker build --target proxy -t rosproxy .
+# The operator's image:  docker build --target operator -t rosproxy-operator .
+# `make image` builds both, with the project's version as tag.
 # Any base with Debian's packages will do; where it has no Python, Debian's is installed.
 ARG BASE_IMAGE=python:3.12-slim-bookworm
 
@@ -30,8 +31,8 @@ COPY proxy proxy
 FROM builder AS proxy-builder
 # Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
 ARG EXTRAS=""
-# Without operator/: a change of the controllers makes no other proxy image, so it replaces no
-# proxy. What is left of them is the name of a program.
+# Without operator/: a change of the operator makes no other proxy image, so it replaces no
+# proxy. What is left of it is the name of a program.
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
       ".${EXTRAS:+[$EXTRAS]}" \
     && rm /opt/rosproxy/bin/rosproxy-operator
@@ -59,8 +60,8 @@ ENV PATH=/opt/rosproxy/bin:$PATH
 USER 10001:10001
 WORKDIR /
 # 11311: the master as nodes inside see it; needs no publishing.
-# 45000-45099: the ports of the nodes inside; publish them 1:1 (-p 45000-45099:45000-45099).
-EXPOSE 11311/tcp 45000-45099/tcp
+# 11000-11099: the ports of the nodes inside; publish them 1:1 (-p 11000-11099:11000-11099).
+EXPOSE 11311/tcp 11000-11099/tcp
 HEALTHCHECK --interval=10s --timeout=5s --start-period=10s --retries=3 CMD ["rosproxy", "health"]
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["rosproxy"]
@@ -68,7 +69,7 @@ CMD ["run"]
 
 
 FROM builder AS operator-builder
-# Which controllers: docker, kubernetes, or operator for both.
+# Which engines: docker, kubernetes, or operator for both.
 ARG OPERATOR_EXTRAS=operator
 COPY operator operator
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
@@ -77,12 +78,12 @@ RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir 
 
 FROM base AS operator
 LABEL org.opencontainers.image.title="rosproxy-operator" \
-      org.opencontainers.image.description="Controllers that run rosproxy for labelled containers" \
+      org.opencontainers.image.description="Runs rosproxy for labelled containers and pods" \
       org.opencontainers.image.licenses="Apache-2.0"
 COPY --from=operator-builder /opt/rosproxy /opt/rosproxy
 ENV PATH=/opt/rosproxy/bin:$PATH
 # A number, as above. It writes no file at all; the key of the admission webhook is served from
-# memory. Docker's controller opens no port but its own health check, on loopback. The engine's
+# memory. The operator for Docker opens no port but its own health check, on loopback. The engine's
 # socket belongs to root: who mounts it runs this as 0:0, still without any capability
 # (examples/docker), or puts a socket proxy between. In Kubernetes the command is `kubernetes`.
 USER 10001:10001

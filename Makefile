@@ -6,8 +6,13 @@ MAKEFLAGS += --no-print-directory
 
 VENV ?= .venv
 BIN := $(VENV)/bin
-IMAGE ?= rosproxy:latest
-OPERATOR_IMAGE ?= rosproxy-operator:latest
+# The project's version, from the one place that has it. The chart pulls images of this tag.
+VERSION := $(shell sed -n 's/^__version__ = "\(.*\)"$$/\1/p' proxy/rosproxy/__init__.py)
+TAG ?= $(VERSION)
+# What stands before the images' names, for example: make image push REGISTRY=registry.example/ros
+REGISTRY ?=
+IMAGE := $(REGISTRY:%=%/)rosproxy
+OPERATOR_IMAGE := $(REGISTRY:%=%/)rosproxy-operator
 # Which layers `make test-all` runs, for example: make test-all LAYERS="unit ros"
 LAYERS ?=
 # Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
@@ -68,13 +73,18 @@ lock: ## pin what is installed anew, into constraints.txt
 	@scripts/lock.sh constraints.txt
 
 .PHONY: manifests
-manifests: $(VENV)/.dev ## write manifests/install.yaml and the tables of docs/kubernetes.md from the chart
+manifests: $(VENV)/.dev ## write manifests/install.yaml, the chart's README and the tables of the RosProxy's fields from the chart
 	@PYTHON=$(BIN)/python scripts/manifests.sh
 
 .PHONY: image
-image: ## build the container images of the proxy and of the controllers (IMAGE, OPERATOR_IMAGE)
-	docker build --target proxy --tag $(IMAGE) .
-	docker build --target operator --tag $(OPERATOR_IMAGE) .
+image: ## build the images rosproxy and rosproxy-operator, tagged with the version and latest (REGISTRY, TAG)
+	docker build --target proxy --tag $(IMAGE):$(TAG) --tag $(IMAGE):latest .
+	docker build --target operator --tag $(OPERATOR_IMAGE):$(TAG) --tag $(OPERATOR_IMAGE):latest .
+
+.PHONY: push
+push: ## push both to REGISTRY, with the version as tag
+	docker push $(IMAGE):$(TAG)
+	docker push $(OPERATOR_IMAGE):$(TAG)
 
 .PHONY: clean
 clean: ## remove what the other targets made

@@ -10,20 +10,20 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.main import Commands as ProxyCommands
-from rosproxy.cli.main import log_options
+from rosproxy.cli.options import Commands, log_options
 
 DEFAULT_ADMIN = "http://127.0.0.1:11313"
 
 
-class Commands(ProxyCommands):
+class OperatorCommands(Commands):
     """Commands whose usage errors begin with this program's name."""
 
     program = "rosproxy-operator"
 
 
 @click.group(
-    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+    cls=OperatorCommands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 @click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 @main.group(
-    cls=Commands,
+    cls=OperatorCommands,
     invoke_without_command=True,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )
@@ -299,7 +299,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 @main.command()
 def health() -> None:
     """Exit with 0 if the controller is alive, with 1 if not; for container health checks."""
-    from rosproxy.cli.admin_client import AdminClient, AdminError, default_url
+    from rosproxy.admin.client import AdminClient, AdminError, default_url
 
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else DEFAULT_ADMIN
     try:

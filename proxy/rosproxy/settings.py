@@ -1,18 +1,34 @@
-"""The settings of a proxy, validated."""
+"""The settings of a proxy: plain data, checked.
+
+``read_…`` makes one value of a text, as it comes from a command line, an environment or a label,
+and raises ValueError with what is wrong and an example. `make_settings` puts values together and
+raises SettingError where they don't go together.
+"""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort, Network, parse_address, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.net.addresses import (
+    HostPort,
+    Network,
+    parse_address,
+    parse_authority,
+    parse_host_port,
+)
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
+
+_Value = TypeVar("_Value")
+_RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
+_TOKEN = re.compile(r"[!-~]{8,200}")
+_LONGEST = 40
+"""Characters of a bad value that a message repeats."""
 
 
 class SettingError(ValueError):
@@ -30,6 +46,7 @@ class Settings:
     ``inside_networks`` empty means: the networks of the proxy's own interfaces.
     ``master_address``: the IP address of the master's host where the proxy can't resolve its name
     or would find itself. ``admin_token``: what callers that are not on loopback must know.
+    Raises SettingError if two of them want the same port.
     """
 
     master_uri: str
@@ -50,125 +67,129 @@ class Settings:
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
 
+    def __post_init__(self) -> None:
+        taken: dict[int, str] = {}
+        for option, port in (
+            ("--master-port", self.master_port),
+            ("--publish-master", self.publish_master),
+            ("--admin-bind", self.admin.port),
+        ):
+            if port is None:
+                continue
+            if port in self.ports.listen:
+                text = f"port {port} lies in --port-range {self.ports.listen}; move one of them"
+                raise SettingError(option, text)
+            if port in taken:
+                text = f"port {port} is that of {taken[port]}; move one of them"
+                raise SettingError(option, text)
+            taken[port] = option
 
-def parse_settings(options: Mapping[str, Any]) -> Settings:
-    """Settings from the values of the command line's options.
 
-    Raises SettingError for the first value that can't be used.
+def make_settings(
+    port_range: PortRange,
+    advertise_port_range: PortRange | None,
+    admin_bind: HostPort,
+    inside_network: tuple[Network, ...],
+    **others: Any,
+) -> Settings:
+    """Settings from the values of the command line's options, by their names.
+
+    Raises SettingError if they don't go together.
     """
-    listen = parse_range("--port-range", options["port_range"])
-    text = options.get("advertise_port_range")
-    advertise = parse_range("--advertise-port-range", text) if text else listen
-    if len(advertise) != len(listen):
+    advertise = advertise_port_range or port_range
+    if len(advertise) != len(port_range):
         raise SettingError(
             "--advertise-port-range",
-            f"{advertise} has {len(advertise)} ports and --port-range {listen} has {len(listen)}; "
-            "both need the same number",
+            f"{advertise} has {len(advertise)} ports and --port-range {port_range} has "
+            f"{len(port_range)}; both need the same number",
         )
-    settings = Settings(
-        master_uri=_master_uri(options.get("master_uri")),
-        advertise_host=_advertise_host(options.get("advertise_host")),
-        ports=PortMap(listen, advertise),
-        master_port=_port("--master-port", options["master_port"]),
-        publish_master=_optional_port("--publish-master", options.get("publish_master")),
-        bind=_bind(options["bind"]),
-        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
-        inside_networks=tuple(_network(text) for text in options.get("inside_network") or ()),
-        slave_control=options["slave_control"],
-        data_plane=options.get("data_plane") or "auto",
-        master_address=_master_address(options.get("master_address")),
-        admin_token=_admin_token(options.get("admin_token")),
-        **{name: _seconds(name, options[name]) for name in _TIMES},
-    )
-    _check_overlaps(settings)
-    return settings
+    ports = PortMap(port_range, advertise)
+    return Settings(ports=ports, admin=admin_bind, inside_networks=inside_network, **others)
 
 
-_RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
-_TOKEN = re.compile(r"[!-~]{8,200}")
-_TIMES = ("probe_interval", "probe_timeout", "cleanup_after", "linger", "master_interval")
-_MAY_BE_ZERO = ("cleanup_after", "linger")
-
-
-def parse_range(option: str, text: str) -> PortRange:
-    """Parse ``first-last``. Raises SettingError that names ``option``."""
+def read_range(text: str) -> PortRange:
+    """A range of ports, ``first-last``. Raises ValueError."""
     found = _RANGE.fullmatch(text)
     if found is None:
-        raise SettingError(option, f"{text[:40]!r} is not a range such as 45000-45099")
+        raise ValueError(f"{text[:_LONGEST]!r} is not a range such as 11000-11099")
     ports = PortRange(int(found[1]), int(found[2]))
     if not 1 <= ports.first <= ports.last <= 65535:
-        raise SettingError(option, f"{text!r} must rise and lie between 1 and 65535")
+        raise ValueError(f"{text!r} must rise and lie between 1 and 65535, such as 11000-11099")
     return ports
 
 
-def _master_uri(uri: str | None) -> str:
-    if not uri:
-        raise SettingError(
-            "--master-uri",
-            "missing; give the real master, e.g. http://robot:11311 (ROS_MASTER_URI)",
-        )
-    if parse_slave_uri(uri) is None:
-        raise SettingError("--master-uri", f"{uri!r} is not of the form http://host:11311")
-    return uri
-
-
-def _master_address(text: str | None) -> str | None:
-    if not text:
-        return None
-    address = parse_address(text)
-    if address is None:
-        raise SettingError(
-            "--master-address", f"{text[:40]!r} is not an IP address such as 192.0.2.7"
-        )
-    return address
-
-
-def _admin_token(text: str | None) -> str | None:
-    """It travels in a header: printable ASCII without spaces."""
-    if not text:
-        return None
-    if not _TOKEN.fullmatch(text):
-        raise SettingError(
-            "--admin-token",
-            "must be 8 to 200 letters, digits or signs without spaces, for example the output of "
-            "openssl rand -hex 16",
-        )
-    return text
-
-
-def _advertise_host(host: str | None) -> str:
-    if not host:
-        raise SettingError(
-            "--advertise-host",
-            "missing; give the name or address under which outside nodes reach this host "
-            "(ROSPROXY_ADVERTISE_HOST)",
-        )
-    return parse_host("--advertise-host", host)
-
-
-def parse_host(option: str, text: str) -> str:
-    """Parse a host name or address, without brackets. Raises SettingError that names ``option``."""
+def read_host(text: str) -> str:
+    """A host name or address, which comes out without brackets. Raises ValueError."""
     bare = text.strip("[]")
     if parse_host_port(f"[{bare}]:1" if ":" in bare else f"{bare}:1") != HostPort(bare, 1):
-        raise SettingError(option, f"{text!r} is neither a host name nor an address")
+        raise ValueError(
+            f"{text[:_LONGEST]!r} is neither a host name nor an address such as 192.0.2.7"
+        )
     return bare
 
 
-def _port(option: str, port: int) -> int:
-    if not 1 <= port <= 65535:
-        raise SettingError(option, f"{port} is not a port between 1 and 65535")
-    return port
+def read_address(text: str) -> str | None:
+    """An IP address in its plain form; None for no text. Raises ValueError."""
+    address = parse_address(text)
+    if text and address is None:
+        raise ValueError(f"{text[:_LONGEST]!r} is not an IP address such as 192.0.2.7")
+    return address
 
 
-def _optional_port(option: str, port: int | None) -> int | None:
-    return None if port is None else _port(option, port)
-
-
-def _bind(address: str) -> str:
+def read_bind_address(text: str) -> str:
+    """An IP address to listen on, also the unspecified one. Raises ValueError."""
     try:
-        return str(ip_address(address))
+        return str(ip_address(text))
     except ValueError:
-        raise SettingError("--bind", f"{address!r} is not an IP address of this host") from None
+        message = f"{text[:_LONGEST]!r} is not an IP address of this host, such as 0.0.0.0"
+        raise ValueError(message) from None
+
+
+def read_host_port(text: str) -> HostPort:
+    """``host:port`` or ``[v6]:port``. Raises ValueError."""
+    where = parse_host_port(text)
+    if where is None:
+        raise ValueError(f"{text[:_LONGEST]!r} is not of the form {DEFAULT_ADMIN}")
+    return where
+
+
+def read_network(text: str) -> Network:
+    """A network as CIDR. Raises ValueError."""
+    try:
+        return ip_network(text)
+    except ValueError as error:
+        message = f"{text[:_LONGEST]!r} is not a network such as 172.18.0.0/16: {error}"
+        raise ValueError(message) from None
+
+
+def read_master_uri(text: str) -> str:
+    """The URI of a ROS master. Raises ValueError."""
+    if not text.startswith("http://") or parse_authority(text) is None:
+        raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
+    return text
+
+
+def read_token(text: str) -> str | None:
+    """What travels in a header: printable ASCII without spaces; None for no text.
+
+    Raises ValueError, which does not repeat it.
+    """
+    if text and not _TOKEN.fullmatch(text):
+        raise ValueError(
+            "must be 8 to 200 letters, digits or signs without spaces, for example the output of "
+            "openssl rand -hex 16"
+        )
+    return text or None
+
+
+def parse_range(option: str, text: str) -> PortRange:
+    """Like `read_range`. Raises SettingError that names ``option``."""
+    return _named(option, read_range, text)
+
+
+def parse_host(option: str, text: str) -> str:
+    """Like `read_host`. Raises SettingError that names ``option``."""
+    return _named(option, read_host, text)
 
 
 def parse_admin(text: str, default: HostPort) -> HostPort:
@@ -179,18 +200,6 @@ def parse_admin(text: str, default: HostPort) -> HostPort:
     return where
 
 
-def _network(text: str) -> Network:
-    try:
-        return ip_network(text)
-    except ValueError as error:
-        raise SettingError("--inside-network", f"{text!r} is not a network: {error}") from None
-
-
-def _seconds(name: str, value: float) -> float:
-    low = 0.0 if name in _MAY_BE_ZERO else 0.05
-    return parse_seconds("--" + name.replace("_", "-"), value, low)
-
-
 def parse_seconds(option: str, value: float, low: float) -> float:
     """Check a time between ``low`` and a day. Raises SettingError that names ``option``."""
     if not low <= value <= 86400:
@@ -198,18 +207,8 @@ def parse_seconds(option: str, value: float, low: float) -> float:
     return float(value)
 
 
-def _check_overlaps(settings: Settings) -> None:
-    taken: dict[int | None, str] = {}
-    for option, port in (
-        ("--master-port", settings.master_port),
-        ("--publish-master", settings.publish_master),
-        ("--admin-bind", settings.admin.port),
-    ):
-        if port in settings.ports.listen:
-            raise SettingError(
-                option,
-                f"port {port} lies in --port-range {settings.ports.listen}; move one of them",
-            )
-        if port in taken:
-            raise SettingError(option, f"port {port} is that of {taken[port]}; move one of them")
-        taken[port] = option
+def _named(option: str, read: Callable[[str], _Value], text: str) -> _Value:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise SettingError(option, str(error)) from None

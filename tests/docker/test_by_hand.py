@@ -18,7 +18,7 @@ from tests.docker.robot import HOST_ADDRESS, MASTER_URI, Robot
 
 EXAMPLE = ROOT / "examples/docker/by-hand"
 KERNEL = ROOT / "examples/docker/kernel"
-PUBLISHED = range(11400, 11420)
+PUBLISHED = range(11000, 11020)
 
 
 class Inside:

@@ -1,4 +1,4 @@
-"""The examples with a controller, started as their READMEs say, with real nodes."""
+"""The examples with the operator, started as their READMEs say, with real nodes."""
 
 import re
 from collections.abc import Iterator
@@ -39,14 +39,14 @@ def example(
 ) -> Iterator[Example]:
     extra = temporary / "names.yaml"
     hosts = f'["{robot.name}:{robot.address}"]'
-    extra.write_text(f"services:\n  controller:\n    extra_hosts: {hosts}\n")
+    extra.write_text(f"services:\n  operator:\n    extra_hosts: {hosts}\n")
     variables = {"ROS_MASTER_URI": robot.master_uri, "ADVERTISE_HOST": robot.host_address}
     found = Example(directory, {**variables, **images}, extra)
     try:
         found.compose("up", "--detach", "--no-build")
         yield found
     finally:
-        print(found.compose("logs", "controller"))
+        print(found.compose("logs", "operator"))
         found.compose("rm", "--stop", "--force", "talker", "listener")
         remove_proxies()
         found.compose("down", "--timeout", "2")
@@ -83,7 +83,7 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
     with example(EXAMPLES, named, images, tmp_path) as found:
         works_both_ways(found, named)
 
-        status = found.compose("exec", "-T", "controller", "rosproxy-operator", "docker", "status")
+        status = found.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
         assert the_proxy().name in status
         assert "talker" in status
         assert "listener" in status
@@ -101,20 +101,20 @@ def test_example_behind_a_socket_proxy(
     with example(SOCKET_PROXY, named, images, tmp_path) as found:
         works_both_ways(found, named)
 
-        controller = inspect(found.container("controller"))
-        assert controller["Config"]["User"] == "10001:10001"
-        assert not controller["Mounts"]
+        operator = inspect(found.container("operator"))
+        assert operator["Config"]["User"] == "10001:10001"
+        assert not operator["Mounts"]
         forbidden = (
             "import os, requests as r; url = os.environ['DOCKER_HOST'].replace('tcp', 'http');"
             "print([r.get(url + '/v1.41/info').status_code,"
             "r.post(url + '/v1.41/containers/x/exec').status_code,"
             "r.delete(url + '/v1.41/networks/x').status_code])"
         )
-        said = docker("exec", controller["Id"], "/opt/rosproxy/bin/python", "-c", forbidden)
+        said = docker("exec", operator["Id"], "/opt/rosproxy/bin/python", "-c", forbidden)
         assert said == "[403, 403, 403]"
 
 
-def test_socket_proxy_allows_what_the_controller_calls() -> None:
+def test_socket_proxy_allows_what_the_operator_calls() -> None:
     """And the documentation lists the same."""
     listed = r"^ {4}(GET|POST|DELETE) (/\S+)$"
     calls = re.findall(listed, str(rosproxy_operator.docker.client.__doc__), re.MULTILINE)
@@ -123,8 +123,8 @@ def test_socket_proxy_allows_what_the_controller_calls() -> None:
 
     assert len(calls) > 10
     assert calls == [(verb.upper(), path.replace("/v[0-9.]+", "")) for verb, path in allowed]
-    documented = (ROOT / "docs/docker.md").read_text()
-    assert calls == re.findall(listed, documented, re.MULTILINE)
+    documented = (ROOT / "docs/reference/permissions.md").read_text()
+    assert calls == re.findall(r"^(GET|POST|DELETE) (/\S+)$", documented, re.MULTILINE)
 
 
 def test_examples_need_no_more_than_their_readme_says() -> None:

@@ -8,8 +8,9 @@ from rosproxy.app import App
 from rosproxy.demo.fake_http import Where, free_ports, where
 from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.settings import Settings, parse_settings
+from rosproxy.settings import Settings
 from tests.integration.net import HOST, PROXY, refuses, until
+from tests.run_options import parse_settings
 
 PORTS = 8
 """How many ports a proxy of the tests has for nodes, unless told otherwise."""

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 from pathlib import Path
 from statistics import median
 
@@ -10,6 +11,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(path for root in ("proxy", "operator") for path in (ROOT / root).rglob("*.py"))
+REFERENCE = ROOT / "docs/reference"
+MADE = {".venv", "build", "node_modules"}
+PAGES = sorted(page for page in ROOT.rglob("*.md") if not MADE & set(page.relative_to(ROOT).parts))
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 45
 MAX_MEDIAN_LINES = 10
@@ -53,23 +57,52 @@ def test_no_package_hides_the_standard_library() -> None:
     assert not (ROOT / "operator/__init__.py").exists()
 
 
-@pytest.mark.parametrize("command", ["make demo", "make test", "make check"])
+@pytest.mark.parametrize("command", ["make demo", "make test", "make test-all", "make check"])
 def test_readme_names_the_commands(command: str) -> None:
     assert command in (ROOT / "README.md").read_text()
 
 
 def test_every_option_is_documented() -> None:
-    text = (ROOT / "docs/configuration.md").read_text()
+    text = (REFERENCE / "options.md").read_text()
     names = [name for option in run_options() for name in option.opts]
     variables = [str(option.envvar) for option in run_options() if option.envvar]
     missing = [word for word in names + variables if not re.search(rf"(?<![\w-]){word}\b", text)]
     assert not missing
 
 
-def test_readme_names_tests_that_exist() -> None:
-    """A table of what works is worth as much as the tests that it names."""
-    named = set(re.findall(r"\btests/[\w/]+\.py\b", (ROOT / "README.md").read_text()))
-    assert not {path for path in named if not (ROOT / path).is_file()}
+def test_architecture_names_what_exists() -> None:
+    """Ways of data, rooms and proofs are worth as much as the modules and tests that they name."""
+    text = (ROOT / "docs/architecture.md").read_text()
+    named = set(re.findall(r"`([\w./]+(?:\.py|/))`", text))
+    roots = [ROOT, ROOT / "proxy/rosproxy", ROOT / "operator/rosproxy_operator"]
+    roots += [roots[2] / "docker/planner", roots[2] / "kubernetes", roots[2] / "docker"]
+    roots += [roots[2] / "kubernetes/planner"]
+    assert len(named) > 60
+    assert not {path for path in named if not any((root / path).exists() for root in roots)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_block_of_code_says_its_language(page: Path) -> None:
+    fences = re.findall(r"^ *```(.*)$", page.read_text(), re.M)
+    assert [language == "" for language in fences] == [False, True] * (len(fences) // 2)
+    prose = re.sub(r"^ *```.*?^ *```$", "", page.read_text(), flags=re.M | re.S)
+    assert not re.findall(r"\n\n    .*", prose)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    broken = []
+    for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", page.read_text()):
+        found = page.parent / target if target else page
+        if not found.exists() or (anchor and anchor not in headings(found)):
+            broken.append(f"{target}#{anchor}")
+    assert not broken
+
+
+def headings(page: Path) -> set[str]:
+    """The anchors of a page, as GitHub and GitLab make them."""
+    titles = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def test_scripts_can_be_run() -> None:
@@ -77,40 +110,65 @@ def test_scripts_can_be_run() -> None:
     assert not [path.name for path in scripts if not path.stat().st_mode & 0o111]
 
 
-def test_docker_page_names_every_option_label_and_metric() -> None:
+def test_images_are_tagged_with_the_version() -> None:
+    """The chart pulls that tag: its appVersion is the same (tests/chart)."""
+    from rosproxy import __version__
+
+    make = ["make", "--dry-run", "image", "push", "REGISTRY=registry.example/ros"]
+    said = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in ("rosproxy", "rosproxy-operator"):
+        image = f"registry.example/ros/{name}:{__version__}"
+        assert f"--tag {image} " in said
+        assert f"docker push {image}\n" in said
+
+
+def reference() -> str:
+    return "\n".join(page.read_text() for page in sorted(REFERENCE.glob("*.md")))
+
+
+def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import DockerMetrics
     from rosproxy_operator.docker.planner.label_values import LABELS
 
-    text = (ROOT / "docs/docker.md").read_text()
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
     metrics = [family.name for family in DockerMetrics().registry.collect()]
-    wanted = [*options, *LABELS, *(name for name in metrics if not name.startswith("process_"))]
-    assert not [word for word in wanted if word not in text]
+    own = [name for name in metrics if not name.startswith("process_")]
+    text = reference()
+    assert not [word for word in [*options, *LABELS, *own] if word not in text]
 
 
-def test_docker_page_lists_the_engine_calls() -> None:
+def test_reference_lists_the_engine_calls() -> None:
     from rosproxy_operator.docker import client
 
     assert client.__doc__ is not None
     calls = re.findall(r"^    ((?:GET|POST|DELETE) \S+)$", client.__doc__, re.M)
-    page = (ROOT / "docs/docker.md").read_text().splitlines()
+    page = (REFERENCE / "permissions.md").read_text()
     assert calls
-    assert [line.strip() for line in page if line.strip() in calls] == calls
+    assert re.findall(r"^(?:GET|POST|DELETE) \S+$", page, re.M) == calls
 
 
-def test_kubernetes_page_names_every_option_label_and_metric() -> None:
+def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import ClusterMetrics
     from rosproxy_operator.kubernetes.planner import names
 
-    text = (ROOT / "docs/kubernetes.md").read_text()
     options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]
     labels = [names.INJECT, names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT]
     annotations = [names.ADVERTISE_HOST, names.MASTER_URI]
     metrics = [family.name for family in ClusterMetrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
+    text = reference()
     assert not [word for word in [*options, *labels, *annotations, *own] if word not in text]
+
+
+def test_reference_names_every_metric_of_the_proxy() -> None:
+    from rosproxy.telemetry.metrics import Metrics
+
+    metrics = [family.name for family in Metrics().registry.collect()]
+    own = [name for name in metrics if not name.startswith("process_")]
+    text = reference()
+    assert not [word for word in own if word not in text]
 
 
 def rules() -> dict[str, set[str]]:
@@ -123,9 +181,9 @@ def rules() -> dict[str, set[str]]:
 
 def test_the_chart_grants_what_the_code_calls_and_no_more() -> None:
     granted: dict[str, set[str]] = {}
-    text = (ROOT / "charts/rosproxy/templates/rbac.yaml").read_text()
+    text = (ROOT / "charts/rosproxy-operator/templates/rbac.yaml").read_text()
     text = text.partition(".Values.rbac.aggregate")[0]  # what follows is for users
-    text += (ROOT / "charts/rosproxy/templates/_rules.tpl").read_text()
+    text += (ROOT / "charts/rosproxy-operator/templates/_rules.tpl").read_text()
     for resources, verbs in re.findall(
         r"resources: \[([^\]]+)\](?:\n *resourceNames:.*)?\n *verbs: \[([^\]]+)\]", text
     ):
@@ -135,6 +193,6 @@ def test_the_chart_grants_what_the_code_calls_and_no_more() -> None:
     assert {resource: granted.get(resource) for resource in rules()} == rules()
 
 
-def test_kubernetes_page_names_every_rule() -> None:
-    text = (ROOT / "docs/kubernetes.md").read_text()
+def test_reference_names_every_rule() -> None:
+    text = (REFERENCE / "permissions.md").read_text()
     assert not [resource for resource in rules() if resource not in text]

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.settings import SettingError, parse_settings
+from rosproxy.settings import SettingError
+from tests.run_options import parse_settings
 
 GIVEN: dict[str, Any] = {
     # as the command line gives them, with its defaults
@@ -98,7 +99,7 @@ TIMES = ["probe_interval", "probe_timeout", "cleanup_after", "linger", "master_i
 BAD: list[tuple[str, Any, str]] = [
     # option, value given, part of the complaint
     ("master_uri", None, "missing"),
-    ("master_uri", "", "missing"),
+    ("master_uri", "", "not of the form"),
     ("master_uri", "robot:11311", "not of the form"),
     ("master_uri", "http://robot", "not of the form"),
     ("master_uri", "http://robot:0", "not of the form"),
@@ -119,7 +120,7 @@ BAD: list[tuple[str, Any, str]] = [
     ("admin_token", "ümlaut-1234", "8 to 200"),
     ("admin_token", "x" * 201, "8 to 200"),
     ("advertise_host", None, "missing"),
-    ("advertise_host", "", "missing"),
+    ("advertise_host", "", "neither a host name nor an address"),
     ("advertise_host", "robot:45000", "neither a host name nor an address"),
     ("advertise_host", "http://robot", "neither a host name nor an address"),
     ("advertise_host", "ro bot", "neither a host name nor an address"),
@@ -143,11 +144,11 @@ BAD: list[tuple[str, Any, str]] = [
     ("advertise_port_range", "30000-30010", "has 11 ports and --port-range 45000-45099 has 100"),
     ("advertise_port_range", "x", "not a range"),
     ("advertise_port_range", "65500-65600", "between 1 and 65535"),
-    ("master_port", 0, "not a port"),
-    ("master_port", 65536, "not a port"),
-    ("master_port", -1, "not a port"),
+    ("master_port", 0, "not in the range 1<=x<=65535"),
+    ("master_port", 65536, "not in the range 1<=x<=65535"),
+    ("master_port", -1, "not in the range 1<=x<=65535"),
     ("master_port", 45050, "lies in --port-range 45000-45099"),
-    ("publish_master", 0, "not a port"),
+    ("publish_master", 0, "not in the range 1<=x<=65535"),
     ("publish_master", 45099, "lies in --port-range"),
     ("publish_master", 11311, "that of --master-port"),
     ("bind", "robot-host", "not an IP address"),

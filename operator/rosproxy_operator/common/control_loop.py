@@ -2,9 +2,9 @@
 
 A reason is an event (`wake`), a time (`wake_in`, or what the look returned), or the resync. A look
 is level-triggered: it sees everything, so an event says no more than that there was one, and a
-burst of them costs one look. A look that fails is repeated after a pause that grows; meanwhile
-events are not heeded, since what could not be asked does not get better by being asked more often,
-but `retry` is: it says that the engine is back.
+burst of them costs one look. A look that fails is repeated after a pause that grows. Events do not
+shorten it, since what could not be asked does not get better by being asked more often, but `retry`
+does: the engine is back.
 
 The loop knows nothing of what is looked at. All times are those of the event loop's clock, so that
 tests can let it jump.

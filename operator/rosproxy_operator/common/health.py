@@ -13,7 +13,7 @@ GREETING = "rosproxy-operator: /healthz /readyz /metrics\n"
 Check = Callable[[], str | None]
 
 
-class Health:
+class HealthServer:
     """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not."""
 
     def __init__(self, metrics: CollectorRegistry, alive: Check, ready: Check) -> None:

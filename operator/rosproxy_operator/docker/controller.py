@@ -50,7 +50,7 @@ class DockerController:
         self._executor = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
         uplink = settings.plan.uplink
         self._proxy_sync = DockerProxySync(self._tasks, self._proxies, uplink, loop.wake)
-        self._events = Events(engine, self._connected, self._happened)
+        self._events = Events(engine, self._connected, self._changed)
         self._memory = DockerMemory()
         self._shown: list[Problem] = []
         self._log = ProblemLog()
@@ -172,7 +172,7 @@ class DockerController:
         self._loop.retry()
         self._loop.wake_in(SETTLED)
 
-    def _happened(self) -> None:
+    def _changed(self) -> None:
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

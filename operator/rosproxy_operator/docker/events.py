@@ -25,14 +25,14 @@ PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
 class Events:
     """Listens to an engine for good, in a thread of its own.
 
-    ``happened`` is called in the event loop when something has; ``connected`` after each connect:
+    ``changed`` is called in the event loop when something has; ``connected`` after each connect:
     the engine is there, and what happened before that was missed.
     """
 
     def __init__(
-        self, engine: DockerClient, connected: Callable[[], None], happened: Callable[[], None]
+        self, engine: DockerClient, connected: Callable[[], None], changed: Callable[[], None]
     ) -> None:
-        self._engine, self._connected, self._happened = engine, connected, happened
+        self._engine, self._connected, self._changed = engine, connected, changed
 
     def start(self) -> None:
         """Begin. Needs a running event loop."""
@@ -47,7 +47,7 @@ class Events:
                 failures = 0
                 _call(loop, self._connected)
                 for _ in events:
-                    _call(loop, self._happened)
+                    _call(loop, self._changed)
             time.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
             failures += 1
 

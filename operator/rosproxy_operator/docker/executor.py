@@ -16,7 +16,6 @@ from rosproxy_operator.docker.errors import EngineError, PortTaken
 from rosproxy_operator.docker.planner.actions import Action, Connect, Disconnect
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.plan import Group
-from rosproxy_operator.docker.planner.report import line
 from rosproxy_operator.docker.planner.specs import proxy_name
 
 log = logging.getLogger(__name__)
@@ -175,14 +174,14 @@ class Executor:
                 return problem
             except EngineError as error:
                 self._refuse(action, error)
-                problem = Problem(_subject(group.key), f"{line(action)}: {error}")
+                problem = Problem(_subject(group.key), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
 
     async def _one(self, action: Action, carry_out: CarryOut) -> None:
         again = action in self._refused
-        log.log(logging.DEBUG if again else logging.INFO, "%s", line(action))
+        log.log(logging.DEBUG if again else logging.INFO, "%s", action)
         outcome = "failed"
         started = time.monotonic()
         try:
@@ -194,13 +193,13 @@ class Executor:
             raise
         finally:
             self._counted(action, outcome)
-            log.debug("%s: %s in %.3f s", line(action), outcome, time.monotonic() - started)
+            log.debug("%s: %s in %.3f s", action, outcome, time.monotonic() - started)
 
     def _refuse(self, action: Action, error: EngineError) -> None:
         """Log why an action failed, once while it is tried again and again."""
         reason = type(error).__name__ if isinstance(error, PortTaken) else str(error)
         again = self._refused.get(action, ("", 0.0))[0] == reason
-        log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", line(action), error)
+        log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", action, error)
         self._refused[action] = reason, time.monotonic()
 
     def _forget_refusals(self) -> None:

@@ -8,7 +8,7 @@ import time
 
 from rosproxy import __version__
 from rosproxy.cli.terminal import size, watch, write
-from rosproxy_operator.common.health import Health
+from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.controller import DockerController
@@ -67,7 +67,7 @@ async def _run(settings: DockerSettings) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = DockerMetrics()
     controller = DockerController(settings, metrics)
-    health = Health(metrics.registry, controller.dead, controller.unready)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, settings.admin)
     running = asyncio.create_task(controller.run())

@@ -17,7 +17,6 @@ from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.planner.actions import Action
 from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
-from rosproxy_operator.docker.planner.report import line
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
@@ -83,7 +82,7 @@ def describe(found: Survey, settings: PlanSettings) -> Json:
             {"subject": problem.subject, "text": problem.text, "fatal": problem.fatal}
             for problem in found.problems
         ],
-        "actions": [line(action) for action in found.actions],
+        "actions": [str(action) for action in found.actions],
     }
 
 

@@ -5,7 +5,7 @@ import logging
 import signal
 
 from rosproxy import __version__
-from rosproxy_operator.common.health import Health
+from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
@@ -32,7 +32,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = ClusterMetrics()
     controller = KubernetesController(settings, api, metrics)
-    health = Health(metrics.registry, controller.dead, controller.unready)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready)
     await health.start(settings.admin)
     log.info(
         "rosproxy-operator %s: looking after %s at %s; health and metrics at http://%s",

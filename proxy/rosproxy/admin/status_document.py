@@ -203,7 +203,7 @@ def _field(value: Any, kind: Any) -> Any:
     """A value as a field's type. Raises ValidationError where nothing of it fits."""
     inner = get_args(kind)[0] if get_origin(kind) in (UnionType, tuple) else kind
     document = isinstance(inner, type) and issubclass(inner, msgspec.Struct)
-    if document and isinstance(value, dict):
+    if document and isinstance(value, dict) and get_origin(kind) is not tuple:
         return _as_far_as_it_fits(value, inner)
     if get_origin(kind) is not tuple or not isinstance(value, list):
         return msgspec.convert(value, kind)

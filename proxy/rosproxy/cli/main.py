@@ -1,141 +1,106 @@
-"""The command line."""
+"""The command line: ``rosproxy run``, ``status``, ``health`` and ``doctor``.
 
-import contextlib
+Commands import what they need when they run, so that a health check starts fast.
+"""
+
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import click
 
 from rosproxy import __version__
-
-Command = Callable[..., Any]
-
-
-class _OneLineErrors(click.Command):
-    """A command that tells what is wrong with its options in one line, for logs of containers."""
-
-    def make_context(self, *arguments: Any, **more: Any) -> click.Context:
-        """Parse the command line. Exits with 2 if there is something wrong with it."""
-        try:
-            return super().make_context(*arguments, **more)
-        except click.UsageError as error:
-            click.echo(f"rosproxy: {error.format_message()}", err=True)
-            sys.exit(2)
-
-
-class UsageError(click.ClickException):
-    """A mistake on the command line, told in one line."""
-
-    exit_code = 2
-
-    def __init__(self, message: str, program: str) -> None:
-        super().__init__(message)
-        self.program = program
-
-    def show(self, file: Any = None) -> None:
-        """Print it."""
-        click.echo(f"{self.program}: {self.format_message()}", file, err=True)
-
-
-class Commands(click.Group):
-    """Commands whose usage errors are one line, led by the program's name; click prints four."""
-
-    program = "rosproxy"
-
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Parse the words before the command. Raises UsageError."""
-        with _in_one_line(self.program):
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Parse the command's words and run it. Raises UsageError."""
-        with _in_one_line(self.program):
-            return super().invoke(ctx)
-
-
-@contextlib.contextmanager
-def _in_one_line(program: str) -> Iterator[None]:
-    try:
-        yield
-    except click.UsageError as error:
-        if "\n" in error.format_message():  # the help, for want of a command
-            raise
-        raise UsageError(error.format_message(), program) from None
-
-
-def log_options(command: Command) -> Command:
-    """The options ``--log-format`` and ``--log-level``."""
-    form = click.option(
-        "--log-format", type=click.Choice(["text", "json"]), default="text", help="Log format."
-    )
-    level = click.option(
-        "--log-level",
-        type=click.Choice(["debug", "info", "warning", "error"], case_sensitive=False),
-        default="info",
-        help="Least severe messages to log.",
-    )
-    return form(level(command))
-
-
-@click.group(
-    cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+from rosproxy.cli.options import (
+    ADDRESS,
+    BIND_ADDRESS,
+    GROUP_SETTINGS,
+    HOST,
+    HOST_PORT,
+    MASTER_URI,
+    NETWORK,
+    PORT,
+    PORT_RANGE,
+    TOKEN,
+    Command,
+    Commands,
+    Seconds,
+    log_options,
+    setting_errors,
 )
+
+
+@click.group(cls=Commands, context_settings=GROUP_SETTINGS)
 @click.version_option(__version__, prog_name="rosproxy")
 def main() -> None:
     """Transparent proxy for ROS 1: nodes behind it and nodes outside talk both ways."""
 
 
 @main.command(
-    cls=_OneLineErrors,
     context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
 )
-@click.option("--master-uri", envvar="ROS_MASTER_URI", metavar="URI", help="The real ROS master.")
+@click.option(
+    "--master-uri",
+    type=MASTER_URI,
+    required=True,
+    envvar="ROS_MASTER_URI",
+    metavar="URI",
+    help="The real ROS master, e.g. http://robot:11311.",
+)
 @click.option(
     "--master-address",
+    type=ADDRESS,
     metavar="ADDRESS",
     help="IP address of the master's host, to use instead of resolving its name.",
 )
 @click.option(
     "--advertise-host",
+    type=HOST,
+    required=True,
     metavar="HOST",
     help="Name or address under which outside nodes and the master reach this host.",
 )
 @click.option(
-    "--master-port", type=int, default=11311, help="Where inside nodes find their master."
+    "--master-port", type=PORT, default=11311, help="Where inside nodes find their master."
 )
 @click.option(
     "--port-range",
-    default="45000-45099",
+    type=PORT_RANGE,
+    default="11000-11099",
     metavar="A-B",
     help="Ports to listen on, one per inside node.",
 )
 @click.option(
     "--advertise-port-range",
+    type=PORT_RANGE,
     metavar="A-B",
     help="The same ports as outside sees them, if it differs; as many as in --port-range.",
 )
 @click.option(
     "--publish-master",
-    type=int,
+    type=PORT,
     metavar="PORT",
     help="Also offer the master itself to outside on this port (where it runs inside).",
 )
-@click.option("--bind", default="0.0.0.0", metavar="ADDRESS", help="Address to listen on.")
+@click.option(
+    "--bind", type=BIND_ADDRESS, default="0.0.0.0", metavar="ADDRESS", help="Address to listen on."
+)
 @click.option(
     "--admin-bind",
+    type=HOST_PORT,
     default="127.0.0.1:11312",
     metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz, /metrics and /status are served.",
 )
 @click.option(
     "--admin-token",
+    type=TOKEN,
     metavar="TOKEN",
     help="Lets callers that know it change things at --admin-bind, not only those on loopback. "
     "Better given as a variable: command lines can be seen by everybody.",
 )
 @click.option(
     "--inside-network",
+    type=NETWORK,
     envvar="ROSPROXY_INSIDE_NETWORKS",
     multiple=True,
     metavar="CIDR",
@@ -143,28 +108,36 @@ def main() -> None:
     "networks of the proxy's own interfaces.",
 )
 @click.option(
-    "--probe-interval", type=float, default=5.0, metavar="S", help="Time between probes of a node."
+    "--probe-interval",
+    type=Seconds(0.05),
+    default=5.0,
+    metavar="S",
+    help="Time between probes of a node.",
 )
 @click.option(
-    "--probe-timeout", type=float, default=3.0, metavar="S", help="Time that a node has to answer."
+    "--probe-timeout",
+    type=Seconds(0.05),
+    default=3.0,
+    metavar="S",
+    help="Time that a node has to answer.",
 )
 @click.option(
     "--cleanup-after",
-    type=float,
+    type=Seconds(0),
     default=30.0,
     metavar="S",
     help="Time after which a node that is gone is unregistered at the master (0: never).",
 )
 @click.option(
     "--linger",
-    type=float,
+    type=Seconds(0),
     default=30.0,
     metavar="S",
     help="Time for which a port is kept after its node has ended.",
 )
 @click.option(
     "--master-interval",
-    type=float,
+    type=Seconds(0.05),
     default=2.0,
     metavar="S",
     help="Time between looks at the master.",
@@ -190,13 +163,14 @@ def run(check: bool, log_format: str, log_level: str, **options: Any) -> None:
     master's is ROS_MASTER_URI, the inside networks' ROSPROXY_INSIDE_NETWORKS.
     """
     from rosproxy.cli.run import run as run_proxy
-    from rosproxy.settings import SettingError
+    from rosproxy.settings import make_settings
+    from rosproxy.telemetry import logs
 
-    try:
-        run_proxy(options, log_format, log_level, check)
-    except SettingError as error:
-        click.echo(f"rosproxy: {error}", err=True)
-        sys.exit(2)
+    with setting_errors():
+        settings = make_settings(**options)
+        logs.set_up(log_format, log_level)
+        if not check:
+            run_proxy(settings)
 
 
 def _admin_option(command: Command) -> Command:
@@ -212,7 +186,7 @@ def _admin_option(command: Command) -> Command:
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
-    from rosproxy.cli.admin_client import AdminClient, default_url
+    from rosproxy.admin.client import AdminClient, default_url
 
     try:
         return AdminClient(url or default_url())
@@ -248,22 +222,22 @@ def health(admin: Any) -> None:
 @_admin_option
 @click.option(
     "--master-uri",
+    type=MASTER_URI,
     envvar="ROS_MASTER_URI",
-    default="",
     metavar="URI",
     help="The master to look at if the proxy can't be asked for its own.",
 )
 @click.option(
     "--advertise-host",
+    type=HOST,
     envvar="ROSPROXY_ADVERTISE_HOST",
-    default="",
     metavar="HOST",
     help="The advertised host if the proxy can't be asked for it.",
 )
 @click.option(
     "--master-address",
+    type=ADDRESS,
     envvar="ROSPROXY_MASTER_ADDRESS",
-    default="",
     metavar="ADDRESS",
     help="The IP address of the master's host if the proxy can't be asked for it.",
 )
@@ -276,9 +250,9 @@ def health(admin: Any) -> None:
 def doctor(
     names: tuple[str, ...],
     admin: Any,
-    master_uri: str,
-    advertise_host: str,
-    master_address: str,
+    master_uri: str | None,
+    advertise_host: str | None,
+    master_address: str | None,
     outside: bool,
     as_json: bool,
 ) -> None:
@@ -294,25 +268,22 @@ def doctor(
     """
     from rosproxy.cli.doctor import examine
     from rosproxy.doctor.collect import DoctorOptions
-    from rosproxy.net.addresses import parse_address
-    from rosproxy.ros1.protocol.uris import parse_slave_uri
 
     if outside and not master_uri:
         raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
-    if master_uri and parse_slave_uri(master_uri) is None:
-        raise click.UsageError(f"--master-uri: {master_uri!r} is not of the form http://host:11311")
-    absolute = tuple(f"/{name.strip('/')}" for name in names)
-    if master_address and parse_address(master_address) is None:
-        raise click.UsageError(f"--master-address: {master_address!r} is not an IP address")
     options = DoctorOptions(
-        None if outside else admin, master_uri, advertise_host, absolute, master_address or None
+        None if outside else admin,
+        master_uri or "",
+        advertise_host or "",
+        tuple(f"/{name.strip('/')}" for name in names),
+        master_address,
     )
     sys.exit(examine(options, as_json))
 
 
 def _or_exit(ask: Callable[[], object]) -> None:
     """Do something that may find the proxy absent, and say so in one line."""
-    from rosproxy.cli.admin_client import AdminError
+    from rosproxy.admin.client import AdminError
 
     try:
         ask()

@@ -3,24 +3,18 @@
 import asyncio
 import contextlib
 import signal
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from rosproxy.app import serve
-from rosproxy.settings import Settings, parse_settings
-from rosproxy.telemetry import logs
+from rosproxy.settings import Settings
 
 new_event_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
 with contextlib.suppress(ImportError):
     from uvloop import new_event_loop
 
 
-def run(options: Mapping[str, Any], log_format: str, log_level: str, check: bool) -> None:
-    """Run a proxy, or only check its options. Raises SettingError."""
-    logs.set_up(log_format, log_level)
-    settings = parse_settings(options)
-    if check:
-        return
+def run(settings: Settings) -> None:
+    """Run a proxy. Raises SettingError if a port is taken."""
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
         runner.run(_serve_until_signal(settings))
 

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from rosproxy.cli.admin_client import AdminClient, default_url
+from rosproxy.admin.client import AdminClient, default_url
 from rosproxy.demo.fake_http import FakeHttpServer, FakeRequest, ok
 from rosproxy.demo.fake_node import FakeNode
 from rosproxy.demo.proxy_process import clean_environment

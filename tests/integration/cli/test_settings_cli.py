@@ -44,10 +44,10 @@ BAD = {
     "advertise_host": ["", "a b", "http://host", "host:80", "a/b"],
     "master_port": ["0", "65536", "abc", "-1"],
     "port_range": ["", "5", "5-", "5-4", "0-5", "65000-70000", "a-b", "1-2-3"],
-    "advertise_port_range": ["5-4", "45000-45009", "x"],
+    "advertise_port_range": ["5-4", "11000-11009", "x"],
     "publish_master": ["0", "65536", "abc", "11311"],
     "bind": ["host", "1.2.3", "127.0.0.1:80"],
-    "admin_bind": ["11312", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":80", "127.0.0.1:45005"],
+    "admin_bind": ["11312", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:x", ":80", "127.0.0.1:11005"],
     "inside_network": ["10.0.0.1/8", "10.0.0.0/33", "net"],
     "probe_interval": ["0", "-1", "x", "nan", "inf", "1e9"],
     "probe_timeout": ["0", "-1", "x"],
@@ -161,7 +161,7 @@ def test_the_command_line_wins_over_the_environment():
     [("master_port", "port_range"), ("admin_bind", "port_range"), ("publish_master", "port_range")],
 )
 def test_ports_that_overlap_are_told(option, clash):
-    value = "127.0.0.1:45005" if option == "admin_bind" else "45005"
+    value = "127.0.0.1:11005" if option == "admin_bind" else "11005"
     code, text = command(arguments({**GOOD, option: value}))
     assert (code, text.count("\n")) == (2, 1)
     assert "--" + option.replace("_", "-") in text

@@ -8,7 +8,7 @@ import pytest
 
 from rosproxy.forwarding.kernel import preflight
 from rosproxy.forwarding.kernel import tools as kernel_tools
-from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import until
@@ -44,7 +44,7 @@ class ChainTools(FakeTools):
 async def test_a_sound_container_has_nothing_in_the_way(place: Path) -> None:
     for mode in ("auto", "kernel"):
         assert await preflight.why_not(mode, ChainTools()) is None
-    assert preflight.forwarding() == World(ipv4=True, ipv6=False)
+    assert preflight.read_forwarding() == HostForwarding(ipv4=True, ipv6=False)
 
 
 async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:

@@ -1,12 +1,14 @@
 """What the operator can do to a Docker host: data, carried out by `rosproxy_operator.docker.apply`.
 
-Containers are named, not numbered: a plan may start what it has yet to create.
+Containers are named, not numbered: a plan may start what it has yet to create. The text of an
+action says what it does, in one plain and harmless line.
 """
 
 from dataclasses import dataclass
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
+from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
 
 
@@ -47,12 +49,22 @@ class CreateNetwork:
 
     name: str
 
+    def __str__(self) -> str:
+        return clean(f"create network {self.name}, a bridge: the uplink of all proxies")
+
 
 @dataclass(frozen=True, slots=True)
 class CreateSandbox:
     """Create a sandbox on the uplink network, without starting it."""
 
     sandbox: SandboxSpec
+
+    def __str__(self) -> str:
+        box = self.sandbox
+        return clean(
+            f"create container {box.name}: it holds ports {box.range} for the proxy of the master "
+            f"{box.key.master_uri}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +73,24 @@ class Create:
 
     proxy: ProxySpec
 
+    def __str__(self) -> str:
+        proxy = self.proxy
+        instead = f", instead of {proxy.replaces}" if proxy.replaces else ""
+        rights = ", with NET_ADMIN" if proxy.data_plane == "kernel" else ""
+        return clean(
+            f"create container {proxy.name}: proxy of the master {proxy.key.master_uri} at "
+            f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{rights}{instead}"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Start:
     """Start a container that was created or has stopped."""
 
     name: str
+
+    def __str__(self) -> str:
+        return clean(f"start container {self.name}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +99,18 @@ class Restart:
 
     name: str
 
+    def __str__(self) -> str:
+        return clean(f"restart container {self.name}")
+
 
 @dataclass(frozen=True, slots=True)
 class Unpause:
     """Resume a container that was paused."""
 
     name: str
+
+    def __str__(self) -> str:
+        return clean(f"resume container {self.name}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +119,9 @@ class Rename:
 
     name: str
     to: str
+
+    def __str__(self) -> str:
+        return clean(f"rename container {self.name} to {self.to}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +132,10 @@ class Connect:
     network: str
     aliases: tuple[str, ...]
 
+    def __str__(self) -> str:
+        names = f" as {', '.join(self.aliases)}" if self.aliases else ""
+        return clean(f"connect container {self.name} to network {self.network}{names}")
+
 
 @dataclass(frozen=True, slots=True)
 class Disconnect:
@@ -106,6 +143,9 @@ class Disconnect:
 
     name: str
     network: str
+
+    def __str__(self) -> str:
+        return clean(f"disconnect container {self.name} from network {self.network}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +161,10 @@ class Remove:
     why: str
     retire: bool = False
     stop: bool = False
+
+    def __str__(self) -> str:
+        after = ", after unregistering its nodes at the master" if self.retire else ""
+        return clean(f"remove container {self.name} ({self.why}){after}")
 
 
 Action = (

@@ -31,9 +31,11 @@ class _Claim:
 
     @property
     def owner(self) -> Key | None:
-        """Whose it is: his who has it, else his whose containers need it; nobody's if taken.
+        """The proxy that gets the name; None if another container on the network has it.
 
-        Who has a name that others have as well keeps it only until it joins the network anew.
+        A proxy that already has the name keeps it, so that no connection is cut. Otherwise it goes
+        to the first one whose containers look for it, else to the first that would have it. One
+        that shares its name with another container loses it when it joins the network anew.
         """
         if self.others:
             return None
@@ -112,10 +114,10 @@ def _problems(claim: _Claim) -> Iterator[Problem]:
     for one in claim.claimants:
         if one.key != claim.owner or claim.others or len(claim.holders) > 1:
             for container in needed_by(one, claim.network, claim.alias):
-                yield Problem(f"container {container}", _astray(claim, one.key), fatal=False)
+                yield Problem(f"container {container}", _misled_text(claim, one.key), fatal=False)
 
 
-def _astray(claim: _Claim, key: Key) -> str:
+def _misled_text(claim: _Claim, key: Key) -> str:
     """What a container is told that looks for its proxy by a name that others have."""
     proxies = {*claim.holders, claim.owner or key} - {key}
     others = [f"container {name}" for name in claim.others]

@@ -28,7 +28,7 @@ def desire(
     memory: DockerMemory,
     now: float,
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
-    """One Desired for each key that is wished for or has a proxy, sorted by key.
+    """One Desired for each key that a container asks for or that has a proxy, sorted by key.
 
     A member for networks that are not there (any more) is dropped. Containers that have exited
     keep networks joined that a proxy is on, and its data plane, for the settings' grace, but join

@@ -22,7 +22,7 @@ from rosproxy_operator.docker.planner.context import (
 from rosproxy_operator.docker.planner.model import STARTED, Container, Proxy, Sandbox
 from rosproxy_operator.docker.planner.sandbox import Home
 from rosproxy_operator.docker.planner.selection import Selection, free_name, select
-from rosproxy_operator.docker.planner.specs import fingerprint, proxy_name
+from rosproxy_operator.docker.planner.specs import proxy_fingerprint, proxy_name
 from rosproxy_operator.docker.planner.state import SERVING
 
 
@@ -35,14 +35,14 @@ def process_steps(
     but can't.
     """
     image, plane = context.observed.image_id, context.desired.data_plane
-    print_ = fingerprint(context.key, context.ports, context.settings, image, plane)
+    expected = proxy_fingerprint(context.key, context.ports, context.settings, image, plane)
     there = [one for one in context.proxies if one.container.name not in gone]
     right = {
         one.container.id
         for one in there
         if lives_in(one.container, home.id)
         and one.range == context.ports
-        and (not context.creatable or one.fingerprint == print_)
+        and (not context.creatable or one.fingerprint == expected)
     }
     found = select(
         (one.container for one in there),
@@ -51,15 +51,15 @@ def process_steps(
         usable=lambda container: True,
         creatable=context.creatable,
     )
-    astray = found.kept and not lives_in(found.kept, home.id)
-    if found.waiting and (astray or not found.kept):
+    misplaced = found.kept and not lives_in(found.kept, home.id)
+    if found.waiting and (misplaced or not found.kept):
         return ()
-    if found.stuck or astray:
+    if found.stuck or misplaced:
         return None
     if found.kept:
         return tuple(_tended(context, found, found.kept, home))
     before = [one.container.name for one in context.proxies if one.container.name in gone]
-    return tuple(_created(context, found, home, print_, before[0] if before else ""))
+    return tuple(_created(context, found, home, expected, before[0] if before else ""))
 
 
 def retired(sandboxes: Collection[Sandbox], proxies: Collection[Proxy]) -> Iterator[Action]:
@@ -107,7 +107,7 @@ def _lost(kept: Container, home: Home) -> bool:
 
 
 def _created(
-    context: PlanContext, found: Selection, home: Home, print_: str, before: str
+    context: PlanContext, found: Selection, home: Home, expected: str, before: str
 ) -> Iterator[Action]:
     """Create a proxy, in the place of an old one, if any; or of one that is removed ``before``."""
     yield from removed(found.others, "left over")
@@ -118,7 +118,7 @@ def _created(
         yield Rename(old.name, former)
     replaces = former or before
     plane = context.desired.data_plane
-    yield Create(ProxySpec(name, context.key, context.ports, print_, home.name, replaces, plane))
+    yield Create(ProxySpec(name, context.key, context.ports, expected, home.name, replaces, plane))
     if old:
         yield Remove(former, "made anew")
     yield Start(name)

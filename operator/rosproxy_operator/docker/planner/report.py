@@ -1,4 +1,4 @@
-"""Text for people: what the operator's host looks like, and what it would do.
+"""The status of a Docker host as text for people.
 
 Names of containers, networks and nodes are whatever their users say, so all are made harmless.
 """
@@ -7,19 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from rosproxy.telemetry.text import besides_first, clean, plural, shorten, table, wrap
-from rosproxy_operator.docker.planner.actions import (
-    Action,
-    Connect,
-    Create,
-    CreateNetwork,
-    CreateSandbox,
-    Disconnect,
-    Remove,
-    Rename,
-    Restart,
-    Start,
-    Unpause,
-)
+from rosproxy_operator.docker.planner.actions import Action
 
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
@@ -48,47 +36,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
 
 def plan_text(actions: Iterable[Action]) -> str:
     """One line for each action."""
-    return "\n".join(map(line, actions)) or "Nothing to do."
-
-
-def line(action: Action) -> str:  # noqa: C901, PLR0911 - one case per action
-    """What an action does, in one plain and harmless line."""
-    match action:
-        case CreateNetwork(name):
-            return clean(f"create network {name}, a bridge: the uplink of all proxies")
-        case CreateSandbox(sandbox):
-            return clean(
-                f"create container {sandbox.name}: it holds ports {sandbox.range} for the proxy of "
-                f"the master {sandbox.key.master_uri}"
-            )
-        case Create():
-            return clean(_create(action))
-        case Start(name):
-            return clean(f"start container {name}")
-        case Restart(name):
-            return clean(f"restart container {name}")
-        case Unpause(name):
-            return clean(f"resume container {name}")
-        case Rename(name, to):
-            return clean(f"rename container {name} to {to}")
-        case Connect(name, network, aliases):
-            names = f" as {', '.join(aliases)}" if aliases else ""
-            return clean(f"connect container {name} to network {network}{names}")
-        case Disconnect(name, network):
-            return clean(f"disconnect container {name} from network {network}")
-        case Remove(name, why, retire):
-            after = ", after unregistering its nodes at the master" if retire else ""
-            return clean(f"remove container {name} ({why}){after}")
-
-
-def _create(action: Create) -> str:
-    proxy = action.proxy
-    instead = f", instead of {proxy.replaces}" if proxy.replaces else ""
-    rights = ", with NET_ADMIN" if proxy.data_plane == "kernel" else ""
-    return (
-        f"create container {proxy.name}: proxy of the master {proxy.key.master_uri} at "
-        f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{rights}{instead}"
-    )
+    return "\n".join(map(str, actions)) or "Nothing to do."
 
 
 def _head(status: Status) -> str:

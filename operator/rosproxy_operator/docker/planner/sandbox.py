@@ -67,11 +67,11 @@ class SandboxSteps:
 def sandbox_steps(context: PlanContext) -> SandboxSteps:
     """The next actions for the sandbox of a key that is wanted."""
     forwards = _forwards(context)
-    print_ = sandbox_fingerprint(context.key, context.ports, context.settings, forwards)
+    expected = sandbox_fingerprint(context.key, context.ports, context.settings, forwards)
     right = {
         one.container.id
         for one in context.sandboxes
-        if one.range == context.ports and (not context.creatable or one.fingerprint == print_)
+        if one.range == context.ports and (not context.creatable or one.fingerprint == expected)
     }
     found = select(
         (one.container for one in context.sandboxes),
@@ -89,7 +89,9 @@ def sandbox_steps(context: PlanContext) -> SandboxSteps:
     if found.waiting or found.stuck:
         return SandboxSteps(stuck=found.stuck)
     name = free_name(sandbox_name(context.key), _others(context))
-    spec = SandboxSpec(name, context.key, context.ports, print_, context.settings.uplink, forwards)
+    spec = SandboxSpec(
+        name, context.key, context.ports, expected, context.settings.uplink, forwards
+    )
     return SandboxSteps(tuple(_created(context, found, spec)), Home(name, starts=True))
 
 

@@ -40,7 +40,7 @@ _SLUG = 30
 
 
 @dataclass(frozen=True, slots=True)
-class Own:
+class OwnLabels:
     """What a container's labels say that this operator made. ``role`` is one of ``ROLE_…``."""
 
     role: str
@@ -84,7 +84,7 @@ def reserved_ports(key: Key) -> frozenset[int]:
     return frozenset({master(key).port, admin_port(key)})
 
 
-def read_own(labels: Mapping[str, str]) -> Own | None:
+def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
     """What the labels of a container of this operator say.
 
     None if they are not those of one, or not whole.
@@ -99,7 +99,7 @@ def read_own(labels: Mapping[str, str]) -> Own | None:
         return None
     if parse_slave_uri(key.master_uri) is None or not key.advertise_host:
         return None
-    return Own(role, key, ports, labels.get(FINGERPRINT, ""))
+    return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
 
 
 def own_labels(spec: SandboxSpec | ProxySpec) -> dict[str, str]:
@@ -122,7 +122,7 @@ def sandbox_fingerprint(
     return _digest({**body, "Image": ""})
 
 
-def fingerprint(
+def proxy_fingerprint(
     key: Key,
     ports: PortRange,
     settings: PlanSettings,

@@ -22,9 +22,9 @@ from rosproxy_operator.docker.planner.model import (
 )
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import (
-    fingerprint,
     master,
     own_labels,
+    proxy_fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
@@ -108,7 +108,7 @@ def proxy(
 ) -> Proxy:
     """A proxy as the operator makes it, by default one that runs in the `sandbox` of its key."""
     name = name or proxy_name(key)
-    made = made or fingerprint(key, ports, settings, image)
+    made = made or proxy_fingerprint(key, ports, settings, image)
     mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
     labels = own_labels(ProxySpec(name, key, ports, made, sandbox_name(key)))
     own = container(name, labels, [], state, mode=mode)

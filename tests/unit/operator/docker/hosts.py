@@ -17,8 +17,8 @@ from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
-    Own,
-    fingerprint,
+    OwnLabels,
+    proxy_fingerprint,
     proxy_name,
     reserved_ports,
     sandbox_fingerprint,
@@ -57,7 +57,7 @@ class Hosts:
         self.served: dict[Key, PortRange] = {}
         self.may_move: set[Key] = set()
 
-    def own(self, *states: str, role: str = "") -> list[tuple[Box, Own]]:
+    def own(self, *states: str, role: str = "") -> list[tuple[Box, OwnLabels]]:
         """The operator's containers."""
         return [
             (box, box.own)
@@ -345,11 +345,11 @@ class Hosts:
         if self.engine.image:
             self.check_made_of(key, is_, runs, plane)
 
-    def check_made_of(self, key: Key, is_: Own, runs: Own, plane: DataPlane) -> None:
+    def check_made_of(self, key: Key, is_: OwnLabels, runs: OwnLabels, plane: DataPlane) -> None:
         forwards = plane == "kernel"
         assert is_.fingerprint == sandbox_fingerprint(key, is_.range, SETTINGS, forwards)
         image = self.engine.image
-        assert runs.fingerprint == fingerprint(key, is_.range, SETTINGS, image, plane)
+        assert runs.fingerprint == proxy_fingerprint(key, is_.range, SETTINGS, image, plane)
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

@@ -33,7 +33,7 @@ from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
-    Own,
+    OwnLabels,
     own_labels,
     read_own,
 )
@@ -74,7 +74,7 @@ class Box:
     namespace: int = 0
 
     @property
-    def own(self) -> Own | None:
+    def own(self) -> OwnLabels | None:
         return read_own(self.labels)
 
     @property

@@ -14,10 +14,9 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.model import Container, PlanSettings, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan
-from rosproxy_operator.docker.planner.report import line
 from rosproxy_operator.docker.planner.specs import (
     container_config,
-    fingerprint,
+    proxy_fingerprint,
     proxy_name,
     sandbox_config,
     sandbox_fingerprint,
@@ -72,7 +71,7 @@ def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
 def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
     box = sandbox(made=sandbox_fingerprint(KEY, RANGE, SETTINGS, forwards))
-    return box, proxy(made=fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
+    return box, proxy(made=proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
 
 
 # what is asked for
@@ -163,7 +162,7 @@ def test_the_sandbox_forwards_and_gets_no_capability() -> None:
 
 
 def test_the_plan_names_the_capability() -> None:
-    texts = [line(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
+    texts = [str(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
     assert ["NET_ADMIN" in text for text in texts] == [True, False]
 
 

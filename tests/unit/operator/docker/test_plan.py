@@ -26,7 +26,7 @@ from rosproxy_operator.docker.planner.actions import (
 from rosproxy_operator.docker.planner.model import HostState, Key, Network, PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
-    fingerprint,
+    proxy_fingerprint,
     proxy_name,
     sandbox_fingerprint,
     sandbox_name,
@@ -66,7 +66,7 @@ def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
-    made = fingerprint(KEY, ports, SETTINGS, image)
+    made = proxy_fingerprint(KEY, ports, SETTINGS, image)
     return Create(ProxySpec(NAME, KEY, ports, made, home, replaces))
 
 

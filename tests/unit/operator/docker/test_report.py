@@ -20,7 +20,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.report import line, plan_text, render
+from rosproxy_operator.docker.planner.report import plan_text, render
 from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {
@@ -93,7 +93,7 @@ ACTIONS: list[tuple[Action, str]] = [
 
 @pytest.mark.parametrize(("action", "text"), ACTIONS)
 def test_each_action_is_one_line(action: Action, text: str) -> None:
-    assert line(action) == text
+    assert str(action) == text
 
 
 def test_a_plan_is_its_lines() -> None:
@@ -172,4 +172,4 @@ def test_hostile_names_do_no_harm(name: str, columns: int, lines: int | None) ->
         assert text.isprintable()
         assert width(text) >= 0
     action = Connect(name, name, (name,))
-    assert line(action).isprintable()
+    assert str(action).isprintable()

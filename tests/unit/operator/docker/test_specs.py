@@ -7,16 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import parse_settings
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
-    Own,
+    OwnLabels,
     admin_port,
     container_config,
-    fingerprint,
     is_proxy_name,
     own_labels,
+    proxy_fingerprint,
     proxy_name,
     read_own,
     reserved_ports,
@@ -24,6 +23,7 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
     sandbox_name,
 )
+from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
 
 SANDBOX = SandboxSpec("s", KEY, PortRange(11400, 11401), "f1", "0-rosproxy")
@@ -96,24 +96,7 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
     """A second roscore is often at 11312, where the admin endpoint usually is."""
     key = Key(f"http://robot:{port}", HERE)
     body = container_config(replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
-    env = dict(pair.split("=", 1) for pair in body["Env"])
-    options = {
-        "master_uri": env["ROS_MASTER_URI"],
-        "advertise_host": env["ROSPROXY_ADVERTISE_HOST"],
-        "port_range": env["ROSPROXY_PORT_RANGE"],
-        "master_port": int(env["ROSPROXY_MASTER_PORT"]),
-        "admin_bind": env["ROSPROXY_ADMIN_BIND"],
-        "admin_token": env["ROSPROXY_ADMIN_TOKEN"],
-        "master_address": env["ROSPROXY_MASTER_ADDRESS"],
-        "bind": "0.0.0.0",
-        "slave_control": "any",
-        "probe_interval": 5.0,
-        "probe_timeout": 3.0,
-        "cleanup_after": 30.0,
-        "linger": 30.0,
-        "master_interval": 2.0,
-    }
-    settings = parse_settings(options)
+    settings = settings_of(dict(pair.split("=", 1) for pair in body["Env"]))
     assert settings.admin.port == admin_port(key)
     assert reserved_ports(key) == {port, settings.admin.port}
 
@@ -127,16 +110,18 @@ def test_what_makes_a_sandbox_anew() -> None:
 
 
 def test_what_makes_a_proxy_anew() -> None:
-    now = fingerprint(KEY, RANGE, SETTINGS, IMAGE)
-    assert now == fingerprint(KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE)
-    assert now != fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
-    assert now != fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
-    assert now != fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
+    now = proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE)
+    assert now == proxy_fingerprint(
+        KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE
+    )
+    assert now != proxy_fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
+    assert now != proxy_fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
+    assert now != proxy_fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
 
 
 def test_labels_are_read_back() -> None:
-    assert read_own(own_labels(SANDBOX)) == Own("ports", KEY, PortRange(11400, 11401), "f1")
-    assert read_own(own_labels(PROXY)) == Own("proxy", KEY, PortRange(11400, 11401), "f2")
+    assert read_own(own_labels(SANDBOX)) == OwnLabels("ports", KEY, PortRange(11400, 11401), "f1")
+    assert read_own(own_labels(PROXY)) == OwnLabels("proxy", KEY, PortRange(11400, 11401), "f2")
 
 
 @pytest.mark.parametrize(

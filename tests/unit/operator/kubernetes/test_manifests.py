@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import Settings, parse_settings
 from rosproxy_operator.kubernetes.planner import manifests, objects
 from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
 from rosproxy_operator.kubernetes.planner.model import Json, MasterSpec
+from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
 
@@ -27,21 +27,6 @@ def container(place: Site | None = None, **changes: Any) -> Json:
 
 def env(place: Site | None = None, **changes: Any) -> dict[str, str]:
     return {one["name"]: one["value"] for one in container(place, **changes)["env"]}
-
-
-def settings_of(variables: dict[str, str]) -> Settings:
-    """The settings of the proxy that is started with such variables."""
-    variables = {name.removeprefix("ROSPROXY_").lower(): text for name, text in variables.items()}
-    defaults = {
-        "bind": "0.0.0.0", "probe_interval": 5.0, "probe_timeout": 3.0, "linger": 30.0,
-        "master_interval": 2.0,
-    }  # fmt: skip
-    numbers = {"master_port": int, "publish_master": int, "cleanup_after": float}
-    read = {name: numbers.get(name, str)(text) for name, text in variables.items()}
-    networks = str(read.pop("inside_networks", "")).split()
-    return parse_settings(
-        {**defaults, **read, "master_uri": read["ros_master_uri"], "inside_network": networks}
-    )
 
 
 def test_the_proxy_understands_all_of_its_variables() -> None:

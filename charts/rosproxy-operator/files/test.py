@@ -1,0 +1,79 @@
+"""Outside: a node that is not proxied sends a message to one that is, and waits for the answer."""
+
+import os
+import sys
+import time
+import uuid
+from urllib.parse import urlsplit
+
+NAMESPACE, ROSPROXY = os.environ["NAMESPACE"], os.environ["ROSPROXY"]
+ECHO = "/" + os.environ["NODE_NAME"]
+STARTED = time.monotonic()
+DEADLINE = STARTED + float(os.environ["TIMEOUT"])
+# The cluster may have no DNS; the kubelet gives each pod the addresses of Services.
+HOST = os.environ.get(os.environ["MASTER_HOST_VARIABLE"]) or os.environ["MASTER_NAME"]
+os.environ["ROS_MASTER_URI"] = "http://%s:11311" % ("[%s]" % HOST if ":" in HOST else HOST)
+
+import rosgraph  # noqa: E402 - they read ROS_MASTER_URI
+import rospy  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+
+def say(text):
+    print("%6.1f s  %s" % (time.monotonic() - STARTED, text), flush=True)
+
+
+def wait_for(found, what, advice):
+    """Wait until something is found, and return it; give up with an advice."""
+    why = ""
+    while time.monotonic() < DEADLINE:
+        try:
+            value = found()
+        except (OSError, rosgraph.MasterException) as error:
+            value, why = None, " (%s)" % error
+        if value:
+            return value
+        time.sleep(0.5)
+    say("FAILED: %s%s. %s" % (what, why, advice))
+    sys.exit(1)
+
+
+def proxied_address():
+    """Where outside finds the echo node; a proxy adds the node's own address as a path."""
+    uri = urlsplit(master.lookupNode(ECHO))
+    return uri.netloc if uri.path.strip("/") else None
+
+
+def hear_answer():
+    questions.publish(question)
+    return question in answers
+
+
+master = rosgraph.Master("/rosproxy_test")
+wait_for(
+    master.getPid,
+    "the master at %s does not answer" % os.environ["ROS_MASTER_URI"],
+    "Look at the test's pods: kubectl -n %s get pods" % NAMESPACE,
+)
+say("the master answers at " + os.environ["ROS_MASTER_URI"])
+
+address = wait_for(
+    proxied_address,
+    "no node %s is registered through a proxy" % ECHO,
+    "While the test runs, look at: kubectl -n %s describe rosproxy %s; is the operator ready? "
+    "A pod made while it was not is not wired." % (NAMESPACE, ROSPROXY),
+)
+say("the node in the labelled pod is registered as " + address)
+
+answers = set()
+question = uuid.uuid4().hex
+rospy.init_node("rosproxy_test", anonymous=True, disable_signals=True)
+rospy.Subscriber(ECHO + "/pong", String, lambda message: answers.add(message.data))
+questions = rospy.Publisher(ECHO + "/ping", String, queue_size=10)
+wait_for(
+    hear_answer,
+    "no message comes through %s" % address,
+    "Can pods connect to hostPorts of their nodes? A firewall or a network policy may be in "
+    "the way.",
+)
+say("PASSED: a message went to the pod and back, through " + address)

@@ -1,0 +1,21 @@
+{{/* What the operator changes: everywhere, or in the namespaces that are named. */}}
+{{- define "rosproxy.writeRules" -}}
+# Proxies are pods: created for the nodes that need one, deleted when they don't, and patched for one
+# thing, another image.
+- apiGroups: [""]
+  resources: [pods]
+  verbs: [create, delete, patch]
+# One Service for each RosProxy, under which pods find the proxy on their own node.
+- apiGroups: [""]
+  resources: [services]
+  verbs: [create, delete]
+# Events on RosProxies and on pods; one that comes again is read and counted. And the kubelet's events
+# on a proxy that does not start: they alone say that a port is taken.
+- apiGroups: [""]
+  resources: [events]
+  verbs: [create, get, list, patch]
+# The status of RosProxies; their spec is the user's.
+- apiGroups: [rosproxy.io]
+  resources: [rosproxies/status]
+  verbs: [patch]
+{{- end -}}

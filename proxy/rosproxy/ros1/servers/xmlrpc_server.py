@@ -1,0 +1,229 @@
+"""The HTTP server of XML-RPC: aiohttp reads requests, a service makes the replies.
+
+What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
+no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
+"""
+
+import asyncio
+import logging
+import socket
+from collections.abc import Awaitable, Callable
+from copy import copy
+from functools import lru_cache
+from typing import Any
+
+from aiohttp import HttpVersion, HttpVersion11, web
+
+from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
+from rosproxy.net.http_client import pieces, read_bounded
+from rosproxy.net.sockets import reset_on_close
+from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+
+log = logging.getLogger(__name__)
+
+BODY_TIMEOUT = 60.0
+"""Seconds in which a request's body must arrive."""
+HEADER_TIMEOUT = 30.0
+"""Seconds in which the header of a connection's first request must arrive."""
+STOP_TIMEOUT = 0.5
+"""Seconds that calls under way get to end when the server stops."""
+
+
+class IncomingCall:
+    """One XML-RPC request: its body, who sent it and where it arrived."""
+
+    def __init__(self, request: web.BaseRequest, body: bytes) -> None:
+        protocol = request.protocol
+        self.body = body
+        self.path = request.path_qs
+        self.source = _address(protocol.peername).host
+        self.local = _address(protocol.sockname)
+        self.host_header = request.headers.get("Host", "")
+        self.loop_id = request.headers.get(LOOP_HEADER, "")
+
+    def comes_from(self, instance: str) -> bool:
+        """Whether a proxy itself made this call."""
+        return self.loop_id.partition(" ")[0] == instance
+
+    def with_body(self, body: bytes) -> "IncomingCall":
+        """The same call with another body."""
+        other = copy(self)
+        other.body = body
+        return other
+
+    @property
+    def reached_locally(self) -> bool:
+        """Whether the caller named the very address and port of this machine that it reached.
+
+        So does a neighbour that was given the proxy's inside address; whoever comes through a
+        published port names the host instead.
+        """
+        return parse_host_port(self.host_header) == self.local
+
+
+XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
+"""Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
+
+
+class PortConnections:
+    """The connections of a port; those that have ended are forgotten now and then."""
+
+    def __init__(self) -> None:
+        self._known: list[web.RequestHandler] = []
+        self._enough = 16
+
+    def add(self, handler: web.RequestHandler) -> None:
+        """Take one in; all are looked at only once their number has doubled."""
+        self._known.append(handler)
+        if len(self._known) > self._enough:
+            self._known = self.alive()
+            self._enough = max(16, 2 * len(self._known))
+
+    def alive(self) -> list[web.RequestHandler]:
+        """Those that are open."""
+        return [handler for handler in self._known if handler.transport is not None]
+
+
+class XmlRpcServer:
+    """Turns accepted sockets into XML-RPC calls to a service."""
+
+    def __init__(self, service: XmlRpcService, greeting: str) -> None:
+        self._service, self._greeting = service, greeting
+        self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
+        self._by_port: dict[int, PortConnections] = {}
+        self._busy: set[web.RequestHandler] = set()
+        self._mute: set[web.RequestHandler] = set()
+
+    async def serve(self, conn: socket.socket) -> None:
+        """Take over a connection. Raises OSError if it has ended already."""
+        port, loop = conn.getsockname()[1], asyncio.get_running_loop()
+        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
+        self._mute.add(handler)
+        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
+        self._by_port.setdefault(port, PortConnections()).add(handler)
+
+    def connections(self, port: int) -> int:
+        """How many connections are open that came in on a port."""
+        return len(self._by_port[port].alive()) if port in self._by_port else 0
+
+    def close_port(self, port: int) -> None:
+        """Let the connections that came in on a port end with the calls that they carry now."""
+        for handler in self._by_port.pop(port, PortConnections()).alive():
+            if handler in self._busy:
+                handler.close()
+            else:
+                handler.force_close()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._server.shutdown(STOP_TIMEOUT)
+
+    def _close_mute(self, handler: web.RequestHandler) -> None:
+        if handler in self._mute:
+            self._mute.discard(handler)
+            handler.force_close()
+
+    async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        self._mute.discard(request.protocol)
+        self._busy.add(request.protocol)
+        try:
+            return await self._respond(request)
+        finally:
+            self._busy.discard(request.protocol)
+
+    async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
+        if request.method in ("GET", "HEAD"):
+            return web.Response(text=self._greeting)
+        if request.method != "POST":
+            return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
+        body = await _body(request)
+        return await self._answer(request, body) if isinstance(body, bytes) else body
+
+    async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
+        try:
+            reply = await self._service(IncomingCall(request, body))
+        except xmlrpc.XmlRpcError as error:
+            reply = xmlrpc.dump_fault(error.code, f"rosproxy: {error}")
+        except Unreachable as error:
+            log.debug("no answer for %s: %s", request.remote, error)
+            return _refuse(request)
+        except Exception:
+            log.exception("a call from %s failed in the proxy", request.remote)
+            reply = xmlrpc.dump_fault(xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see its log")
+        return _Reply(reply)
+
+
+class _Reply(web.StreamResponse):
+    """An XML-RPC document with status 200.
+
+    Its header is written here: aiohttp takes about as long for one as reading a document takes.
+    """
+
+    def __init__(self, document: bytes) -> None:
+        super().__init__()
+        self._document = document
+        self._lasts = False
+
+    @property
+    def keep_alive(self) -> bool:
+        """Whether the connection serves another request."""
+        return self._lasts
+
+    async def prepare(self, request: web.BaseRequest) -> None:
+        """Send it all. Raises ConnectionError."""
+        self._lasts = request.keep_alive
+        head = _head(request.version, self._lasts, len(self._document))
+        for piece in pieces(head, self._document):
+            await request.writer.write(piece)
+        await request.writer.drain()
+
+    async def write_eof(self, data: bytes = b"") -> None:
+        """Nothing is left to send."""
+
+
+def _head(version: HttpVersion, lasts: bool, size: int) -> bytes:
+    """A reply's header; that the connection lasts is said where HTTP's version doesn't imply it."""
+    lines = f"HTTP/{version.major}.{version.minor} 200 OK\r\nContent-Type: text/xml\r\n"
+    if lasts != (version >= HttpVersion11):
+        lines += f"Connection: {'keep-alive' if lasts else 'close'}\r\n"
+    return f"{lines}Content-Length: {size}\r\n\r\n".encode()
+
+
+@lru_cache(maxsize=1024)
+def _address(found: Any) -> HostPort:
+    return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
+
+
+async def _body(request: web.BaseRequest) -> bytes | web.StreamResponse:
+    """A request's body, or the response to one that can't be read."""
+    try:
+        if request.content.is_eof():  # it came together with the header
+            return await read_bounded(request.content)
+        async with asyncio.timeout(BODY_TIMEOUT):
+            _invite(request)
+            return await read_bounded(request.content)
+    except TimeoutError:
+        return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
+    except ValueError as error:
+        return web.Response(status=413, text=f"{error}\n")
+    except web.RequestPayloadError as error:
+        return web.Response(status=400, text=f"{error}\n")
+    except ConnectionResetError:
+        return _refuse(request)
+
+
+def _invite(request: web.BaseRequest) -> None:
+    """Ask for the body, if the client waits to be asked."""
+    waits = request.headers.get("Expect", "").lower() == "100-continue"
+    if waits and request.version >= HttpVersion11 and request.transport is not None:
+        request.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+
+
+def _refuse(request: web.BaseRequest) -> web.StreamResponse:
+    """Reset the connection: what a caller finds whose peer is gone; ROS's clients try again."""
+    transport = request.transport
+    if transport is not None:
+        reset_on_close(transport.get_extra_info("socket"))
+        transport.abort()
+    return web.Response(status=503)

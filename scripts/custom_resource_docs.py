@@ -1,0 +1,106 @@
+"""Write the tables of the RosProxy's fields in docs/reference/custom-resource.md.
+
+    python scripts/custom_resource_docs.py [--check]
+
+They stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->`` (and
+the same for the status), and are made from manifests/install.yaml. The chart's
+values are in its README, by helm-docs. With ``--check`` nothing is written; the exit code tells
+whether the page is as it should be.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs/reference/custom-resource.md"
+INSTALL = ROOT / "manifests/install.yaml"
+
+
+def custom_resource() -> Mapping[str, Any]:
+    """The custom resource definition, as it is installed."""
+    documents = yaml.safe_load_all(INSTALL.read_text())
+    return next(one for one in documents if one["kind"] == "CustomResourceDefinition")
+
+
+def fields_table(part: str, definition: Mapping[str, Any]) -> str:
+    """The fields of the spec or of the status, as a table."""
+    schema = definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"][part]
+    rows = ["| field | type | default | meaning |", "|---|---|---|---|", *_fields(schema, part)]
+    return "\n".join(rows)
+
+
+def _fields(schema: Mapping[str, Any], path: str) -> Iterator[str]:
+    required = schema.get("required", [])
+    for name, field in schema.get("properties", {}).items():
+        where = f"{path}.{name}"
+        default = "required" if name in required else _default(field)
+        yield f"| `{where}` | {_type(field)} | {default} | {_meaning(field)} |"
+        yield from _fields(field, where)
+        if _is_list_of_objects(field):
+            yield from _fields(field["items"], f"{where}[]")
+
+
+def _is_list_of_objects(field: Mapping[str, Any]) -> bool:
+    return bool(field.get("type") == "array" and field["items"].get("type") == "object")
+
+
+def _default(field: Mapping[str, Any]) -> str:
+    if "default" not in field:
+        return ""
+    value = field["default"]
+    return f"`{value if isinstance(value, str) else json.dumps(value)}`"
+
+
+def _type(field: Mapping[str, Any]) -> str:
+    if "enum" in field:
+        return ", ".join(f"`{value}`" for value in field["enum"])
+    kind = str(field["type"])
+    if kind == "integer" and "minimum" in field:
+        return f"{field['minimum']} to {field['maximum']}"
+    if kind == "array":
+        return f"list of {_plural(str(field['items']['type']))}"
+    if "additionalProperties" in field:
+        return "map"
+    return kind
+
+
+def _plural(kind: str) -> str:
+    return f"{kind}s"
+
+
+def _meaning(field: Mapping[str, Any]) -> str:
+    text = str(field["description"])
+    rules = field.get("x-kubernetes-validations", [])
+    refusals = [f"Refused with: *{rule['message']}*." for rule in rules]
+    return " ".join([text, *refusals]).replace("|", r"\|")
+
+
+def page(text: str) -> str:
+    """The page with its tables made anew."""
+    definition = custom_resource()
+    tables = {
+        "fields of the spec": fields_table("spec", definition),
+        "fields of the status": fields_table("status", definition),
+    }
+    for name, table in tables.items():
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        before, rest = text.split(begin)
+        text = f"{before}{begin}\n{table}\n\n{end}{rest.split(end)[1]}"
+    return text
+
+
+def main() -> int:
+    text = PAGE.read_text()
+    wanted = page(text)
+    if "--check" not in sys.argv:
+        PAGE.write_text(wanted)
+    return int("--check" in sys.argv and text != wanted)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
