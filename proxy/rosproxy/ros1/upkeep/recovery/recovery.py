@@ -16,7 +16,6 @@ If ports are others after a start, look here: the log names each claim that was 
 import asyncio
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
@@ -164,9 +163,7 @@ class Recovery:
             await self._registrar.clean_up(endpoint)
             self._leases.end(endpoint)
             return
-        endpoint.tcpros_port, endpoint.trusted = info.tcpros_port, True
-        if endpoint.health.pid is None:
-            endpoint.health.pid = info.pid
+        endpoint.note_verified(info.pid, info.tcpros_port)
         self._leases.open(endpoint)
         await self._note_whether_named(endpoint)
         await self._registrar.register_missing(endpoint, info)
@@ -176,7 +173,7 @@ class Recovery:
         address = endpoint.place.address
         addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
         if endpoint.place.address == address:
-            endpoint.place = replace(endpoint.place, named=address in addresses)
+            endpoint.note_named(address in addresses)
 
     async def _announce(self, endpoint: Endpoint) -> None:
         """Announce an endpoint, together with those that came up during the one before.
