@@ -113,11 +113,9 @@ class Prober:
         """End the lease of an endpoint that nobody has needed for long enough."""
         now = self._context.now()
         if not policy.is_unused(endpoint):
-            endpoint.idle_since = None
+            endpoint.note_used()
             return
-        if endpoint.idle_since is None:
-            endpoint.idle_since = now
         lasts = policy.lease_lasts(endpoint, self._context.settings.linger)
-        if now - endpoint.idle_since >= lasts:
+        if endpoint.note_unused(now) >= lasts:
             log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
             self._leases.end(endpoint)
