@@ -73,7 +73,7 @@ lock: ## pin what is installed anew, into constraints.txt
 	@scripts/lock.sh constraints.txt
 
 .PHONY: manifests
-manifests: $(VENV)/.dev ## write manifests/install.yaml and the tables of docs/kubernetes.md from the chart
+manifests: $(VENV)/.dev ## write manifests/install.yaml, the chart's README and the tables of the RosProxy's fields from the chart
 	@PYTHON=$(BIN)/python scripts/manifests.sh
 
 .PHONY: image

@@ -47,5 +47,6 @@ for name in kube-apiserver kube-controller-manager kube-scheduler kubelet kube-p
 done
 build etcd etcd go.etcd.io/etcd/server/v3
 build helm helm helm.sh/helm/v3/cmd/helm
+build helm-docs helm-docs github.com/norwoodj/helm-docs/cmd/helm-docs
 gcc -static -Os -s -o "$bin/pause" "$tools/pause.c"
 echo "$pins" >"$bin/pins"

@@ -12,7 +12,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 ROOT = Path(__file__).resolve().parents[2]
-CHART = ROOT / "charts/rosproxy"
+CHART = ROOT / "charts/rosproxy-operator"
 NAMESPACE = "rosproxy-system"
 KUBERNETES = "1.30.0"
 """A helm that was not built by its own makefile takes each cluster for an ancient one."""

@@ -1,10 +1,10 @@
-"""The custom resource definition, compared with what the controller reads and writes."""
+"""The custom resource definition, compared with what the operator reads and writes."""
 
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from scripts.chart_docs import custom_resource
+from scripts.custom_resource_docs import custom_resource
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import names
@@ -42,7 +42,7 @@ SPEC = dict(fields(SCHEMA["properties"]["spec"], "spec"))
 STATUS = dict(fields(SCHEMA["properties"]["status"], "status"))
 
 
-def test_names_are_the_controllers() -> None:
+def test_names_are_the_operators() -> None:
     spec = DEFINITION["spec"]
     assert f"{spec['group']}/{VERSION['name']}" == names.API_VERSION
     assert spec["names"]["plural"] == names.PLURAL
@@ -98,15 +98,15 @@ def with_defaults(value: Any, schema: Json) -> Any:
         {"master": {"uri": "http://robot:11311"}, "policy": {}, "resources": {}},
     ],
 )
-def test_defaults_are_the_controllers(spec: Json) -> None:
-    """The controller reads an object the same, whether or not the API server has completed it."""
+def test_defaults_are_the_operators(spec: Json) -> None:
+    """The operator reads an object the same, whether or not the API server has completed it."""
     bare = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1}, "spec": spec}
     completed = with_defaults(bare, SCHEMA)
     assert completed != bare
     assert rosproxy(completed) == rosproxy(bare)
 
 
-def test_limits_are_the_controllers() -> None:
+def test_limits_are_the_operators() -> None:
     assert SPEC["spec.ports"]["maximum"] == MOST_PORTS
     assert f"size() <= {MOST_NAME}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
 

@@ -9,7 +9,7 @@ import pytest
 
 from rosproxy import __version__
 from rosproxy_operator.cli import main
-from rosproxy_operator.kubernetes.settings import WebhookSettings, parse_kubernetes_settings
+from rosproxy_operator.kubernetes.settings import WebhookSettings, make_kubernetes_settings
 from tests.chart.chart import (
     CHART,
     NAMESPACE,
@@ -86,11 +86,11 @@ def check_references(found: list[Json], values: Any) -> None:
 
 @pytest.mark.parametrize("combination", ALL)
 def test_arguments(combination: str) -> None:
-    """The controller can use its arguments, and they mean what the values say."""
-    (pod,) = controller(rendered(combination))
+    """The operator can use its arguments, and they mean what the values say."""
+    (pod,) = operator(rendered(combination))
     command, *words = pod["containers"][0]["args"]
     context = main.commands[command].make_context(command, words)
-    settings = parse_kubernetes_settings(context.params)
+    settings = make_kubernetes_settings(context.params)
     values: Json = dict(ALL[combination])
     assert settings.namespaces == tuple(values.get("namespaces", ()))
     image = values.get("proxy", {}).get("image", {"repository": "rosproxy", "tag": __version__})
@@ -117,17 +117,17 @@ def check_webhook(webhook: WebhookSettings | None, ports: Any, found: list[Json]
         assert webhook.configuration == configurations[0]["metadata"]["name"]
 
 
-def controller(found: Any) -> list[Json]:
+def operator(found: Any) -> list[Json]:
     return [
         one["spec"]["template"]["spec"]
         for one in of_kind(list(found), "Deployment")
-        if one["metadata"]["labels"]["app.kubernetes.io/component"] == "controller"
+        if one["metadata"]["labels"]["app.kubernetes.io/component"] == "operator"
     ]
 
 
 @pytest.mark.parametrize("combination", ALL)
 def test_pods_are_restricted(combination: str) -> None:
-    """The Pod Security Standard "restricted", for the controller and for the test's pods."""
+    """The Pod Security Standard "restricted", for the operator and for the test's pods."""
     found = list(rendered(combination))
     pods = [one["spec"]["template"]["spec"] for one in of_kind(found, "Deployment")]
     pods += [one["spec"] for one in of_kind(found, "Pod")]
@@ -148,9 +148,9 @@ def test_pods_are_restricted(combination: str) -> None:
             assert not [port for port in container.get("ports", []) if "hostPort" in port]
 
 
-def test_one_controller() -> None:
+def test_one_operator() -> None:
     (deployment,) = [one for one in of_kind(objects(), "Deployment")
-                     if one["metadata"]["name"] == "rosproxy"]  # fmt: skip
+                     if one["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
     assert deployment["spec"]["replicas"] == 1
     assert deployment["spec"]["strategy"] == {"type": "Recreate"}
     container = deployment["spec"]["template"]["spec"]["containers"][0]
@@ -166,7 +166,12 @@ def test_webhook() -> None:
     assert webhook["failurePolicy"] == "Ignore"
     assert webhook["timeoutSeconds"] == 5
     assert webhook["clientConfig"] == {
-        "service": {"name": "rosproxy", "namespace": NAMESPACE, "path": "/wire", "port": 443}
+        "service": {
+            "name": "rosproxy-operator",
+            "namespace": NAMESPACE,
+            "path": "/wire",
+            "port": 443,
+        }
     }
     assert webhook["objectSelector"]["matchExpressions"] == [
         {"key": "rosproxy.io/inject", "operator": "Exists"},
@@ -198,7 +203,7 @@ def test_cert_manager() -> None:
     found = objects(OPTIONS["webhook"]["cert-manager"])
     (certificate,) = of_kind(found, "Certificate")
     (issuer,) = of_kind(found, "Issuer")
-    assert certificate["spec"]["dnsNames"] == [f"rosproxy.{NAMESPACE}.svc"]
+    assert certificate["spec"]["dnsNames"] == [f"rosproxy-operator.{NAMESPACE}.svc"]
     assert certificate["spec"]["issuerRef"] == {
         "kind": "Issuer", "name": issuer["metadata"]["name"],
     }  # fmt: skip
@@ -206,7 +211,7 @@ def test_cert_manager() -> None:
     assert configuration["metadata"]["annotations"] == {
         "cert-manager.io/inject-ca-from": f"{NAMESPACE}/{certificate['metadata']['name']}"
     }
-    (pod,) = controller(found)
+    (pod,) = operator(found)
     (volume,) = pod["volumes"]
     assert volume["secret"]["secretName"] == certificate["spec"]["secretName"]
     (mount,) = pod["containers"][0]["volumeMounts"]
@@ -231,9 +236,11 @@ def test_definition_is_kept() -> None:
 @pytest.mark.parametrize(
     ("release", "values", "name"),
     [
-        ("rosproxy", {}, "rosproxy"),
-        ("my", {}, "my-rosproxy"),
-        ("my-rosproxy", {}, "my-rosproxy"),
+        ("rosproxy", {}, "rosproxy-operator"),
+        ("rosproxy-operator", {}, "rosproxy-operator"),
+        ("my", {}, "my-rosproxy-operator"),
+        ("my-rosproxy", {}, "my-rosproxy-operator"),
+        ("my-rosproxy-operator", {}, "my-rosproxy-operator"),
         ("my", {"nameOverride": "proxies"}, "my-proxies"),
         ("my", {"fullnameOverride": "other"}, "other"),
         ("r" * 53, {}, f"{'r' * 40}"),
@@ -268,7 +275,7 @@ def test_everything_of_the_test_is_removed() -> None:
         ({"namespaces": ["a", "b"], "tests": {"namespace": "b"}}, "b"),
     ],
 )
-def test_the_test_runs_where_the_controller_may(values: Json, namespace: str) -> None:
+def test_the_test_runs_where_the_operator_may(values: Json, namespace: str) -> None:
     hooks = [one for one in objects(values) if "helm.sh/hook" in str(one["metadata"])]
     assert {one["metadata"]["namespace"] for one in hooks} == {namespace}
 
@@ -277,9 +284,9 @@ def test_the_test_without_a_webhook() -> None:
     """Nobody wires its pod then, so it is wired in its template."""
     found = objects(merged(OPTIONS["webhook"]["off"]))
     (echo,) = [one for one in of_kind(found, "Deployment")
-               if one["metadata"]["name"] == "rosproxy-test-echo"]  # fmt: skip
+               if one["metadata"]["name"] == "rosproxy-operator-test-echo"]  # fmt: skip
     env = {one["name"]: one for one in echo["spec"]["template"]["spec"]["containers"][0]["env"]}
-    assert env["ROS_MASTER_URI"]["value"] == "http://rosproxy-rosproxy-test:11311"
+    assert env["ROS_MASTER_URI"]["value"] == "http://rosproxy-rosproxy-operator-test:11311"
 
 
 @pytest.fixture(scope="session")

@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show with a failure what the controller has logged and what there is in the cluster."""
+    """Show with a failure what the operator has logged and what there is in the cluster."""
     report = yield
     if report.failed and report.when in ("setup", "call") and KUBECONFIG.exists():
         try:
@@ -47,7 +47,7 @@ def pytest_runtest_makereport(
 
 
 def _sections() -> Iterator[tuple[str, str]]:
-    for body in api.objects("pods", release.NAMESPACE, release.CONTROLLERS):
+    for body in api.objects("pods", release.NAMESPACE, release.OPERATORS):
         name = body["metadata"]["name"]
         yield name, api.logs(release.NAMESPACE, name)[-8000:]
     yield "the cluster", kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
@@ -88,10 +88,10 @@ def cluster(*command: str) -> None:
 def _release(_cluster: None) -> Iterator[None]:
     """The chart, installed."""
     release.remove()
-    others = api.objects("pods", "", release.CONTROLLERS)
-    assert not others, f"another controller is at work in this cluster: {others[0]['metadata']}"
+    others = api.objects("pods", "", release.OPERATORS)
+    assert not others, f"another operator is at work in this cluster: {others[0]['metadata']}"
     release.install()
-    release.wait_controller()
+    release.wait_operator()
     yield
     release.remove()
 

@@ -13,7 +13,9 @@ from tests.kubernetes.pods import Namespace, Pod
 
 NAMESPACE = "rosproxy-system"
 NAME = "rosproxy"
-CONTROLLERS = "app.kubernetes.io/component=controller"
+FULL_NAME = "rosproxy-operator"
+"""What the chart calls the objects of the release."""
+OPERATORS = "app.kubernetes.io/component=operator"
 _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
     "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
@@ -54,41 +56,41 @@ def remove() -> None:
     wait_until(lambda: not api.get("namespaces", "", NAMESPACE), 60, f"{NAMESPACE} is gone")
 
 
-def controller() -> Pod:
-    """The controller's pod, the newest if there are two."""
-    found = api.objects("pods", NAMESPACE, CONTROLLERS)
+def operator() -> Pod:
+    """The operator's pod, the newest if there are two."""
+    found = api.objects("pods", NAMESPACE, OPERATORS)
     alive = [body for body in found if "deletionTimestamp" not in body["metadata"]]
-    assert alive, "no controller"
+    assert alive, "no operator"
     newest = max(alive, key=lambda body: str(body["metadata"]["creationTimestamp"]))
     return Pod(NAMESPACE, newest["metadata"]["name"])
 
 
-def kill_controller() -> None:
-    """Kill the controller's process and delete its pod.
+def kill_operator() -> None:
+    """Kill the operator's process and delete its pod.
 
     Without the latter the kubelet waits 10 seconds, 20, 40, … before it starts the next.
     """
-    pod = controller()
+    pod = operator()
     pod.crash()
     pod.remove(grace=0)
 
 
-def wait_controller(seconds: float = 60) -> None:
-    """Wait until a controller is ready, no other is there, and its webhook is reached.
+def wait_operator(seconds: float = 60) -> None:
+    """Wait until an operator is ready, no other is there, and its webhook is reached.
 
     For a second after that it is ready, kube-proxy still leads to the one before.
     """
 
     def there() -> bool:
-        found = api.objects("pods", NAMESPACE, CONTROLLERS)
-        return len(found) == 1 and controller().ready and _webhook_answers()
+        found = api.objects("pods", NAMESPACE, OPERATORS)
+        return len(found) == 1 and operator().ready and _webhook_answers()
 
-    wait_until(there, seconds, lambda: str(api.objects("pods", NAMESPACE, CONTROLLERS)))
+    wait_until(there, seconds, lambda: str(api.objects("pods", NAMESPACE, OPERATORS)))
 
 
 def _webhook_answers() -> bool:
     """Whether it warns of a labelled pod where there is no RosProxy, or whether there is none."""
-    if not api.get("mutatingwebhookconfigurations", "", NAME):
+    if not api.get("mutatingwebhookconfigurations", "", FULL_NAME):
         return True
     body = Namespace("default").pod_body("unused", "true")
     return api.dry_run(body)[1] != ""
@@ -98,7 +100,7 @@ def _apply(verb: str, **values: Any) -> None:
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
         json.dump(_merged(_IMAGES, values), file)
         file.flush()
-        helm(verb, NAME, ROOT / "charts/rosproxy", "--namespace", NAMESPACE,
+        helm(verb, NAME, ROOT / "charts/rosproxy-operator", "--namespace", NAMESPACE,
              "--values", file.name, "--wait", "--timeout", "2m")  # fmt: skip
 
 

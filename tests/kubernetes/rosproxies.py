@@ -1,4 +1,4 @@
-"""RosProxies and what the controller makes of them."""
+"""RosProxies and what the operator makes of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

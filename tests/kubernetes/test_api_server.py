@@ -12,7 +12,7 @@ from tests.kubernetes.rosproxies import rosproxy
 from tests.kubernetes.traffic import flow
 
 
-def test_traffic_goes_on_and_the_controller_finds_back(net: Namespace, robot: Robot) -> None:
+def test_traffic_goes_on_and_the_operator_finds_back(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
         before, restarts = made.the_proxy(), _restarts()
@@ -29,9 +29,9 @@ def test_traffic_goes_on_and_the_controller_finds_back(net: Namespace, robot: Ro
         note(f"API server killed: up again after {up - killed:.1f} s; {gaps}; "
              f"a pod's proxy was made {found:.1f} s after it")  # fmt: skip
         made.the_proxy("node2")
-        assert _restarts() == restarts, "the controller needed a restart"
+        assert _restarts() == restarts, "the operator needed a restart"
 
 
 def _restarts() -> int:
-    status = release.controller().body["status"]["containerStatuses"][0]
+    status = release.operator().body["status"]["containerStatuses"][0]
     return int(status["restartCount"])

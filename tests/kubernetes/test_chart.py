@@ -17,7 +17,7 @@ from tests.kubernetes.rosproxies import NOWHERE, rosproxy
 
 FOREIGN = {"cert-manager.io/v1", "monitoring.coreos.com/v1"}
 """Groups whose definitions are not in this cluster."""
-SECRET = "rosproxy-webhook"
+SECRET = "rosproxy-operator-webhook"
 
 
 @pytest.fixture(scope="module")
@@ -173,19 +173,19 @@ def test_upgrade_keeps_the_certificate(restored: None) -> None:
     assert all(before)
     release.upgrade(webhook={"timeoutSeconds": 7}, commonLabels={"changed": "yes"})
     assert certificate() == before
-    (webhook,) = api.get("mutatingwebhookconfigurations", "", release.NAME)["webhooks"]
+    (webhook,) = api.get("mutatingwebhookconfigurations", "", release.FULL_NAME)["webhooks"]
     assert webhook["timeoutSeconds"] == 7
 
 
 def certificate() -> tuple[Any, Any]:
     """What the webhook shows, and what the API server is to believe."""
     secret = api.get("secrets", release.NAMESPACE, SECRET)
-    (webhook,) = api.get("mutatingwebhookconfigurations", "", release.NAME)["webhooks"]
+    (webhook,) = api.get("mutatingwebhookconfigurations", "", release.FULL_NAME)["webhooks"]
     return secret.get("data"), webhook["clientConfig"].get("caBundle")
 
 
 def test_deleted_certificate_is_made_anew(net: Namespace, restored: None) -> None:
-    """Helm restores the empty Secret, and the controller fills it in."""
+    """Helm restores the empty Secret, and the operator fills it in."""
     wait_until(lambda: certificate() != (None, None), 30, "a certificate")
     before = certificate()
     api.delete("secrets", release.NAMESPACE, SECRET)

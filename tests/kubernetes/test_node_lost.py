@@ -17,7 +17,7 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     # The API server reaches Services by way of node1: that is so in this cluster only.
     other, lost_node = "node1", "node2"
-    _controller_on(other, not_on=lost_node)
+    _operator_on(other, not_on=lost_node)
     with (
         flow(net, robot, "rospy", on=other) as unharmed,
         flow(net, robot, "roscpp", on=lost_node) as hit,
@@ -46,10 +46,10 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
         made.wait_for("Degraded", "False", seconds=60)
 
 
-def _controller_on(node: str, not_on: str) -> None:
-    """Have the controller run on a node."""
-    if release.controller().body["spec"]["nodeName"] != node:
+def _operator_on(node: str, not_on: str) -> None:
+    """Have the operator run on a node."""
+    if release.operator().body["spec"]["nodeName"] != node:
         kubectl("cordon", not_on)
-        release.kill_controller()
-        release.wait_controller()
+        release.kill_operator()
+        release.wait_operator()
         kubectl("uncordon", not_on)

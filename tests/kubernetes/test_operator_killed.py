@@ -1,4 +1,4 @@
-"""The controller is killed, in the middle of anything, and while pods come and go."""
+"""The operator is killed, in the middle of anything, and while pods come and go."""
 
 import time
 from collections.abc import Iterator
@@ -16,33 +16,31 @@ from tests.kubernetes.traffic import flow
 
 
 @contextmanager
-def no_controller() -> Iterator[None]:
-    """A cluster whose controller is away."""
+def no_operator() -> Iterator[None]:
+    """A cluster whose operator is away."""
     _scale(0)
-    wait_until(
-        lambda: not api.objects("pods", release.NAMESPACE, release.CONTROLLERS), 40, "it ends"
-    )
+    wait_until(lambda: not api.objects("pods", release.NAMESPACE, release.OPERATORS), 40, "it ends")
     try:
         yield
     finally:
         _scale(1)
-        release.wait_controller()
+        release.wait_operator()
 
 
 def _scale(replicas: int) -> None:
-    api.patch("deployments", release.NAMESPACE, release.NAME, {"spec": {"replicas": replicas}})
+    api.patch("deployments", release.NAMESPACE, release.FULL_NAME, {"spec": {"replicas": replicas}})
 
 
 def test_traffic_does_not_notice(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
         before, killed = made.the_proxy(), time.time()
-        release.kill_controller()
-        release.wait_controller()
+        release.kill_operator()
+        release.wait_operator()
         back = time.time() - killed
         traffic.wait(since=time.time())
         gaps = traffic.gaps(killed)
-        note(f"controller killed: ready again after {back:.1f} s; {gaps}")
+        note(f"operator killed: ready again after {back:.1f} s; {gaps}")
         assert max(gaps.outward, gaps.inward, gaps.service) < 1
         assert made.the_proxy().uid_then == before.uid_then
 
@@ -54,10 +52,10 @@ def test_killed_in_the_middle_of_making_a_proxy(delay: float, net: Namespace) ->
     net.idle(on="node1")
     net.idle(on="node2")
     time.sleep(delay)
-    release.kill_controller()
+    release.kill_operator()
     wait_until(lambda: {proxy.on for proxy in made.proxies} == {"node1", "node2"}, 60, made.tell)
     assert len(made.proxies) == 2
-    release.wait_controller()
+    release.wait_operator()
 
 
 def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
@@ -68,7 +66,7 @@ def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
     )
     with flow(net, robot, "rospy") as traffic:
         ports = made.the_proxy().ports
-        with no_controller():
+        with no_operator():
             pod = net.idle(on="node1")
             assert pod.environment == {}
             doomed.remove()

@@ -18,10 +18,10 @@ def baseline(_release: None) -> Iterator[Namespace]:
         yield made
 
 
-def test_controller_runs_where_restricted_is_enforced() -> None:
+def test_operator_runs_where_restricted_is_enforced() -> None:
     labels = api.get("namespaces", "", release.NAMESPACE)["metadata"]["labels"]
     assert labels[ENFORCE] == "restricted"
-    assert release.controller().ready
+    assert release.operator().ready
 
 
 def test_baseline_forbids_host_ports_and_it_is_said_what_to_do(baseline: Namespace) -> None:

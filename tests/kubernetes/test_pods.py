@@ -106,6 +106,6 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
         wait_until(lambda: not made.proxies, 40, made.tell)
     finally:
         kubectl("uncordon", "node2")
-    release.wait_controller()  # it may have been on that node
+    release.wait_operator()  # it may have been on that node
     talker(net, "rospy", name, on="node2")
     ear.wait_for("inside", since=time.time(), seconds=60)

@@ -7,6 +7,8 @@ from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import all_proxies, rosproxy
 
+NAMES = ("rosproxy", "rosproxy-operator")
+"""Of what the chart makes and of what the operator makes."""
 CLUSTER_WIDE = ("customresourcedefinitions", "clusterroles", "clusterrolebindings",
                 "mutatingwebhookconfigurations")  # fmt: skip
 NAMESPACED = ("pods", "services", "secrets", "serviceaccounts", "roles", "rolebindings",
@@ -19,7 +21,7 @@ def left() -> list[str]:
     for resource in CLUSTER_WIDE + NAMESPACED:
         for body in api.objects(resource):
             name = body["metadata"]["name"]
-            own = body["metadata"].get("labels", {}).get("app.kubernetes.io/name") == "rosproxy"
+            own = body["metadata"].get("labels", {}).get("app.kubernetes.io/name") in NAMES
             if own or ("rosproxy" in name and body["metadata"].get("namespace") != "default"):
                 found.append(f"{resource} {body['metadata'].get('namespace', '')}/{name}")
     return found

@@ -21,12 +21,12 @@ def test_helm_test() -> None:
     note(f"helm test: {time.time() - started:.0f} s")
 
 
-def test_upgrade_of_the_controller_only(net: Namespace, robot: Robot) -> None:
+def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "roscpp") as traffic:
         before, started = made.the_proxy(), time.time()
         release.upgrade(log={"level": "debug"})
-        release.wait_controller()
+        release.wait_operator()
         traffic.wait(since=time.time())
         gaps = traffic.gaps(started)
         assert max(gaps.outward, gaps.inward, gaps.service) < 1, gaps
@@ -53,7 +53,7 @@ def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
 def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
     """Pods start all the same; they set their master themselves."""
     release.upgrade(webhook={"enabled": False})
-    release.wait_controller()
+    release.wait_operator()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     wait_until(lambda: bool(made.service), 20, made.tell)
     pod = net.idle(on="node1")
@@ -64,4 +64,4 @@ def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
     robot.node("ear_by_hand", "rospy", "sub", "--topic", "/by_hand").wait_for("inside", seconds=60)
     assert robot.knows_proxied(talker.node, "node1")
     release.upgrade()
-    release.wait_controller()
+    release.wait_operator()

@@ -181,9 +181,9 @@ def rules() -> dict[str, set[str]]:
 
 def test_the_chart_grants_what_the_code_calls_and_no_more() -> None:
     granted: dict[str, set[str]] = {}
-    text = (ROOT / "charts/rosproxy/templates/rbac.yaml").read_text()
+    text = (ROOT / "charts/rosproxy-operator/templates/rbac.yaml").read_text()
     text = text.partition(".Values.rbac.aggregate")[0]  # what follows is for users
-    text += (ROOT / "charts/rosproxy/templates/_rules.tpl").read_text()
+    text += (ROOT / "charts/rosproxy-operator/templates/_rules.tpl").read_text()
     for resources, verbs in re.findall(
         r"resources: \[([^\]]+)\](?:\n *resourceNames:.*)?\n *verbs: \[([^\]]+)\]", text
     ):

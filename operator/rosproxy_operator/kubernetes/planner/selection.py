@@ -129,9 +129,9 @@ def _selects(rosproxy: RosProxy, pod: Pod) -> bool:
 
 
 def _is_ours(labels: Mapping[str, str]) -> bool:
-    """Whether labels are those of a proxy, or of the controller as its chart labels it."""
+    """Whether labels are those of a proxy, or of the operator as its chart labels it."""
     whole = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
-    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "controller" and "rosproxy" in whole)
+    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in whole)
 
 
 def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, str]) -> bool:

@@ -123,8 +123,8 @@ def test_a_pod_is_taken_by_its_label(label, taken):
         {INJECT: "false"},
         {INJECT: ""},
         own_labels("arm"),
-        {"app.kubernetes.io/name": "rosproxy", "app.kubernetes.io/component": "controller"},
-        {"app.kubernetes.io/part-of": "rosproxy", "app.kubernetes.io/component": "controller"},
+        {"app.kubernetes.io/name": "rosproxy", "app.kubernetes.io/component": "operator"},
+        {"app.kubernetes.io/part-of": "rosproxy", "app.kubernetes.io/component": "operator"},
     ],
 )
 def test_pods_that_no_selector_takes(labels):

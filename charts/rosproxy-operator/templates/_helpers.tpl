@@ -1,4 +1,7 @@
-{{/* The name of what belongs to this release. 40 characters leave room for suffixes. */}}
+{{/*
+The name of what belongs to this release: "rosproxy-operator" for the release rosproxy, else with the
+release's name before it. 40 characters leave room for suffixes.
+*/}}
 {{- define "rosproxy.fullname" -}}
 {{- if .Values.fullnameOverride -}}
 {{- .Values.fullnameOverride | trunc 40 | trimSuffix "-" -}}
@@ -6,17 +9,19 @@
 {{- $name := default .Chart.Name .Values.nameOverride -}}
 {{- if contains $name .Release.Name -}}
 {{- .Release.Name | trunc 40 | trimSuffix "-" -}}
+{{- else if and (eq $name "rosproxy-operator") (hasSuffix "rosproxy" .Release.Name) -}}
+{{- printf "%s-operator" .Release.Name | trunc 40 | trimSuffix "-" -}}
 {{- else -}}
 {{- printf "%s-%s" .Release.Name $name | trunc 40 | trimSuffix "-" -}}
 {{- end -}}
 {{- end -}}
 {{- end -}}
 
-{{/* What the controller's pod is selected by. Never to be changed: a Deployment's selector can't be. */}}
+{{/* What the operator's pod is selected by. Never to be changed: a Deployment's selector can't be. */}}
 {{- define "rosproxy.selectorLabels" -}}
 app.kubernetes.io/name: {{ default .Chart.Name .Values.nameOverride | trunc 63 | trimSuffix "-" }}
 app.kubernetes.io/instance: {{ .Release.Name }}
-app.kubernetes.io/component: controller
+app.kubernetes.io/component: operator
 {{- end -}}
 
 {{- define "rosproxy.commonLabels" -}}
@@ -56,7 +61,7 @@ app.kubernetes.io/part-of: rosproxy
 {{ include "rosproxy.fullname" . }}-webhook
 {{- end -}}
 
-{{/* Not empty if the controller makes the webhook's certificate itself. */}}
+{{/* Not empty if the operator makes the webhook's certificate itself. */}}
 {{- define "rosproxy.selfSigned" -}}
 {{- if and .Values.webhook.enabled (eq .Values.webhook.certificate.source "self-signed") -}}
 true
@@ -70,7 +75,7 @@ true
 {{- end -}}
 {{- end -}}
 
-{{/* Who is granted something: the controller's ServiceAccount. */}}
+{{/* Who is granted something: the operator's ServiceAccount. */}}
 {{- define "rosproxy.subjects" -}}
 - kind: ServiceAccount
   name: {{ include "rosproxy.serviceAccountName" . }}

@@ -1,4 +1,4 @@
-{{/* What the controller changes: everywhere, or in the namespaces that are named. */}}
+{{/* What the operator changes: everywhere, or in the namespaces that are named. */}}
 {{- define "rosproxy.writeRules" -}}
 # Proxies are pods: created for the nodes that need one, deleted when they don't, and patched for one
 # thing, another image.

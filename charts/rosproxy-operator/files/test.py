@@ -60,7 +60,7 @@ say("the master answers at " + os.environ["ROS_MASTER_URI"])
 address = wait_for(
     proxied_address,
     "no node %s is registered through a proxy" % ECHO,
-    "While the test runs, look at: kubectl -n %s describe rosproxy %s; is the controller ready? "
+    "While the test runs, look at: kubectl -n %s describe rosproxy %s; is the operator ready? "
     "A pod made while it was not is not wired." % (NAMESPACE, ROSPROXY),
 )
 say("the node in the labelled pod is registered as " + address)

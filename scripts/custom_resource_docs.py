@@ -1,15 +1,14 @@
-"""Write the tables of docs/reference/custom-resource.md, which are made from the chart.
+"""Write the tables of the RosProxy's fields in docs/reference/custom-resource.md.
 
-    python scripts/chart_docs.py [--check]
+    python scripts/custom_resource_docs.py [--check]
 
-Between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` stand the fields of the RosProxy, from the
-custom resource definition in manifests/install.yaml, and the chart's values with the comments of
-values.yaml. With ``--check`` nothing is written; the exit code tells whether the page is as it
-should be.
+They stand between ``<!-- fields of the spec -->`` and ``<!-- end of fields of the spec -->`` (and
+the same for the status), and are made from manifests/install.yaml. The chart's
+values are in its README, by helm-docs. With ``--check`` nothing is written; the exit code tells
+whether the page is as it should be.
 """
 
 import json
-import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,11 +19,6 @@ import yaml  # type: ignore[import-untyped]
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs/reference/custom-resource.md"
 INSTALL = ROOT / "manifests/install.yaml"
-VALUES = ROOT / "charts/rosproxy/values.yaml"
-
-_KEY = re.compile(r"( *)([A-Za-z]+):(?: (.*))?")
-_HEADING = re.compile(r"# -- .* -+")
-_EXAMPLE = re.compile(r" *#  ")
 
 
 def custom_resource() -> Mapping[str, Any]:
@@ -86,41 +80,12 @@ def _meaning(field: Mapping[str, Any]) -> str:
     return " ".join([text, *refusals]).replace("|", r"\|")
 
 
-def values_table(text: str) -> str:
-    """The chart's values with their defaults and comments, as a table."""
-    rows = ["| value | default | meaning |", "|---|---|---|"]
-    rows += [f"| `{path}` | {default} | {meaning} |" for path, default, meaning in values(text)]
-    return "\n".join(rows)
-
-
-def values(text: str) -> Iterator[tuple[str, str, str]]:
-    """Each value, and each group with a comment: its path, its default, and the comment above."""
-    path: list[str] = []
-    comment: list[str] = []
-    for line in text.splitlines():
-        found = _KEY.fullmatch(line)
-        if found:
-            path = [*path[: len(found[1]) // 2], found[2]]
-            if comment or found[3]:
-                yield ".".join(path), _shown(found[3]), " ".join(comment)
-            comment = []
-        elif not line.strip() or _HEADING.fullmatch(line):
-            comment = []
-        elif line.strip().startswith("#") and not _EXAMPLE.match(line):
-            comment.append(line.strip(" #"))
-
-
-def _shown(default: str | None) -> str:
-    return "" if default in (None, '""') else f"`{default}`"
-
-
 def page(text: str) -> str:
     """The page with its tables made anew."""
     definition = custom_resource()
     tables = {
         "fields of the spec": fields_table("spec", definition),
         "fields of the status": fields_table("status", definition),
-        "values of the chart": values_table(VALUES.read_text()),
     }
     for name, table in tables.items():
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
