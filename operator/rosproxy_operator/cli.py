@@ -342,7 +342,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 @main.command()
 def health() -> None:
     """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
-    from rosproxy.cli.admin_client import AdminClient, AdminError, default_url
+    from rosproxy.admin.client import AdminClient, AdminError, default_url
 
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:

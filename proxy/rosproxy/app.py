@@ -1,29 +1,34 @@
-"""A running proxy: its parts put together, started and stopped."""
+"""A running proxy: its parts put together, started and stopped.
+
+Each part is given those that it needs, as they are or as a `Protocol`. They are made from the
+bottom up. One thing goes the other way: a leased port hands its connections to the servers, which
+in turn may close the port (``leases.server``).
+"""
 
 import asyncio
 import logging
-import socket
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
 from rosproxy.admin.requests import read_master_address
 from rosproxy.admin.server import AdminServer
+from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
 from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net import limits, listeners
-from rosproxy.net.acceptor import Acceptor, first_bytes
+from rosproxy.leases.leases import RANGE_OPTION, Leases, PortBank
+from rosproxy.net import limits, sockets
+from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.http_server import Service, XmlRpcServer
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import make_context
-from rosproxy.ros1.protocol.tcpros import speaks_http
-from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.servers.admission import NodeAdmission
+from rosproxy.ros1.servers.dispatch import NodeServer, dispatch
 from rosproxy.ros1.servers.master import MasterApi, PublishedMaster
 from rosproxy.ros1.servers.slave import SlaveApi
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
+from rosproxy.ros1.servers.xmlrpc_server import XmlRpcServer, XmlRpcService
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 from rosproxy.ros1.upkeep.containers.events import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
@@ -33,7 +38,6 @@ from rosproxy.ros1.upkeep.recovery.recovery import Recovery
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscription.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.settings import SettingError, Settings
-from rosproxy.telemetry.metrics import StateCollector
 
 log = logging.getLogger(__name__)
 
@@ -48,33 +52,31 @@ class App:
         self.settings = settings
         self.context = context = make_context(settings)
         nodes = NodeClient(context.upstream, settings.probe_timeout)
-        self._tcpros = TcprosServer(context, nodes)
-        self._plane = KernelPlane(context)
+        self.tcpros = TcprosServer(context, nodes)
+        self.plane = plane = KernelPlane(
+            settings, context.registry, context.tasks, context.problems, context.now
+        )
         self.alias = Alias(context)
         updates = PublisherUpdates(context, self.alias)
         self.registrar = registrar = Registrar(context, nodes, updates)
-        self._resubscriber = Resubscriber(context, registrar, updates, self._tcpros, self._plane)
-        self._leases = Leases(
-            context,
-            nodes,
-            self._plane,
-            self._connection,
-            self._close_port,
-            lambda endpoint: self._resubscriber.watch([endpoint]),
+        self._resubscriber = Resubscriber(context, registrar, updates, self.tcpros, plane)
+        self.leases = leases = Leases(
+            context.registry,
+            PortBank(settings.bind),
+            plane,
+            self._resubscriber,
+            context.tasks,
+            context.problems,
         )
-        self._recovery = Recovery(
-            context, self._leases, nodes, registrar, self._resubscriber, self._plane
-        )
-        self.prober = Prober(
-            context, self._leases, nodes, registrar, self._resubscriber, self._recovery
-        )
+        self._admission = NodeAdmission(context, leases, nodes)
+        self._recovery = Recovery(context, leases, nodes, registrar, self._resubscriber, plane)
+        self.prober = Prober(context, leases, nodes, registrar, self._resubscriber, self._recovery)
         self.master_monitor = MasterMonitor(context, self._recovery, registrar)
-        self._adopter = Adopter(context, self._leases, nodes, registrar)
-        self._slaves = XmlRpcServer(
-            SlaveApi(context, self._leases, self.alias, self._adopter),
-            "rosproxy: slave API of a ROS node behind it\n",
-        )
-        self._servers = [self._slaves]
+        self._adopter = Adopter(context, leases, self._admission, nodes, registrar)
+        slave = SlaveApi(context, leases, self.alias, self._adopter)
+        slaves = XmlRpcServer(slave, "rosproxy: slave API of a ROS node behind it\n")
+        leases.server = NodeServer(slaves, self.tcpros)
+        self._servers = [slaves]
         self._acceptors: list[Acceptor] = []
         self._admin = self._make_admin(nodes)
 
@@ -82,9 +84,9 @@ class App:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
         self._check_bind()
         self._reserve_range()
-        await self._plane.start()
+        await self.plane.start()
         settings = self.settings
-        master = MasterApi(self.context, self._leases, self.alias, self._recovery, self._adopter)
+        master = MasterApi(self.context, self._admission, self.alias, self._recovery, self._adopter)
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
@@ -95,10 +97,10 @@ class App:
         repeat = self.context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
         repeat(self.prober.look, PROBE_TICK, "looking after nodes")
-        repeat(self._leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
+        repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
         repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
-        repeat(self._tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
+        repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         self._log_start()
 
     async def stop(self) -> None:
@@ -106,32 +108,30 @@ class App:
         for acceptor in self._acceptors:
             acceptor.stop()
             acceptor.sock.close()
-        for endpoint in self.context.registry:
-            self._leases.close(endpoint)
-        self.context.bank.close_all()
+        self.leases.close_all()
         self.alias.close()
         await self.context.tasks.cancel()
-        await self._plane.stop()
+        await self.plane.stop()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(self._admin.stop(), self._tcpros.stop(), self.alias.stop(), *servers)
+        await asyncio.gather(self._admin.stop(), self.tcpros.stop(), self.alias.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
         return to_json(
-            describe(self.context, self.master_monitor, self._tcpros, self.alias, self._plane)
+            describe(self.context, self.master_monitor, self.tcpros, self.alias, self.plane)
         )
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
         containers = ContainerEvents(
             self.context,
-            self._leases,
+            self.leases,
             nodes,
             self.registrar,
             self._adopter,
             self._recovery,
-            self._tcpros,
-            self._plane,
+            self.tcpros,
+            self.plane,
         )
         actions = {
             "/probe": self._probe,
@@ -155,7 +155,7 @@ class App:
         return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
-        return to_json(await probe_range(self.context, self._leases))
+        return to_json(await probe_range(self.context, self.leases))
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""
@@ -166,22 +166,9 @@ class App:
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
 
-    async def _connection(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
-        """Serve a connection to a lease: XML-RPC or TCPROS, by its first bytes."""
-        first = await first_bytes(conn)
-        if len(first) < 4:
-            conn.close()
-        elif speaks_http(first):
-            await self._slaves.serve(conn)
-        else:
-            await self._tcpros.serve(endpoint, conn, peer)
-
-    def _close_port(self, port: int) -> None:
-        self._slaves.close_port(port)
-
     def _check_bind(self) -> None:
         try:
-            listeners.bind(self.settings.bind, 0).close()
+            sockets.bind(self.settings.bind, 0).close()
         except OSError as error:
             text = f"{self.settings.bind} can't be bound: {error.strerror}"
             raise SettingError("--bind", text) from None
@@ -190,26 +177,24 @@ class App:
         ports = self.settings.ports.listen
         if not limits.files_for(len(ports)):
             text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
-            raise SettingError("--port-range", text)
-        taken = self.context.bank.reserve(ports.ports())
-        for port in taken:
-            self.context.registry.pool.block(port)
+            raise SettingError(RANGE_OPTION, text)
+        taken = self.leases.reserve_range()
         if len(taken) == len(ports):
-            raise SettingError("--port-range", f"no port of {ports} can be bound; all are taken")
+            raise SettingError(RANGE_OPTION, f"no port of {ports} can be bound; all are taken")
         if taken:
             text = f"ports of --port-range {ports} held by other programs: {taken}"
             log.warning("%s", text)
-            self.context.problems.add("--port-range", text)
+            self.context.problems.add(RANGE_OPTION, text)
 
-    def _listen(self, option: str, port: int, service: Service, what: str) -> None:
+    def _listen(self, option: str, port: int, service: XmlRpcService, what: str) -> None:
         try:
-            sock = listeners.listen(self.settings.bind, port)
+            sock = sockets.listen(self.settings.bind, port)
         except OSError as error:
             raise SettingError(option, f"port {port} can't be bound: {error.strerror}") from None
         server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
         self._servers.append(server)
         self._acceptors.append(
-            Acceptor(self.context.tasks, sock, lambda conn, peer: _serve_speaker(server, conn))
+            Acceptor(self.context.tasks, sock, lambda conn, peer: dispatch(conn, server))
         )
 
     async def _start_admin(self) -> None:
@@ -223,11 +208,11 @@ class App:
     def _state_metrics(self) -> StateCollector:
         return StateCollector(
             self.context.registry,
-            self._tcpros.traffic,
-            lambda: len(self._tcpros.relays),
+            self.tcpros.traffic,
+            lambda: len(self.tcpros.relays),
             lambda: len(self.alias),
             lambda: bool(self.master_monitor.up),
-            self._plane.tally,
+            self.plane.tally,
         )
 
     def _log_start(self) -> None:
@@ -240,14 +225,6 @@ class App:
             settings.advertise_host,
             settings.ports.advertise,
         )
-
-
-async def _serve_speaker(server: XmlRpcServer, conn: socket.socket) -> None:
-    """Serve a connection once its client has said something; silent ones time out."""
-    if await first_bytes(conn):
-        await server.serve(conn)
-    else:
-        conn.close()
 
 
 async def serve(settings: Settings, stopped: asyncio.Event) -> None:

@@ -12,8 +12,13 @@ from ipaddress import ip_address, ip_network
 from typing import Any, Literal, TypeVar
 
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import HostPort, Network, parse_address, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.net.addresses import (
+    HostPort,
+    Network,
+    parse_address,
+    parse_authority,
+    parse_host_port,
+)
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
@@ -159,7 +164,7 @@ def read_network(text: str) -> Network:
 
 def read_master_uri(text: str) -> str:
     """The URI of a ROS master. Raises ValueError."""
-    if parse_slave_uri(text) is None:
+    if not text.startswith("http://") or parse_authority(text) is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
     return text
 

@@ -75,7 +75,7 @@ class Proxy:
             async with asyncio.timeout(5):
                 await self.app.stop()
 
-    def metric(self, name: str, **labels: str) -> float:
+    def metric(self, name: str, /, **labels: str) -> float:
         """What a metric stands at; 0 if there is none of these labels yet."""
         registry = self.app.context.metrics.registry
         return registry.get_sample_value(f"rosproxy_{name}", labels) or 0

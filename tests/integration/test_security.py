@@ -54,7 +54,7 @@ async def victim() -> AsyncIterator[Victim]:
 @pytest.fixture
 def _as_if_not_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tests' addresses are loopback, where a node's word counts for even less."""
-    monkeypatch.setattr("rosproxy.ros1.registry.leases.is_loopback", lambda address: False)
+    monkeypatch.setattr("rosproxy.ros1.servers.admission.is_loopback", lambda address: False)
 
 
 async def test_a_forged_request_topic_reply_leads_nowhere_else(proxy, node, victim):

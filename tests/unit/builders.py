@@ -166,19 +166,18 @@ def exchange(
 ) -> Exchange:
     """What the shell does with a call: admit, export, ask the master, note, import."""
     request = master_api.read_request(body, asker)
-    request.admissions = [
+    admissions = [
         _admit(addressing, master_api.registering_uri(call), asker, refuse)
         for call in request.calls
     ]
-    local = master_api.local_reply(request)
-    if local is not None:
-        return Exchange(b"", local)
-    sent = master_api.export_request(request, addressing)
-    answer = master_api.read_answer(request, reply)
-    facts = master_api.noted(answer, 7.0)
+    exported = master_api.export_request(request, admissions, addressing)
+    if exported.body is None:
+        return Exchange(b"", exported.refused_reply())
+    answer = master_api.read_reply(exported, reply)
+    facts = answer.facts(7.0)
     for fact in facts:
         note(addressing.registry, fact)
-    return Exchange(sent, master_api.import_answer(request, answer, addressing), facts)
+    return Exchange(exported.body, master_api.import_reply(answer, addressing), facts)
 
 
 def note(registry: Registry, fact: Noted) -> None:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rosproxy.net.http_server import Connections
+from rosproxy.ros1.servers.xmlrpc_server import PortConnections
 
 
 class Handler:
@@ -20,7 +20,7 @@ class Handler:
 
 
 def test_only_open_ones_are_alive() -> None:
-    connections, handlers = Connections(), [Handler() for _ in range(100)]
+    connections, handlers = PortConnections(), [Handler() for _ in range(100)]
     for number, handler in enumerate(handlers):
         connections.add(as_aiohttp_s(handler))
         handler.open = number % 3 == 0
@@ -28,7 +28,7 @@ def test_only_open_ones_are_alive() -> None:
 
 
 def test_those_that_have_ended_are_forgotten() -> None:
-    connections = Connections()
+    connections = PortConnections()
     for _ in range(1000):
         handler = Handler()
         connections.add(as_aiohttp_s(handler))
@@ -38,7 +38,7 @@ def test_those_that_have_ended_are_forgotten() -> None:
 
 
 def test_many_open_ones_are_not_all_looked_at_for_each_new_one() -> None:
-    connections, Handler.looks = Connections(), 0
+    connections, Handler.looks = PortConnections(), 0
     for _ in range(1000):
         connections.add(as_aiohttp_s(Handler()))
     assert Handler.looks < 4000

@@ -15,6 +15,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from rosproxy.admin.requests import PortProbe, RangeProbe
+from rosproxy.leases.leases import Leases, PortBank
 from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
@@ -22,7 +23,7 @@ from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry.leases import Leases
+from rosproxy.ros1.registry.endpoint import Endpoint
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ class _Trial:
         return self.masters.encode() in seen or self.mine.encode() in seen
 
 
-async def probe_range(context: Context, leases: Leases) -> RangeProbe:
+async def probe_range(context: Context, leases: Leases[Endpoint]) -> RangeProbe:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
 
     The second port is left out where the master misses the first: rosmaster calls back from three
@@ -76,19 +77,21 @@ async def probe_range(context: Context, leases: Leases) -> RangeProbe:
         async with leases.lent(order) as port:
             if port is None:
                 break
-            probes.append(await _try(context, _Trial(port, context.addressing.outside(port))))
+            probes.append(
+                await _try(context, leases.bank, _Trial(port, context.addressing.outside(port)))
+            )
         if probes[0].from_master == "missed" or pool.free == 1:
             break
     return RangeProbe(tuple(probes))
 
 
-async def _try(context: Context, trial: _Trial) -> PortProbe:
-    acceptor = Acceptor(context.tasks, context.bank.open(trial.port), trial.greet)
+async def _try(context: Context, bank: PortBank, trial: _Trial) -> PortProbe:
+    acceptor = Acceptor(context.tasks, bank.open(trial.port), trial.greet)
     try:
         mine, masters = await asyncio.gather(_dial(context, trial), _ask_master(context, trial))
     finally:
         acceptor.stop()
-        context.bank.close(trial.port, acceptor.sock)
+        bank.close(trial.port, acceptor.sock)
     return PortProbe(trial.port, str(trial.where), mine, masters)
 
 

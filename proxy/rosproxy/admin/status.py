@@ -27,7 +27,6 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.telemetry.metrics import state_of
 
 
 def describe(
@@ -93,7 +92,7 @@ def _ports(context: Context) -> PortsStatus:
         listen=str(ports.listen),
         advertise=str(ports.advertise),
         used=len(context.registry),
-        free=fast_ports.left(context.registry),
+        free=fast_ports.left(pool, context.registry),
         blocked=pool.blocked,
     )
 
@@ -107,7 +106,7 @@ def _node(
         address=str(endpoint.slave),
         advertised_uri=context.addressing.advertised_uri(endpoint),
         port=endpoint.port,
-        state=state_of(endpoint),
+        state=endpoint.state,
         publishes=tuple(endpoint.names(Kind.PUBLISHER)),
         subscribes=tuple(endpoint.names(Kind.SUBSCRIBER)),
         services=tuple(endpoint.names(Kind.SERVICE)),

@@ -186,7 +186,7 @@ def _admin_option(command: Command) -> Command:
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
-    from rosproxy.cli.admin_client import AdminClient, default_url
+    from rosproxy.admin.client import AdminClient, default_url
 
     try:
         return AdminClient(url or default_url())
@@ -283,7 +283,7 @@ def doctor(
 
 def _or_exit(ask: Callable[[], object]) -> None:
     """Do something that may find the proxy absent, and say so in one line."""
-    from rosproxy.cli.admin_client import AdminError
+    from rosproxy.admin.client import AdminError
 
     try:
         ask()

@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.text import Text
 from rich.theme import Theme
 
-from rosproxy.cli.admin_client import AdminClient, AdminError
+from rosproxy.admin.client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
 
 WATCH_INTERVAL = 2.0

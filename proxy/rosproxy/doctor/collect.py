@@ -21,8 +21,8 @@ from xmlrpc.client import Fault, loads
 
 import aiohttp
 
+from rosproxy.admin.client import AdminClient, AdminError
 from rosproxy.admin.requests import RangeProbe
-from rosproxy.cli.admin_client import AdminClient, AdminError
 from rosproxy.doctor import replies
 from rosproxy.doctor.facts import (
     Attempt,

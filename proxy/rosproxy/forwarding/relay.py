@@ -10,10 +10,11 @@ import fcntl
 import logging
 import os
 import socket
-import struct
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+
+from rosproxy.net.sockets import reset_on_close
 
 log = logging.getLogger(__name__)
 
@@ -49,8 +50,6 @@ Finished = Callable[["Relay"], None]
 """Is told that a relay has ended."""
 WhenReadable = Callable[[socket.socket, Callable[[], object]], None]
 """Has a function called, once, when a socket has bytes, has ended or has failed."""
-
-_LINGER_RESET = struct.pack("ii", 1, 0)
 
 
 @dataclass(slots=True, eq=False)
@@ -178,12 +177,6 @@ class Relay:
 
 
 _END = threading.Lock()
-
-
-def reset_on_close(sock: socket.socket) -> None:
-    """Make closing a socket send a reset instead of an orderly end."""
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_RESET)
 
 
 def _prepare(sock: socket.socket) -> None:

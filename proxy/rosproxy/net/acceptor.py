@@ -1,7 +1,7 @@
-"""Accepting connections, and telling XML-RPC from TCPROS by the first four bytes.
+"""Accepting connections on a listening socket, each served in a task of its own.
 
-Clients speak first in both protocols. The bytes are only peeked at, so that the socket can be
-handed on untouched.
+What a client sends is for the handler: it takes the socket over, and whatever ends the handler by
+an exception closes the connection.
 """
 
 import asyncio
@@ -13,12 +13,8 @@ from functools import partial
 
 from rosproxy.net.addresses import plain_address
 from rosproxy.net.tasks import Tasks
-from rosproxy.ros1.protocol.tcpros import header_length
 
 log = logging.getLogger(__name__)
-
-FIRST_BYTES_TIMEOUT = 30.0
-"""Seconds that a connection may stay silent before it is closed."""
 
 ACCEPTS_PER_TURN = 64
 
@@ -81,48 +77,3 @@ def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:
     """A task that is cancelled before it has begun never gets to close its connection."""
     if task.cancelled():
         conn.close()
-
-
-async def first_bytes(conn: socket.socket) -> bytes:
-    """Peek at the first four bytes; fewer if the connection ends before.
-
-    The kernel wakes the reader only at four bytes (SO_RCVLOWAT), however small the slices in
-    which they come. Raises TimeoutError, OSError.
-    """
-    conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, 4)
-    async with asyncio.timeout(FIRST_BYTES_TIMEOUT):
-        await _readable(conn)
-        first = conn.recv(4, socket.MSG_PEEK)
-    conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, 1)
-    return first
-
-
-async def read_header(conn: socket.socket) -> bytes:
-    """Take a TCPROS connection header off the socket: its four bytes of length and its body.
-
-    Raises HeaderError if it is too long, EOFError, TimeoutError, OSError.
-    """
-    async with asyncio.timeout(FIRST_BYTES_TIMEOUT):
-        first = await _exactly(conn, 4)
-        return first + await _exactly(conn, header_length(first))
-
-
-async def _readable(conn: socket.socket) -> None:
-    loop = asyncio.get_running_loop()
-    ready = asyncio.Event()
-    loop.add_reader(conn, ready.set)
-    try:
-        await ready.wait()
-    finally:
-        loop.remove_reader(conn)
-
-
-async def _exactly(conn: socket.socket, size: int) -> bytes:
-    loop, parts = asyncio.get_running_loop(), []
-    while size:
-        part = await loop.sock_recv(conn, min(size, 65536))
-        if not part:
-            raise EOFError("the connection ended inside its header")
-        parts.append(part)
-        size -= len(part)
-    return b"".join(parts)

@@ -15,7 +15,7 @@ from aiohttp.client_proto import ResponseHandler
 
 from rosproxy.net import resolver
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.dialing import dial
+from rosproxy.net.sockets import dial
 
 MAX_BODY = 64 * 1024 * 1024
 """Longest XML-RPC body in bytes, either way."""

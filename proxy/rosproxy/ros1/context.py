@@ -1,4 +1,7 @@
-"""What the parts of a running proxy share."""
+"""What the parts of a running proxy share: its state, and the tools to act on it.
+
+Made once (`make_context`), before the parts; none of them keeps a copy of what is in it.
+"""
 
 import time
 import uuid
@@ -7,9 +10,9 @@ from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import Network, is_inside
 from rosproxy.net.interfaces import address_towards, interface_networks
-from rosproxy.net.listeners import PortBank
 from rosproxy.net.tasks import Tasks
 from rosproxy.ros1.clients.master import MasterClient
+from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
@@ -28,7 +31,6 @@ class Context:
     settings: Settings
     registry: Registry
     addressing: Addressing
-    bank: PortBank
     upstream: MasterClient
     metrics: Metrics
     tasks: Tasks
@@ -74,12 +76,15 @@ class Context:
 
 def make_context(settings: Settings) -> Context:
     """A context for a proxy that is about to start; needs a running event loop."""
-    registry, metrics, instance = Registry(settings.ports.listen), Metrics(), uuid.uuid4().hex
+    registry, metrics, instance = (
+        Registry(settings.ports.listen),
+        Metrics(KNOWN_METHODS),
+        uuid.uuid4().hex,
+    )
     context = Context(
         settings=settings,
         registry=registry,
         addressing=Addressing(registry, settings.advertise_host, settings.ports),
-        bank=PortBank(settings.bind),
         upstream=MasterClient(settings.master_uri, instance, metrics, settings.master_address),
         metrics=metrics,
         tasks=Tasks(),

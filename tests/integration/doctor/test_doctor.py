@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.cli.admin_client import AdminClient
+from rosproxy.admin.client import AdminClient
 from rosproxy.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
 from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode, Header

@@ -7,9 +7,8 @@ import pytest
 from rosproxy.demo.fake_http import Where
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
-from rosproxy.forwarding.kernel import targets as kernel_targets
-from rosproxy.forwarding.kernel.policy import World
-from rosproxy.forwarding.kernel.targets import KernelTargets
+from rosproxy.forwarding.kernel import syncer
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools
@@ -37,8 +36,8 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
 
     monkeypatch.setattr(kernel_plane, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(kernel_targets, "forwarding", World)
-    monkeypatch.setattr(KernelTargets, "_is_own", lambda targets, address: False)
+    monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
+    monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
     monkeypatch.setattr(decisions, "is_loopback", lambda address: False)
     return made
 

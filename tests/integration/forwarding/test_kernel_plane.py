@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from rosproxy.forwarding.kernel import plane as kernel_plane
-from rosproxy.forwarding.kernel import targets
+from rosproxy.forwarding.kernel import syncer
 from rosproxy.forwarding.kernel.nft import Marks
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases import fast_ports
 from rosproxy.net.addresses import HostPort
@@ -50,7 +50,15 @@ class Bench:
     def __init__(self, mode: str = "auto", tools: FakeTools | None = None) -> None:
         self.context: Context = make_context(parse_settings(settings(mode)))
         self.tools = tools or FakeTools()
-        self.plane = KernelPlane(self.context, self.tools)
+        self.later = 0.0
+        self.plane = KernelPlane(
+            self.context.settings,
+            self.context.registry,
+            self.context.tasks,
+            self.context.problems,
+            lambda: self.context.now() + self.later,
+            self.tools,
+        )
 
     def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
         node = HostPort(NODE, 40000 + number)
@@ -60,7 +68,7 @@ class Bench:
 
     async def forwarded(self, number: int = 0) -> Endpoint:
         endpoint = self.node(number)
-        assert fast_ports.claim(self.context.registry, endpoint)
+        assert fast_ports.claim(self.context.registry.pool, endpoint)
         assert await self.plane.forwards(endpoint, 50000)
         return endpoint
 
@@ -76,7 +84,7 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> None:
         return None
 
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(targets, "forwarding", World)
+    monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
 
 
 @pytest.fixture
@@ -114,12 +122,12 @@ async def test_another_tcpros_port_is_followed(bench: Bench) -> None:
 async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> None:
     endpoint, other = await bench.forwarded(), await bench.forwarded(1)
     endpoint.health.end(1.0)
-    bench.plane.wake(endpoint)
+    bench.plane.note_change(endpoint)
     await bench.plane.cleared(45002)
     assert set(bench.tools.forwards) == {45003}
-    fast_ports.give_back(bench.context.registry, other)
+    fast_ports.give_back(bench.context.registry.pool, other)
     bench.context.registry.remove(other)
-    bench.plane.wake(other)
+    bench.plane.note_change(other)
     await bench.plane.cleared(45003)
     assert bench.tools.forwards == {}
     assert bench.plane.status_of(endpoint)["reason"] == "the node does not answer"
@@ -176,7 +184,7 @@ async def test_what_somebody_else_changed_is_put_right(bench: Bench) -> None:
 async def test_a_plane_that_is_lost_is_told_and_comes_back(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel_plane, "RETRY_LOST", 0.0)
+    monkeypatch.setattr(syncer, "RETRY_LOST", 0.0)
     endpoint = await bench.forwarded()
     endpoint.fast_peers = {"198.51.100.2": 1}
     bench.tools.failing, endpoint.tcpros_port = 2, 50001
@@ -200,21 +208,18 @@ async def test_a_plane_that_stays_lost_is_tried_again_later(bench: Bench) -> Non
     assert bench.tools.failing == left
 
 
-async def test_who_is_not_answered_gets_back_to_user_space(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     bench.tools.flows = bench.flow(45002, "SYN_SENT")
     await bench.plane.look()
     assert bench.plane.may_forward(endpoint)
-    now = bench.context.now() + kernel_plane.UNANSWERED_PATIENCE
-    monkeypatch.setattr(Context, "now", lambda _: now)
+    bench.later = kernel_plane.UNANSWERED_PATIENCE
     await bench.plane.look()
     assert bench.tools.forwards == {}
     assert (Marks(11311).one(45002), False, "SYN_SENT") in bench.tools.forgotten
     assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
     bench.tools.flows = ""
-    monkeypatch.setattr(Context, "now", lambda _: now + 6)
+    bench.later += 6
     assert await bench.plane.forwards(endpoint, 50000)
 
 
@@ -241,7 +246,7 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     await bench.forwarded()
     later = Bench(tools=bench.tools)
     await later.plane.start()
-    later.plane.wake()
+    later.plane.note_change()
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
     node = HostPort(NODE, 40000)

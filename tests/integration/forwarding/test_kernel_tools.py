@@ -8,9 +8,10 @@ import pytest
 
 from rosproxy.forwarding.kernel import preflight
 from rosproxy.forwarding.kernel import tools as kernel_tools
-from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from tests.integration.kernel_fake import FakeTools
+from tests.integration.net import until
 
 
 @pytest.fixture
@@ -43,7 +44,7 @@ class ChainTools(FakeTools):
 async def test_a_sound_container_has_nothing_in_the_way(place: Path) -> None:
     for mode in ("auto", "kernel"):
         assert await preflight.why_not(mode, ChainTools()) is None
-    assert preflight.forwarding() == World(ipv4=True, ipv6=False)
+    assert preflight.read_forwarding() == HostForwarding(ipv4=True, ipv6=False)
 
 
 async def test_a_host_is_left_alone_unless_asked_for(place: Path) -> None:
@@ -134,10 +135,14 @@ async def test_a_program_that_hangs_is_ended(
 
 
 async def test_what_a_cancelled_task_began_is_finished(programs: Path) -> None:
-    program(programs, "nft", f"/bin/sleep 0.3; echo done >{programs}/said; exit 1")
+    program(
+        programs,
+        "nft",
+        f"echo >{programs}/begun; /bin/sleep 0.3; echo done >{programs}/said; exit 1",
+    )
     tools = Tools()
     task = asyncio.ensure_future(tools.nft("list", "chains"))
-    await asyncio.sleep(0.1)
+    await until((programs / "begun").exists, "it begins")
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task

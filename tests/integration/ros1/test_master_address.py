@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rosproxy.cli.admin_client import AdminClient
+from rosproxy.admin.client import AdminClient
 from rosproxy.demo.fake_http import where
 from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode

@@ -3,7 +3,12 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.forwarding.kernel.accounting import Account, KernelBook, Ledger, Silence
+from rosproxy.forwarding.kernel.accounting import (
+    Account,
+    CounterDeltas,
+    KernelAccounts,
+    UnansweredPorts,
+)
 from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
@@ -17,7 +22,7 @@ def holder(registry: Registry, number: int) -> Endpoint:
     node = HostPort(f"10.0.0.{number}", 40000)
     endpoint = registry.admit(f"http://{node}/", node, Place(node.host, True), node.host)
     registry.register(endpoint, Registration(Kind.PUBLISHER, "/t", f"/node{number}"))
-    assert fast_ports.claim(registry, endpoint)
+    assert fast_ports.claim(registry.pool, endpoint)
     return endpoint
 
 
@@ -27,7 +32,7 @@ def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
 
 @given(st.lists(st.tuples(st.integers(0, 1000), st.integers(0, 1000))))
 def test_no_byte_is_lost_or_counted_twice(steps: list[tuple[int, int]]) -> None:
-    ledger, counter, counted = Ledger(), (0, 0), (0, 0)
+    ledger, counter, counted = CounterDeltas(), (0, 0), (0, 0)
     for sent, received in steps:
         counter = counter[0] + sent, counter[1] + received
         more = ledger.take({45050: counter}).get(45050, (0, 0))
@@ -36,7 +41,7 @@ def test_no_byte_is_lost_or_counted_twice(steps: list[tuple[int, int]]) -> None:
 
 
 def test_counters_that_begin_anew_are_added() -> None:
-    ledger = Ledger()
+    ledger = CounterDeltas()
     assert ledger.take({1: (100, 10)}) == {1: (100, 10)}
     assert ledger.take({1: (100, 10)}) == {}
     assert ledger.take({1: (30, 3)}) == {1: (30, 3)}
@@ -44,7 +49,7 @@ def test_counters_that_begin_anew_are_added() -> None:
 
 
 def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
     endpoint = holder(registry, 1)
     book.note_owners(registry)
     assert book.count({1002: (400, 40), 1003: (5, 6)}, 10.0) == [
@@ -58,10 +63,10 @@ def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
 
 
 def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
     first = holder(registry, 1)
     book.note_owners(registry)
-    fast_ports.give_back(registry, first)
+    fast_ports.give_back(registry.pool, first)
     book.note_owners(registry)
     assert book.ports_of(first) == [1002]
     book.note_peers([open_flow(first, 1002)])
@@ -73,7 +78,7 @@ def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> Non
 
 
 def test_peers_are_those_of_the_nodes_own_address() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
     first, second = holder(registry, 1), holder(registry, 2)
     book.note_owners(registry)
     flows = [open_flow(first, 1002), open_flow(first, 1003), open_flow(second, 1003, "192.0.2.2")]
@@ -89,7 +94,7 @@ def test_peers_are_those_of_the_nodes_own_address() -> None:
 
 
 def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
-    silence = Silence()
+    silence = UnansweredPorts()
     assert silence.look({1: (0, 60), 2: (0, 60), 3: (5, 60)}, 10.0) == []
     assert silence.look({1: (0, 60), 2: (40, 60), 3: (0, 60)}, 13.0) == [1]
     assert silence.look({3: (0, 60), 1: (0, 0)}, 16.0) == [3]
@@ -98,7 +103,7 @@ def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
 
 
 def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
-    silence = Silence()
+    silence = UnansweredPorts()
     assert silence.look({1: (0, 60), 2: (0, 60)}, 10.0) == []
     assert silence.look({1: (0, 60), 2: (0, 60)}, 10.1) == []
     assert silence.look({1: (40, 0)}, 11.9) == []
@@ -106,7 +111,7 @@ def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
 
 
 def test_silent_ports_are_noted_with_the_bytes() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelBook()
+    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
     holder(registry, 1)
     book.note_owners(registry)
     for size in (60, 120):

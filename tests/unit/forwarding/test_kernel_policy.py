@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from rosproxy.forwarding.kernel.policy import (
     LONGEST_PAUSE,
+    HostForwarding,
     Pauses,
-    World,
     changes,
     destination,
     kept,
@@ -33,26 +33,35 @@ def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
 
 
 def test_a_node_that_named_its_port_is_forwarded_to() -> None:
-    assert destination(an_endpoint(), World()) == THERE
-    assert destination(an_endpoint(topic_ports={"/a": 50000}), World()) == THERE
-    assert destination(an_endpoint(tcpros_port=None, topic_ports={"/a": 50000}), World()) == THERE
-    assert destination(an_endpoint("fd00::5"), World()) == HostPort("fd00::5", 50000)
+    assert destination(an_endpoint(), HostForwarding()) == THERE
+    assert destination(an_endpoint(topic_ports={"/a": 50000}), HostForwarding()) == THERE
+    assert (
+        destination(an_endpoint(tcpros_port=None, topic_ports={"/a": 50000}), HostForwarding())
+        == THERE
+    )
+    assert destination(an_endpoint("fd00::5"), HostForwarding()) == HostPort("fd00::5", 50000)
 
 
 @pytest.mark.parametrize(
     ("endpoint", "world", "why"),
     [
-        (an_endpoint(trusted=False), World(), "does not answer"),
-        (an_endpoint(tcpros_port=None), World(), "nobody outside has asked"),
-        (an_endpoint(topic_ports={"/a": 50001}), World(), "several TCPROS ports"),
-        (an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None), World(), "several"),
-        (an_endpoint("127.0.0.1"), World(), "namespace of the proxy itself"),
-        (an_endpoint(), World(own={NODE}), "namespace of the proxy itself"),
-        (an_endpoint(), World(ipv4=False), "net.ipv4.ip_forward"),
-        (an_endpoint("fd00::5"), World(ipv6=False), "net.ipv6.conf.all.forwarding"),
+        (an_endpoint(trusted=False), HostForwarding(), "does not answer"),
+        (an_endpoint(tcpros_port=None), HostForwarding(), "nobody outside has asked"),
+        (an_endpoint(topic_ports={"/a": 50001}), HostForwarding(), "several TCPROS ports"),
+        (
+            an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None),
+            HostForwarding(),
+            "several",
+        ),
+        (an_endpoint("127.0.0.1"), HostForwarding(), "namespace of the proxy itself"),
+        (an_endpoint(), HostForwarding(own={NODE}), "namespace of the proxy itself"),
+        (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),
+        (an_endpoint("fd00::5"), HostForwarding(ipv6=False), "net.ipv6.conf.all.forwarding"),
     ],
 )
-def test_what_keeps_a_node_in_user_space(endpoint: Endpoint, world: World, why: str) -> None:
+def test_what_keeps_a_node_in_user_space(
+    endpoint: Endpoint, world: HostForwarding, why: str
+) -> None:
     said = destination(endpoint, world)
     assert isinstance(said, str)
     assert why in said
@@ -61,9 +70,9 @@ def test_what_keeps_a_node_in_user_space(endpoint: Endpoint, world: World, why: 
 def test_a_node_that_is_down_stays_in_user_space() -> None:
     endpoint = an_endpoint()
     for _ in range(2):
-        assert destination(endpoint, World()) == THERE
+        assert destination(endpoint, HostForwarding()) == THERE
         endpoint.health.note(ProbeResult.REFUSED, 1.0)
-    assert destination(endpoint, World()) == "the node does not answer"
+    assert destination(endpoint, HostForwarding()) == "the node does not answer"
 
 
 PORTS = st.integers(1, 9)

@@ -43,8 +43,8 @@ def test_a_port_outside_the_range_has_no_partner() -> None:
 def test_an_endpoint_gets_the_partner_of_its_lease_and_keeps_it() -> None:
     registry = Registry(PortRange(1000, 1003))
     endpoint = admitted(registry, 1)
-    assert fast_ports.claim(registry, endpoint)
-    assert fast_ports.claim(registry, endpoint)
+    assert fast_ports.claim(registry.pool, endpoint)
+    assert fast_ports.claim(registry.pool, endpoint)
     assert (endpoint.port, endpoint.fast_port) == (1000, 1002)
     assert registry.pool.free == 2
     assert fast_ports.held(registry) == 1
@@ -53,9 +53,9 @@ def test_an_endpoint_gets_the_partner_of_its_lease_and_keeps_it() -> None:
 def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
     registry = Registry(PortRange(1000, 1001))
     first, second = admitted(registry, 1), admitted(registry, 2)
-    assert not fast_ports.claim(registry, first)
-    assert not fast_ports.claim(registry, second)
-    assert fast_ports.why_none(registry, first) == (
+    assert not fast_ports.claim(registry.pool, first)
+    assert not fast_ports.claim(registry.pool, second)
+    assert fast_ports.why_none(registry.pool, first) == (
         "port 1001, which goes with its port 1000, is in use"
     )
 
@@ -63,29 +63,29 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
 def test_the_odd_last_port_has_none() -> None:
     registry = Registry(PortRange(1000, 1000))
     endpoint = admitted(registry, 1)
-    assert not fast_ports.claim(registry, endpoint)
-    assert "goes with port 1000" in fast_ports.why_none(registry, endpoint)
+    assert not fast_ports.claim(registry.pool, endpoint)
+    assert "goes with port 1000" in fast_ports.why_none(registry.pool, endpoint)
 
 
 def test_a_fast_port_is_given_back_once() -> None:
     registry = Registry(PortRange(1000, 1003))
     endpoint = admitted(registry, 1)
-    fast_ports.claim(registry, endpoint)
+    fast_ports.claim(registry.pool, endpoint)
     for _ in range(2):
-        fast_ports.give_back(registry, endpoint)
+        fast_ports.give_back(registry.pool, endpoint)
     assert fast_ports.held(registry) == 0
     assert registry.pool.free == 3
-    assert "asked for a topic" in fast_ports.why_none(registry, endpoint)
+    assert "asked for a topic" in fast_ports.why_none(registry.pool, endpoint)
 
 
 def test_a_fast_port_that_another_program_holds_is_blocked() -> None:
     registry = Registry(PortRange(1000, 1003))
     endpoint = admitted(registry, 1)
-    fast_ports.claim(registry, endpoint)
-    fast_ports.give_back(registry, endpoint, blocked=True)
+    fast_ports.claim(registry.pool, endpoint)
+    fast_ports.give_back(registry.pool, endpoint, blocked=True)
     assert registry.pool.blocked_ports == [1002]
     assert registry.pool.free == 2
-    assert not fast_ports.claim(registry, endpoint)
+    assert not fast_ports.claim(registry.pool, endpoint)
 
 
 def test_the_least_used_fast_port_goes_first() -> None:
@@ -93,11 +93,11 @@ def test_the_least_used_fast_port_goes_first() -> None:
     endpoints = [admitted(registry, number) for number in range(3)]
     assert fast_ports.to_give_back(registry) is None
     for endpoint, count in zip(endpoints, (2, 0, 1), strict=True):
-        fast_ports.claim(registry, endpoint)
+        fast_ports.claim(registry.pool, endpoint)
         endpoint.fast_peers = {"192.0.2.1": count} if count else {}
     given_back = []
     while (holder := fast_ports.to_give_back(registry)) is not None:
-        fast_ports.give_back(registry, holder)
+        fast_ports.give_back(registry.pool, holder)
         given_back.append(holder)
     assert given_back == [endpoints[1], endpoints[2], endpoints[0]]
     assert registry.pool.free == 3

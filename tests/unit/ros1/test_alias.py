@@ -9,7 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.alias import policy
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
-from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting import master_api, slave_api
 from rosproxy.settings import Settings
 from tests.unit.builders import DIALECTS, make_addressing, make_asker, py_call, py_reply
 
@@ -43,8 +43,8 @@ def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = F
     method, params = calls[0]
     text = py_call("system.multicall", body) if multicall else py_call(method, *params)
     request = master_api.read_request(text, make_asker("10.0.0.5"))
-    request.admissions = [None] * len(request.calls)
-    return list(policy.uris_in_answer(master_api.read_answer(request, reply)))
+    exported = master_api.export_request(request, [None] * len(request.calls), make_addressing())
+    return list(master_api.read_reply(exported, reply).uris())
 
 
 NAMED = [
@@ -92,7 +92,7 @@ def test_uris_that_a_publisher_update_names(
     method: str, params: list[Any], expected: list[str]
 ) -> None:
     call = xmlrpc.parse_call(py_call(method, *params))
-    assert list(policy.announced_publishers(call)) == expected
+    assert list(slave_api.announced_publishers(call)) == expected
 
 
 def test_only_ports_of_the_masters_host_need_a_port() -> None:

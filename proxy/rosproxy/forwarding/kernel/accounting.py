@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint, ForwardedEndpoints
 from rosproxy.forwarding.kernel.nft import Counters
-from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.registry import Registry
 
 
 @dataclass(slots=True)
@@ -22,7 +21,7 @@ class Account:
     rates: tuple[float, float] = (0.0, 0.0)
 
 
-class Ledger:
+class CounterDeltas:
     """Bytes by port, from counters that begin anew whenever their table is made again."""
 
     def __init__(self) -> None:
@@ -45,7 +44,7 @@ SILENCE_WINDOW = 2.0
 """Seconds at least over which it is told whether anything goes back through a port."""
 
 
-class Silence:
+class UnansweredPorts:
     """Ports through which something comes in and nothing goes back.
 
     Connections that are dropped on the way never show up as such; their bytes do. A first packet
@@ -70,7 +69,7 @@ class Silence:
         return sorted(found)
 
 
-class KernelBook:
+class KernelAccounts:
     """Whose the connections through the fast ports are, and what went through them.
 
     A port that was given back stays its last holder's until somebody else holds it, or the holder
@@ -79,16 +78,16 @@ class KernelBook:
     """
 
     def __init__(self) -> None:
-        self.owners: Mapping[int, Endpoint] = {}
-        self._accounts: dict[Endpoint, Account] = {}
-        self._ledger, self._silence = Ledger(), Silence()
+        self.owners: Mapping[int, ForwardedEndpoint] = {}
+        self._accounts: dict[ForwardedEndpoint, Account] = {}
+        self._deltas, self._silence = CounterDeltas(), UnansweredPorts()
         self.silent: list[int] = []
         self._counted_at = 0.0
 
-    def note_owners(self, registry: Registry) -> None:
+    def note_owners(self, endpoints: ForwardedEndpoints) -> None:
         """Take in who holds which fast port now."""
-        there = {p: e for p, e in self.owners.items() if registry.by_port.get(e.port) is e}
-        self.owners = there | {e.fast_port: e for e in registry if e.fast_port is not None}
+        there = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
+        self.owners = there | {e.fast_port: e for e in endpoints if e.fast_port is not None}
         known = set(self.owners.values())
         self._accounts = {e: account for e, account in self._accounts.items() if e in known}
 
@@ -97,7 +96,7 @@ class KernelBook:
         passed, self._counted_at = now - self._counted_at, now
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
-        grown, by_port = [], self._ledger.take(counters)
+        grown, by_port = [], self._deltas.take(counters)
         self.silent = self._silence.look(by_port, now)
         for port, (sent, received) in by_port.items():
             endpoint = self.owners.get(port)
@@ -107,7 +106,7 @@ class KernelBook:
             grown.append((names[0] if names else "unnamed", sent, received))
         return grown
 
-    def _add(self, endpoint: Endpoint, sent: int, received: int, passed: float) -> None:
+    def _add(self, endpoint: ForwardedEndpoint, sent: int, received: int, passed: float) -> None:
         account = self._accounts.setdefault(endpoint, Account())
         account.sent += sent
         account.received += received
@@ -124,17 +123,17 @@ class KernelBook:
         by_port: dict[int, list[Flow]] = {}
         for flow in flows:
             by_port.setdefault(flow.port, []).append(flow)
-        found: dict[Endpoint, list[Flow]] = {}
+        found: dict[ForwardedEndpoint, list[Flow]] = {}
         for port, endpoint in self.owners.items():
             found.setdefault(endpoint, []).extend(by_port.get(port, []))
         for endpoint, mine in found.items():
-            there = [] if endpoint.health.down else mine
-            endpoint.fast_peers = conntrack.peers(there, endpoint.place.address)
+            there = [] if endpoint.is_down else mine
+            endpoint.fast_peers = conntrack.peers(there, endpoint.address)
 
-    def account(self, endpoint: Endpoint) -> Account:
+    def account(self, endpoint: ForwardedEndpoint) -> Account:
         """What went through an endpoint's fast ports so far."""
         return self._accounts.get(endpoint, Account())
 
-    def ports_of(self, endpoint: Endpoint) -> list[int]:
+    def ports_of(self, endpoint: ForwardedEndpoint) -> list[int]:
         """The fast ports that connections to an endpoint may go through."""
         return [port for port, owner in self.owners.items() if owner is endpoint]

@@ -1,6 +1,6 @@
 """The kernel plane: which ports the kernel forwards to where, and why it doesn't.
 
-Plain decisions; the shell (`plane`) reads and changes the kernel's tables. A
+Plain decisions; `syncer` reads and changes the kernel's table. A
 forward never sees a connection header. Should a policy ever need one (who may subscribe to what),
 `destination` is the place to answer why such an endpoint stays in user space.
 """
@@ -8,8 +8,8 @@ forward never sees a connection header. Should a policy ever need one (who may s
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
+from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint
 from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.ros1.registry.endpoint import Endpoint
 
 Forwards = Mapping[int, HostPort]
 """Fast ports with the TCPROS addresses of the nodes that they are forwarded to."""
@@ -21,7 +21,7 @@ longest time, it doubles from one to the other."""
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class HostForwarding:
     """What the kernel can do here: forward IPv4, forward IPv6; ``own`` tells own addresses."""
 
     ipv4: bool = True
@@ -29,31 +29,32 @@ class World:
     own: Collection[str] = ()
 
 
-def destination(endpoint: Endpoint, world: World) -> HostPort | str:
+def destination(endpoint: ForwardedEndpoint, host: HostForwarding) -> HostPort | str:
     """Where an endpoint's fast port may be forwarded to, or why it may not.
 
     The address is the one that the proxy found the node at, the port the one that the node itself
     named: a forged registration can't make the kernel forward to another host.
     """
-    ports = {port for port in (endpoint.tcpros_port, *endpoint.topic_ports.values()) if port}
-    address = endpoint.place.address
-    if endpoint.health.down or not endpoint.trusted:
+    ports, address = endpoint.tcpros_ports, endpoint.address
+    if not endpoint.answers:
         return "the node does not answer"
     if not ports:
         return "nobody outside has asked for a topic of it yet"
     if len(ports) > 1:
         return "its topics are on several TCPROS ports"
-    if is_loopback(address) or address in world.own:
+    if is_loopback(address) or address in host.own:
         return "the node runs in the network namespace of the proxy itself"
-    if not (world.ipv6 if ":" in address else world.ipv4):
+    if not (host.ipv6 if ":" in address else host.ipv4):
         return f"{_FORWARDING[':' in address]} is not 1 in the proxy's network namespace"
-    return HostPort(address, ports.pop())
+    return HostPort(address, next(iter(ports)))
 
 
 _FORWARDING = ("net.ipv4.ip_forward", "net.ipv6.conf.all.forwarding")
 
 
-def kept(now: Forwards, endpoints: Iterable[Endpoint], recovered: bool) -> dict[int, HostPort]:
+def kept(
+    now: Forwards, endpoints: Iterable[ForwardedEndpoint], recovered: bool
+) -> dict[int, HostPort]:
     """The forwards from before a restart that nothing is known against yet.
 
     Until the registry is rebuilt these are all; after that those of endpoints whose node has not
@@ -61,12 +62,12 @@ def kept(now: Forwards, endpoints: Iterable[Endpoint], recovered: bool) -> dict[
     """
     if not recovered:
         return dict(now)
-    waiting = {e.fast_port: e.place.address for e in endpoints if not e.trusted and e.fast_port}
+    waiting = {e.fast_port: e.address for e in endpoints if not e.trusted and e.fast_port}
     return {port: where for port, where in now.items() if waiting.get(port) == where.host}
 
 
 def unchanged(
-    now: Forwards, owners: Mapping[int, Endpoint], changed: Collection[Endpoint]
+    now: Forwards, owners: Mapping[int, ForwardedEndpoint], changed: Collection[ForwardedEndpoint]
 ) -> dict[int, HostPort]:
     """The forwards of all endpoints that still have them, without those that have changed."""
     found = ((port, where, owners.get(port)) for port, where in now.items())

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
-from rosproxy.forwarding.kernel.policy import World
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from rosproxy.settings import DataPlane
 
@@ -15,9 +15,9 @@ _IPV4 = Path("/proc/sys/net/ipv4/ip_forward")
 _IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
 
 
-def forwarding() -> World:
+def read_forwarding() -> HostForwarding:
     """What this network namespace forwards."""
-    return World(ipv4=_says_one(_IPV4), ipv6=_says_one(_IPV6))
+    return HostForwarding(ipv4=_says_one(_IPV4), ipv6=_says_one(_IPV6))
 
 
 async def why_not(mode: DataPlane, tools: Tools) -> str | None:
@@ -49,8 +49,8 @@ def _reasons(mode: DataPlane) -> Iterator[str]:
             f"this looks like a host's own network (it has {hardware}), which --data-plane auto "
             "leaves alone: use --data-plane kernel, or a network namespace of its own"
         )
-    world = forwarding()
-    if not (world.ipv4 or world.ipv6):
+    host = read_forwarding()
+    if not (host.ipv4 or host.ipv6):
         yield (
             "net.ipv4.ip_forward is not 1 in the proxy's network namespace: set it (sysctls: "
             "net.ipv4.ip_forward: 1; for nodes with IPv6 addresses net.ipv6.conf.all.forwarding: 1)"

@@ -1,9 +1,14 @@
 """What the kernel forwards, kept as the endpoints want it.
 
-Level-triggered: `KernelForwards.wake` only says that something may have changed. One worker at a
-time compares what is wanted with what the kernel has, and changes it in one transaction. All
-endpoints are gone through every few seconds; in between only those that changed, so that a
-thousand that come one by one don't make a million.
+Level-triggered: `ForwardSyncer.note_change` only says that something may have changed. One worker
+at a time (`run_once`) compares what is wanted with what the kernel has, and changes it in one
+transaction. All endpoints are gone through every few seconds; in between only those that changed,
+so that a thousand that come one by one don't make a million.
+
+Where an endpoint may be forwarded to is decided in `policy`. What that depends on is kept here:
+what this network namespace forwards, which addresses are the proxy's own, forwards that failed of
+late, and why the kernel may forward nothing at all (``why_not``). That is changed by `begin`,
+`refuse` and a table that can't be made any more, and by nobody else.
 """
 
 import asyncio
@@ -11,87 +16,136 @@ import contextlib
 import itertools
 import logging
 from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
 
-from rosproxy.forwarding.kernel.accounting import KernelBook
+from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint, ForwardedEndpoints
 from rosproxy.forwarding.kernel.nft import Counters, NftError
-from rosproxy.forwarding.kernel.policy import Changes, kept, unchanged
+from rosproxy.forwarding.kernel.policy import (
+    Changes,
+    HostForwarding,
+    Pauses,
+    destination,
+    kept,
+    unchanged,
+)
+from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
-from rosproxy.forwarding.kernel.targets import KernelTargets
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases import fast_ports
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.net.interfaces import address_towards
+from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
 
+Clock = Callable[[], float]
+"""Seconds of the monotonic clock."""
+OPTION = "--data-plane"
+RETRY_LOST = 30.0
+"""Seconds between attempts to get a kernel plane back that was lost."""
+
 SYNC_PATIENCE = 1.0
 """Seconds that a subscriber's requestTopic waits at most for its forward."""
+OWN_TTL = 60.0
+"""Seconds for which it is remembered which addresses are the proxy's own."""
 
 
-class KernelForwards:
+class ForwardSyncer:
     """The one worker that changes and reads the kernel's table.
 
-    ``on_lost`` is told why the table can't be made any more; it has to say so to ``targets``.
-    ``recovered`` is False until the registry is rebuilt: what a former process left then stays.
+    ``why_not`` tells why the kernel may forward nothing at all; None while it may. ``recovered``
+    is False until the registry is rebuilt: what a former process left then stays.
     """
 
     def __init__(
         self,
-        context: Context,
+        endpoints: ForwardedEndpoints,
         table: KernelTable,
-        targets: KernelTargets,
-        book: KernelBook,
-        on_lost: Callable[[str], None],
+        accounts: KernelAccounts,
+        problems: Problems,
+        clock: Clock,
     ) -> None:
-        self._context, self._table, self._targets = context, table, targets
-        self._book, self._on_lost = book, on_lost
+        self._endpoints, self._table, self._accounts = endpoints, table, accounts
+        self._problems, self._clock = problems, clock
         self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
-        self._changed: set[Endpoint] = set()
+        self._changed: set[ForwardedEndpoint] = set()
         self._all = True
+        self._host, self._pauses = HostForwarding(), Pauses()
+        self._own: dict[str, bool] = {}
+        self._own_until, self._retry_at = 0.0, float("inf")
+        self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 
-    async def begin(self) -> str | None:
-        """Make the table; why that is not possible."""
+    @property
+    def usable(self) -> bool:
+        """Whether the kernel may forward at all."""
+        return self.why_not is None
+
+    async def begin(self) -> None:
+        """Make the table; ``why_not`` tells if that is not possible."""
         async with self._lock:
             try:
                 await self._table.begin()
             except ToolError as error:
-                return str(error)
-        return None
+                self.why_not = str(error)
+            else:
+                self.why_not = None
 
-    def wake(self, endpoint: Endpoint | None = None) -> None:
-        """Say that an endpoint has changed, or any."""
-        if endpoint is not None and self._targets.usable:
+    async def regain(self) -> bool:
+        """Try, now and then, to make a table that was lost; whether that has worked."""
+        if self._clock() < self._retry_at:
+            return False
+        await self.begin()
+        self._retry_at = float("inf") if self.usable else self._clock() + RETRY_LOST
+        return self.usable
+
+    def refuse(self, why: str) -> None:
+        """Forward nothing from now on, for a reason."""
+        self.why_not = why
+
+    def read_host(self) -> None:
+        """Take in what this network namespace forwards now, and at times its own addresses."""
+        self._host = read_forwarding()
+        if self._clock() > self._own_until:
+            self._own, self._own_until = {}, self._clock() + OWN_TTL
+
+    def note_change(self, endpoint: ForwardedEndpoint | None = None) -> None:
+        """Note that an endpoint has changed, or any."""
+        if endpoint is not None and self.usable:
             self._changed.add(endpoint)
         else:
             self._all = True
         self._wake.set()
 
-    async def turn(self) -> None:
-        """Wait for news, and have the kernel forward what is wanted then."""
+    async def run_once(self) -> None:
+        """Wait for a change, and have the kernel forward what is wanted then."""
         await self._wake.wait()
         await self._sync()
 
-    def reason(self, endpoint: Endpoint) -> str:
+    def may_forward(self, endpoint: ForwardedEndpoint) -> bool:
+        """Whether an endpoint's topics could be forwarded if it had a fast port."""
+        return isinstance(self._target(endpoint), HostPort)
+
+    def reason(self, endpoint: ForwardedEndpoint) -> str:
         """Why an endpoint's topics are not forwarded by the kernel; nothing if they are."""
-        where = self._targets.of(endpoint)
+        where = self._target(endpoint)
         if isinstance(where, str):
             return where
         if endpoint.fast_port is None:
-            return fast_ports.why_none(self._context.registry, endpoint)
+            return fast_ports.why_none(self._endpoints.pool, endpoint)
         made = self._table.forwards.get(endpoint.fast_port) == where
         return "" if made else "about to be forwarded"
 
-    async def lead(self, endpoint: Endpoint, tcpros_port: int) -> bool:
+    async def forwards(self, endpoint: ForwardedEndpoint, tcpros_port: int) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
         if self._leads(endpoint, tcpros_port):
             return True
-        self.wake(endpoint)
+        self.note_change(endpoint)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SYNC_PATIENCE):
-                while self._targets.allowed(endpoint) and not self._leads(endpoint, tcpros_port):
+                while self.may_forward(endpoint) and not self._leads(endpoint, tcpros_port):
                     await self._done.wait()
         return self._leads(endpoint, tcpros_port)
 
@@ -99,16 +153,16 @@ class KernelForwards:
         """Wait a moment until a port is not forwarded any more."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SYNC_PATIENCE):
-                while self._targets.usable and port in self._table.forwards:
+                while self.usable and port in self._table.forwards:
                     await self._done.wait()
 
-    async def look(self) -> tuple[Counters, list[Flow]] | None:
+    async def read_kernel(self) -> tuple[Counters, list[Flow]] | None:
         """The kernel's counters and connections.
 
         None if they can't be read; the table is then made again.
         """
         async with self._lock:
-            self._book.note_owners(self._context.registry)
+            self._accounts.note_owners(self._endpoints)
             try:
                 return await self._table.look(), await self._table.flows(self._has_ipv6())
             except (ToolError, NftError) as error:
@@ -122,7 +176,8 @@ class KernelForwards:
         for port in ports:
             where = self._table.forwards.get(port)
             if where is not None:
-                self._targets.pause(port, where)
+                why = f"nothing came back from the node at {where} through the kernel"
+                self._pauses.note(port, where, why, self._clock())
         if ports:
             self._all = True
             await self._sync()
@@ -134,19 +189,35 @@ class KernelForwards:
         await self._sync()
         await self._table.forget(ports)
 
-    def _leads(self, endpoint: Endpoint, tcpros_port: int) -> bool:
-        where, port = HostPort(endpoint.place.address, tcpros_port), endpoint.fast_port
-        return self._targets.usable and port is not None and self._table.forwards.get(port) == where
+    def _target(self, endpoint: ForwardedEndpoint) -> HostPort | str:
+        """Where an endpoint's topics may be forwarded to, or why they may not."""
+        if self.why_not is not None:
+            return self.why_not
+        address = endpoint.address
+        own = {address} if self._is_own(address) else ()
+        where = destination(endpoint, replace(self._host, own=own))
+        if isinstance(where, str) or endpoint.fast_port is None:
+            return where
+        return self._pauses.why(endpoint.fast_port, where, self._clock()) or where
+
+    def _is_own(self, address: str) -> bool:
+        if address not in self._own:
+            self._own[address] = address_towards(address) == address
+        return self._own[address]
+
+    def _leads(self, endpoint: ForwardedEndpoint, tcpros_port: int) -> bool:
+        where, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
+        return self.usable and port is not None and self._table.forwards.get(port) == where
 
     def _has_ipv6(self) -> bool:
-        return any(":" in endpoint.place.address for endpoint in self._book.owners.values())
+        return any(":" in endpoint.address for endpoint in self._accounts.owners.values())
 
     async def _sync(self) -> None:
         async with self._lock:
             self._wake.clear()
-            self._book.note_owners(self._context.registry)
-            self._targets.keep(self._book.owners)
-            if self._targets.usable:
+            self._accounts.note_owners(self._endpoints)
+            self._pauses.keep(self._accounts.owners)
+            if self.usable:
                 await self._change()
             done, self._done = self._done, asyncio.Event()
             done.set()
@@ -163,27 +234,34 @@ class KernelForwards:
         try:
             await self._table.make(wanted)
         except ToolError as error:
-            self._all = True
-            self._on_lost(str(error))
+            self._lose(str(error))
+
+    def _lose(self, why: str) -> None:
+        self._all, self.why_not = True, why
+        self._retry_at = self._clock() + RETRY_LOST
+        self._accounts.note_peers([])
+        text = f"topics are no longer forwarded by the kernel: {why}"
+        log.error("%s", text)
+        self._problems.add(OPTION, text)
 
     def _wanted(self) -> dict[int, HostPort]:
-        registry, now = self._context.registry, self._table.forwards
+        now = self._table.forwards
         changed, self._changed = self._changed, set()
         if self._all or not self.recovered:
-            self._all, changed = False, set(registry)
+            self._all, changed = False, set(self._endpoints)
             wanted = kept(now, changed, self.recovered)
         else:
-            wanted = unchanged(now, self._book.owners, changed)
+            wanted = unchanged(now, self._accounts.owners, changed)
         for endpoint in changed:
-            where = self._targets.of(endpoint) if endpoint.fast_port else ""
-            held = registry.by_port.get(endpoint.port) is endpoint
+            where = self._target(endpoint) if endpoint.fast_port else ""
+            held = self._endpoints.by_port.get(endpoint.port) is endpoint
             if held and endpoint.fast_port and isinstance(where, HostPort):
                 wanted[endpoint.fast_port] = where
         return wanted
 
     def _log(self, change: Changes) -> None:
         for port in {**change.removed, **change.added}:
-            endpoint, where = self._book.owners.get(port), change.added.get(port)
+            endpoint, where = self._accounts.owners.get(port), change.added.get(port)
             name = endpoint.label if endpoint else "a node that is gone"
             if where:
                 log.info("%s: the kernel forwards port %d to %s", name, port, where)

@@ -15,21 +15,21 @@ import socket
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
-from rosproxy.forwarding.relay import Relay, reset_on_close
+from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
-from rosproxy.net import listeners
-from rosproxy.net.acceptor import Acceptor, first_bytes
+from rosproxy.net import sockets
+from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort, is_inside
-from rosproxy.net.dialing import dial
-from rosproxy.net.http_server import Call, XmlRpcServer
 from rosproxy.net.interfaces import address_towards
 from rosproxy.ros1.alias import policy
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.servers.dispatch import dispatch
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer
 
 log = logging.getLogger(__name__)
 
@@ -125,7 +125,7 @@ class Alias:
                 return f"is one too many: {MOST_PORTS} others stand in for nodes and are in use"
             self._close(oldest)
         try:
-            sock = listeners.listen(self._context.settings.bind, port)
+            sock = sockets.listen(self._context.settings.bind, port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
         self._acceptors[port] = Acceptor(
@@ -158,7 +158,7 @@ class Alias:
     async def _refuses(self, port: int) -> bool:
         """Whether nobody listens at a port of the master's host."""
         try:
-            (await dial(self._target(port), LOOK_TIMEOUT)).close()
+            (await sockets.dial(self._target(port), LOOK_TIMEOUT)).close()
         except ConnectionRefusedError:
             return True
         except OSError as error:
@@ -196,21 +196,15 @@ class Alias:
             conn.close()
             return
         self._note_used(port)
-        first = await first_bytes(conn)
-        if len(first) < 4:
-            conn.close()
-        elif speaks_http(first):
-            await self._server.serve(conn)
-        else:
-            await self._relay(port, conn, peer)
+        await dispatch(conn, self._server, partial(self._relay, port, peer))
 
-    async def _relay(self, port: int, conn: socket.socket, peer: str) -> None:
+    async def _relay(self, port: int, peer: str, conn: socket.socket) -> None:
         """Relay TCPROS as it is."""
         try:
-            node = await dial(self._target(port), CONNECT_TIMEOUT)
+            node = await sockets.dial(self._target(port), CONNECT_TIMEOUT)
         except OSError as error:
             log.debug("port %d of %s: %s", port, self._name, error)
-            reset_on_close(conn)
+            sockets.reset_on_close(conn)
             conn.close()
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(port)
@@ -219,7 +213,7 @@ class Alias:
         relay.splice = self._context.settings.data_plane != "copy"
         self._relays.start(relay, lambda ended: self._note_used(ended.port))
 
-    async def _forward(self, call: Call) -> bytes:
+    async def _forward(self, call: IncomingCall) -> bytes:
         """A node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
             raise Unreachable(f"the address of {self._name} leads back to the proxy itself")

@@ -9,17 +9,13 @@ passes on what arrives there. The URIs stay as they are, and nothing has to be m
 from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
-from rosproxy.ros1.protocol.master_methods import Reply, row
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.rewriting.master_api import Answer
 from rosproxy.ros1.rewriting.slave_api import ros_triple, send_to, tcpros_address
 from rosproxy.settings import Settings
-
-_URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 
 
 def aliased_host(master_uri: str) -> str | None:
@@ -28,21 +24,6 @@ def aliased_host(master_uri: str) -> str | None:
     if where is None or is_address(where.host) or is_loopback(where.host):
         return None
     return where.host.lower()
-
-
-def uris_in_answer(answer: Answer) -> Iterator[str]:
-    """The URIs that a reply of the master hands to an inside node."""
-    for result in answer.results:
-        held = result.triple.items[2]
-        if result.accepted and row(result.call.method).reply in _URIS:
-            texts = (item.string() for item in (held.items or [held]))
-            yield from (text for text in texts if text)
-
-
-def announced_publishers(call: Call) -> Iterator[str]:
-    """The publishers that a ``publisherUpdate`` names."""
-    if call.method == "publisherUpdate" and len(call.params) > 2:
-        yield from (text for item in call.params[2].items if (text := item.string()))
 
 
 def ports_needed(uris: Iterable[str], host: str, addressing: Addressing) -> dict[int, str]:

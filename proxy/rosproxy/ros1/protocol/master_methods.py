@@ -60,6 +60,39 @@ MASTER_METHODS: dict[str, Row] = {
 
 NO_ROW = Row()
 
+_SLAVE_METHODS = frozenset(
+    {
+        "getBusInfo",
+        "getBusStats",
+        "getMasterUri",
+        "getName",
+        "getPid",
+        "getPublications",
+        "getSubscriptions",
+        "getUri",
+        "paramUpdate",
+        "publisherUpdate",
+        "requestTopic",
+        "shutdown",
+    }
+)
+_OTHER_MASTER_METHODS = frozenset(
+    {
+        "deleteParam",
+        "getParam",
+        "getParamNames",
+        "getPublishedTopics",
+        "getSystemState",
+        "getTopicTypes",
+        "hasParam",
+        "searchParam",
+        "setParam",
+        "system.multicall",
+    }
+)
+KNOWN_METHODS = _SLAVE_METHODS | _OTHER_MASTER_METHODS | frozenset(MASTER_METHODS)
+"""The methods of both APIs, those of slaves as well."""
+
 
 def row(method: str) -> Row:
     """The row of a method; an empty one if nothing in it is rewritten."""

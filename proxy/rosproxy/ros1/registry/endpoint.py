@@ -1,11 +1,13 @@
 """An endpoint: a node behind the proxy, where it is, what it registered, the port it holds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.health import Health, ProbeResult
+
+STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "unverified")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +91,59 @@ class Endpoint:
         self.trusted, self.tcpros_port = True, tcpros_port
         self.health.note(ProbeResult.ANSWERED, now)
         self.health.pid, self.health.cleaned = pid, False
+
+    def confirm(self) -> None:
+        """Note that the node registered from its own address: what it says is believed."""
+        self.place, self.trusted = replace(self.place, confirmed=True), True
+
+    def note_tcpros_port(self, port: int, topic: str) -> None:
+        """Note the TCPROS port that the node named for a topic.
+
+        By topic only for those that it has registered: roscpp names its port for any topic, so
+        anybody could have names remembered without end.
+        """
+        self.tcpros_port = port
+        if self.publishes(topic):
+            self.topic_ports[topic] = port
+
+    def replace_tcpros_ports(self, port: int | None) -> None:
+        """Note the TCPROS port that the node names now, in place of all before."""
+        self.topic_ports.clear()
+        self.tcpros_port = port
+
+    def note_connection(self) -> None:
+        """Note that somebody outside has connected through the proxy."""
+        self.connections += 1
+        self.idle_since = None
+
+    def note_disconnection(self) -> None:
+        """Note that such a connection has ended."""
+        self.connections -= 1
+
+    @property
+    def address(self) -> str:
+        """The IP address at which the proxy reaches the node."""
+        return self.place.address
+
+    @property
+    def state(self) -> str:
+        """One word for its state: one of STATES."""
+        return self.health.state if self.trusted else "unverified"
+
+    @property
+    def is_down(self) -> bool:
+        """Whether the node is known not to answer, so that its port refuses."""
+        return self.health.down
+
+    @property
+    def answers(self) -> bool:
+        """Whether the node is known to be there, as far as the proxy can tell."""
+        return self.trusted and not self.health.down
+
+    @property
+    def tcpros_ports(self) -> set[int]:
+        """The TCPROS ports that the node has named."""
+        return {port for port in (self.tcpros_port, *self.topic_ports.values()) if port}
 
     @property
     def direct(self) -> bool:

@@ -1,14 +1,17 @@
 """The master API as inside nodes call it: calls rewritten on the way out, replies on the way in.
 
 A request is one call or a ``system.multicall`` of several; each follows its own row of
-``rosproxy.ros1.protocol.master_methods``. Rows and traps: http://wiki.ros.org/ROS/Master_API and
+``rosproxy.ros1.protocol.master_methods``. It goes one way through four steps, each of which makes
+a new value of the one before and changes nothing: `read_request`, `export_request` (once it is
+known which nodes are admitted), `read_reply`, which tells what the registry has to learn, and
+`import_reply`. Rows and traps: http://wiki.ros.org/ROS/Master_API and
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-from rosproxy.ros1.protocol.master_methods import Reply, Row, resolve_name, row
+from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, row
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
@@ -33,24 +36,24 @@ class Refusal:
         return [-1, self.reason, 0]
 
 
+_URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 Admission = Endpoint | Refusal | None
 """What became of a call that registers or unregisters: its endpoint, or why it has none."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Request:
-    """A request of an inside node and what is known of it.
+    """A request of an inside node, read: one call, or the calls of a ``system.multicall``.
 
     ``calls`` holds None for an element of a multicall that is no call; ``items`` are those
-    elements, and ``admissions`` has one for each call.
+    elements as they were sent.
     """
 
     body: bytes
-    calls: list[Call | None]
+    calls: tuple[Call | None, ...]
     multicall: bool
     asker: Asker
-    items: list[Value] = field(default_factory=list)
-    admissions: list[Admission] = field(default_factory=list)
+    items: Sequence[Value] = ()
 
     @property
     def method(self) -> str:
@@ -62,11 +65,26 @@ class Request:
     @property
     def plain(self) -> bool:
         """Whether request and reply pass untouched."""
-        return all(call is None or row(call.method) == Row() for call in self.calls)
+        return all(call is None or row(call.method) == NO_ROW for call in self.calls)
 
-    def forwarded(self) -> list[int]:
-        """Which calls the master gets to see."""
-        return [i for i, a in enumerate(self.admissions) if not isinstance(a, Refusal)]
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """A request made ready for the master, and what became of each of its calls.
+
+    ``body`` is what the master gets; None if it gets nothing, since all calls were refused.
+    An ``outcome`` is the endpoint whose registration the call makes or ends, None for another
+    call, or a refusal.
+    """
+
+    request: Request
+    outcomes: tuple[Admission, ...]
+    body: bytes | None
+
+    def refused_reply(self) -> bytes:
+        """The whole reply to a request of which the master gets nothing."""
+        triples = [one.triple() for one in self.outcomes if isinstance(one, Refusal)]
+        return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +102,6 @@ class Result:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """The master's reply to a request; ``results`` leaves out faults and malformed triples."""
-
-    body: bytes
-    value: Value | None
-    results: list[Result]
-
-
-@dataclass(frozen=True, slots=True)
 class Noted:
     """A fact from an accepted call, for the registry.
 
@@ -103,91 +112,117 @@ class Noted:
     endpoint: Endpoint | None
 
 
+@dataclass(frozen=True, slots=True)
+class MasterReply:
+    """The master's reply, matched with its request.
+
+    ``results`` leaves out faults and malformed triples.
+    """
+
+    exported: Exported
+    body: bytes
+    value: Value | None
+    results: tuple[Result, ...]
+
+    def facts(self, now: float) -> list[Noted]:
+        """What the registry has to learn from the calls that the master accepted.
+
+        The master also accepts what changes nothing: a node that makes room for another of its
+        name unregisters with its own URI, and the other's registrations stay.
+        """
+        found = []
+        for result in self.results:
+            held = _registration(result.call, now)
+            if held and result.accepted and result.endpoint:
+                made = row(result.call.method).registers is not None
+                found.append(Noted(held, result.endpoint if made else None))
+        return found
+
+    def uris(self) -> Iterator[str]:
+        """The URIs that it hands to an inside node, as the master holds them."""
+        for result in self.results:
+            held = result.triple.items[2]
+            if result.accepted and row(result.call.method).reply in _URIS:
+                texts = (item.string() for item in (held.items or [held]))
+                yield from (text for text in texts if text)
+
+
 def read_request(body: bytes, asker: Asker) -> Request:
     """Parse a request. Raises XmlRpcError if it is none."""
     call = xmlrpc.parse_call(body)
     if call.method != MULTICALL:
-        return Request(body, [call], False, _named(asker, _caller_id(call)))
-    calls = inner_calls(call)
+        return Request(body, (call,), False, _named(asker, _caller_id(call)))
+    calls = tuple(inner_calls(call))
     caller_id = next((_caller_id(inner) for inner in calls if inner), "")
-    items = inner_items(call)
-    return Request(body, calls, True, _named(asker, caller_id), items)
+    return Request(body, calls, True, _named(asker, caller_id), inner_items(call))
 
 
 def registering_uri(call: Call | None) -> str | None:
     """The slave URI that a call registers, if it is a complete registration."""
-    found = row(call.method) if call else Row()
+    found = row(call.method) if call else NO_ROW
     if call is None or found.registers is None or found.caller_api is None:
         return None
     return call.string(found.caller_api)
 
 
-def export_request(request: Request, addressing: Addressing) -> bytes:
+def export_request(
+    request: Request, admissions: Sequence[Admission], addressing: Addressing
+) -> Exported:
     """The request for the master: URIs exported, refused calls left out.
 
-    A call that unregisters gets the endpoint of its registration as its admission.
+    ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
+    registration instead.
     """
-    edits: list[Edit] = []
-    for index, call in enumerate(request.calls):
+    asker, edits = request.asker, list[Edit]()
+    outcomes: list[Admission] = []
+    for call, admission in zip(request.calls, admissions, strict=True):
+        outcome = admission
         if call and row(call.method).unregisters:
-            request.admissions[index] = _holder(call, request.asker, addressing)
-    for call, admission in zip(request.calls, request.admissions, strict=True):
-        if call and not isinstance(admission, Refusal):
-            edits += _export_call(call, admission, request.asker, addressing)
-    return xmlrpc.apply(request.body, edits + _without_refused(request))
+            outcome = _holder(call, asker, addressing)
+        if call and not isinstance(outcome, Refusal):
+            edits += _export_call(call, outcome, asker, addressing)
+        outcomes.append(outcome)
+    refused = [isinstance(outcome, Refusal) for outcome in outcomes]
+    if refused and all(refused):
+        return Exported(request, tuple(outcomes), None)
+    edits += [xmlrpc.remove(item) for item, out in zip(request.items, refused, strict=False) if out]
+    return Exported(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
 
 
-def local_reply(request: Request) -> bytes | None:
-    """The whole reply if no call of the request is to be forwarded, else None."""
-    if request.forwarded() or not request.calls:
-        return None
-    triples = [a.triple() for a in request.admissions if isinstance(a, Refusal)]
-    return xmlrpc.dump_reply([[t] for t in triples] if request.multicall else triples[0])
-
-
-def read_answer(request: Request, reply: bytes) -> Answer:
+def read_reply(exported: Exported, reply: bytes) -> MasterReply:
     """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response."""
     value = xmlrpc.parse_reply(reply)
-    return Answer(reply, value, list(_results(request, value)) if value else [])
+    return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
 
-def import_answer(request: Request, answer: Answer, addressing: Addressing) -> bytes:
+def import_reply(reply: MasterReply, addressing: Addressing) -> bytes:
     """The reply for the inside node: URIs imported, refused calls answered."""
     edits: list[Edit] = []
-    for result in answer.results:
+    request = reply.exported.request
+    for result in reply.results:
         if row(result.call.method).reply is not Reply.OTHER:
             asker = request.asker
             if result.endpoint and result.endpoint is not asker.endpoint:
                 asker = replace(asker, endpoint=result.endpoint)
             edits += _import_result(result, asker, addressing)
-    if request.multicall and answer.value and answer.value.items:
-        edits += insert_items(answer.value, _refused_results(request))
-    return xmlrpc.apply(answer.body, edits)
+    if request.multicall and reply.value and reply.value.items:
+        edits += insert_items(reply.value, _refused_results(reply.exported))
+    return xmlrpc.apply(reply.body, edits)
 
 
-def rename_master(answer: Answer, master: str) -> bytes:
-    """The reply with the master's own URI, where getUri asked for it, as ``master`` is reached."""
+def rename_master(request: Request, reply: bytes, master: str) -> bytes:
+    """A reply with the master's own URI, where getUri asked for it, as ``master`` is reached.
+
+    Nothing else in it is changed. Raises XmlRpcError.
+    """
+    if not any(call and call.method == "getUri" for call in request.calls):
+        return reply
     edits: list[Edit] = []
-    for result in answer.results:
+    for result in read_reply(Exported(request, (None,) * len(request.calls), None), reply).results:
         text = result.triple.items[2].string()
         if row(result.call.method).reply is Reply.MASTER_URI and text:
             edits += _import_one(result.triple, text, f"http://{master}/")
-    return xmlrpc.apply(answer.body, edits)
-
-
-def noted(answer: Answer, now: float) -> list[Noted]:
-    """What the registry has to learn from the calls that the master accepted.
-
-    The master also accepts what changes nothing: a node that makes room for another of its name
-    unregisters with its own URI, and the other's registrations stay.
-    """
-    facts = []
-    for result in answer.results:
-        held = _registration(result.call, now)
-        if held and result.accepted and result.endpoint:
-            made = row(result.call.method).registers is not None
-            facts.append(Noted(held, result.endpoint if made else None))
-    return facts
+    return xmlrpc.apply(reply, edits)
 
 
 def _named(asker: Asker, caller_id: str) -> Asker:
@@ -245,28 +280,24 @@ def _string_at(call: Call, index: int | None) -> Value | None:
     return call.params[index]
 
 
-def _without_refused(request: Request) -> list[Edit]:
-    refused = zip(request.items, request.admissions, strict=False)
-    return [xmlrpc.remove(item) for item, a in refused if isinstance(a, Refusal)]
-
-
-def _refused_results(request: Request) -> list[tuple[int, bytes]]:
+def _refused_results(exported: Exported) -> list[tuple[int, bytes]]:
     return [
-        (i, xmlrpc.dump_value([admission.triple()]))
-        for i, admission in enumerate(request.admissions)
-        if isinstance(admission, Refusal)
+        (i, xmlrpc.dump_value([outcome.triple()]))
+        for i, outcome in enumerate(exported.outcomes)
+        if isinstance(outcome, Refusal)
     ]
 
 
-def _results(request: Request, value: Value) -> Iterator[Result]:
+def _results(exported: Exported, value: Value) -> Iterator[Result]:
     """The calls that went to the master with their ROS triples; faults are left out."""
     triples: Sequence[Value | None] = [value]
-    if request.multicall:
+    if exported.request.multicall:
         triples = [item.items[0] if item.items else None for item in value.items]
-    for index, triple in zip(request.forwarded(), triples, strict=False):
-        call, admission = request.calls[index], request.admissions[index]
+    pairs = zip(exported.request.calls, exported.outcomes, strict=True)
+    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, Refusal)]
+    for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and triple.kind == "array" and len(triple.items) == 3:
-            yield Result(call, triple, admission if isinstance(admission, Endpoint) else None)
+            yield Result(call, triple, endpoint)
 
 
 def _import_result(result: Result, asker: Asker, addressing: Addressing) -> list[Edit]:

@@ -4,6 +4,7 @@ Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
 clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import HostPort
@@ -75,6 +76,26 @@ def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing)
     else:
         edits = []
     return xmlrpc.apply(reply, edits)
+
+
+def announced_publishers(call: Call) -> Iterator[str]:
+    """The publishers that a ``publisherUpdate`` names; nothing for other calls."""
+    if call.method == "publisherUpdate" and len(call.params) > 2:
+        yield from (text for item in call.params[2].items if (text := item.string()))
+
+
+def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
+    """Whether a ``publisherUpdate`` lacks a publisher that is being registered anew.
+
+    A newer one follows; a subscriber inside need not drop its connection in between.
+    """
+    topic, listed = call.string(1) or "", set(announced_publishers(call))
+    return any(
+        endpoint.settles_at > now
+        and endpoint.publishes(topic)
+        and addressing.advertised_uri(endpoint) not in listed
+        for endpoint in addressing.registry
+    )
 
 
 def topic_port(call: Call, reply: bytes) -> TopicPort | None:

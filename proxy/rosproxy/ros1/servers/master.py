@@ -1,23 +1,22 @@
-"""The master port: inside nodes call it as their master."""
+"""The master port: inside nodes call it as their master.
 
-import logging
+A call that registers or names an address goes one way: its node is admitted (`admission`), its
+addresses are exported, the master is called, what it accepted is noted in the registry, and the
+addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
+they are.
+"""
+
 from dataclasses import replace
 
-from rosproxy.net.http_server import Call
-from rosproxy.ros1.alias import policy
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Answer, Request
-from rosproxy.ros1.upkeep.adoption.adopter import Adopter
-from rosproxy.ros1.upkeep.recovery.recovery import Recovery
-
-log = logging.getLogger(__name__)
+from rosproxy.ros1.rewriting.master_api import MasterReply, Request
+from rosproxy.ros1.servers.admission import NodeAdmission
+from rosproxy.ros1.servers.needs import AliasPorts, Recovering, TakingOver
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
 
 
 class MasterApi:
@@ -30,76 +29,65 @@ class MasterApi:
     def __init__(
         self,
         context: Context,
-        leases: Leases,
-        alias: Alias,
-        recovery: Recovery,
-        adopter: Adopter,
+        admission: NodeAdmission,
+        alias: AliasPorts,
+        recovery: Recovering,
+        adopter: TakingOver,
     ) -> None:
-        self._context, self._leases, self._alias = context, leases, alias
+        self._context, self._admission, self._alias = context, admission, alias
         self._recovery, self._adopter = recovery, adopter
 
-    async def __call__(self, call: Call) -> bytes:
+    async def __call__(self, call: IncomingCall) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
+        count = self._context.metrics.count
         try:
             request = master_api.read_request(call.body, asker)
         except xmlrpc.XmlRpcError:
-            self._context.metrics.count("master", "other", "malformed")
+            count("master", "other", "malformed")
             raise
         try:
-            reply = await self._reply(request)
+            if request.plain:
+                reply = await self._context.upstream.post_to_master(request.body)
+            else:
+                reply = await self._rewrite(request)
         except Unreachable:
-            self._context.metrics.count("master", request.method, "unreachable")
+            count("master", request.method, "unreachable")
             raise
-        self._context.metrics.count("master", request.method, "answered")
+        count("master", request.method, "answered")
         return reply
 
-    async def _reply(self, request: Request) -> bytes:
-        if request.plain:
-            return await self._context.upstream.post_to_master(request.body)
+    async def _rewrite(self, request: Request) -> bytes:
+        """Admit, export, call the master, note, import."""
         await self._recovery.ensure()
-        self._context.refresh_networks(request.asker.address)
-        pending: list[Endpoint] = []
-        try:
-            for call in request.calls:  # one after the other: they may register the same new node
-                admission = await self._leases.admit(call, request.asker) if call else None
-                request.admissions.append(admission)
-                if isinstance(admission, Endpoint):
-                    pending.append(admission)
-                    await self._adopter.take_over(admission, call.string(0) or "" if call else "")
-            return await self._forward(request)
-        finally:
-            for endpoint in pending:
-                endpoint.pending -= 1
+        addressing = self._context.addressing
+        async with self._admission.of(request, self._adopter) as admissions:
+            exported = master_api.export_request(request, admissions, addressing)
+            if exported.body is None:
+                return exported.refused_reply()
+            answer = await self._context.upstream.post_to_master(exported.body)
+            reply = master_api.read_reply(exported, answer)
+            self._note(reply, request.asker.address)
+            await self._alias.listen_for(reply.uris())
+            return master_api.import_reply(reply, addressing)
 
-    async def _forward(self, request: Request) -> bytes:
-        local = master_api.local_reply(request)
-        if local is not None:
-            return local
-        body = master_api.export_request(request, self._context.addressing)
-        reply = await self._context.upstream.post_to_master(body)
-        answer = master_api.read_answer(request, reply)
-        self._note(answer, request.asker)
-        await self._alias.listen_for(policy.uris_in_answer(answer))
-        return master_api.import_answer(request, answer, self._context.addressing)
-
-    def _note(self, answer: Answer, asker: Asker) -> None:
+    def _note(self, reply: MasterReply, source: str) -> None:
         """Take in what the master accepted.
 
         A service's port is believed only from the node's own address: anybody may register a
         service in another node's name, and its port would be opened to outside.
         """
-        registry, now = self._context.registry, self._context.now()
-        for fact in master_api.noted(answer, now):
+        registry = self._context.registry
+        for fact in reply.facts(self._context.now()):
             held = fact.registration
             if fact.endpoint is None:
                 registry.unregister(held.kind, held.name, held.caller_id)
             elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
-                own = asker.address == fact.endpoint.place.address
+                own = source == fact.endpoint.place.address
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
 
-    def _refuse_loop(self, call: Call) -> None:
+    def _refuse_loop(self, call: IncomingCall) -> None:
         if not call.comes_from(self._context.instance):
             return
         what = "a node's address"
@@ -117,13 +105,9 @@ class PublishedMaster:
     def __init__(self, context: Context, address: str) -> None:
         self._context, self._address = context, address
 
-    async def __call__(self, call: Call) -> bytes:
+    async def __call__(self, call: IncomingCall) -> bytes:
         """The master's reply to a call. Raises XmlRpcError, Unreachable."""
         asker = Asker(call.source, call.local.host, master=self._address)
         request = master_api.read_request(call.body, asker)
-        request.admissions = [None] * len(request.calls)
         reply = await self._context.upstream.post_to_master(call.body)
-        if not any(inner and inner.method == "getUri" for inner in request.calls):
-            return reply
-        answer = master_api.read_answer(request, reply)
-        return master_api.rename_master(answer, self._address)
+        return master_api.rename_master(request, reply, self._address)

@@ -1,12 +1,15 @@
-"""The slave API of inside nodes, as outside and the master reach it through a lease."""
+"""The slave API of inside nodes, as outside and the master reach it through a lease.
+
+The port at which a call arrives says which node is meant. The call is forwarded to it, with the
+addresses in it imported and those in its reply exported (`rosproxy.ros1.rewriting.slave_api`). What
+the calls tell is noted: the TCPROS port that a node names, and that a node refuses.
+"""
 
 import asyncio
 import logging
 
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.http_server import Call
-from rosproxy.ros1.alias import policy as alias_policy
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_inside_path
@@ -14,11 +17,10 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import Change, ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting import slave_api
-from rosproxy.ros1.rewriting.slave_api import TopicPort, Visit
-from rosproxy.ros1.upkeep.adoption import policy as adoption_policy
-from rosproxy.ros1.upkeep.adoption.adopter import Adopter
+from rosproxy.ros1.rewriting.slave_api import Visit
+from rosproxy.ros1.servers.needs import AliasPorts, TakingOver
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
 
 log = logging.getLogger(__name__)
 
@@ -29,11 +31,17 @@ REGISTRATION_GRACE = 0.5
 class SlaveApi:
     """Forwards slave API calls to the node behind the port at which they arrive."""
 
-    def __init__(self, context: Context, leases: Leases, alias: Alias, adopter: Adopter) -> None:
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases[Endpoint],
+        alias: AliasPorts,
+        adopter: TakingOver,
+    ) -> None:
         self._context, self._leases, self._alias = context, leases, alias
         self._adopter = adopter
 
-    async def __call__(self, call: Call) -> bytes:
+    async def __call__(self, call: IncomingCall) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
         endpoint = self._context.registry.by_port.get(call.local.port)
         if call.comes_from(self._context.instance):
@@ -60,7 +68,9 @@ class SlaveApi:
         said = parse_inside_path(path)
         return said is None or (said.address or said.node.host, said.node.port) == endpoint.key
 
-    async def _result(self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: Call) -> bytes:
+    async def _result(
+        self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: IncomingCall
+    ) -> bytes:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
@@ -68,7 +78,7 @@ class SlaveApi:
         reply = await self._one(endpoint, xmlrpc.parse_call(single.body), single)
         return multicall.result_value(reply)
 
-    async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+    async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
         if not await self._may(parsed.method, call.source):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
@@ -80,14 +90,14 @@ class SlaveApi:
         self._context.metrics.count("slave", parsed.method, "answered")
         return reply
 
-    async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: Call) -> bytes:
+    async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
         if await self._is_void(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.rewritten(parsed):
             return await self._ask(endpoint, call.body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
-            await self._alias.listen_for(alias_policy.announced_publishers(parsed))
+            await self._alias.listen_for(slave_api.announced_publishers(parsed))
         self._context.refresh_networks()
         visit = self._visit(endpoint, call, endpoint.port)
         addressing = self._context.addressing
@@ -95,7 +105,7 @@ class SlaveApi:
         reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
         said = slave_api.topic_port(parsed, reply)
         if said is not None:
-            self._note_port(endpoint, said)
+            endpoint.note_tcpros_port(said.port, said.topic)
             port = await self._leases.fast_port(endpoint, said.port) or endpoint.port
             visit = self._visit(endpoint, call, port)
         return slave_api.export_reply(parsed, reply, visit, addressing)
@@ -107,10 +117,7 @@ class SlaveApi:
             return await self._adopter.absorb_shutdown(endpoint, caller_id, reason)
         if parsed.method != "publisherUpdate":
             return False
-        topic, uris = parsed.string(1) or "", alias_policy.announced_publishers(parsed)
-        return adoption_policy.is_outdated(
-            topic, uris, self._context.addressing, self._context.now()
-        )
+        return slave_api.is_outdated(parsed, self._context.addressing, self._context.now())
 
     async def _after_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach the node first.
@@ -121,15 +128,6 @@ class SlaveApi:
         deadline = self._context.now() + REGISTRATION_GRACE
         while endpoint.pending and self._context.now() < deadline:  # noqa: ASYNC110 - rare, short
             await asyncio.sleep(0.002)
-
-    def _note_port(self, endpoint: Endpoint, said: TopicPort) -> None:
-        """Note a TCPROS port; by topic only for topics that the node has registered.
-
-        roscpp names its port for any topic, so anybody could have names remembered without end.
-        """
-        endpoint.tcpros_port = said.port
-        if endpoint.publishes(said.topic):
-            endpoint.topic_ports[said.topic] = said.port
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         try:
@@ -147,7 +145,7 @@ class SlaveApi:
             log.info("%s is gone: %s", endpoint.label, error)
             self._leases.close(endpoint)
 
-    def _visit(self, endpoint: Endpoint, call: Call, port: int) -> Visit:
+    def _visit(self, endpoint: Endpoint, call: IncomingCall, port: int) -> Visit:
         """A call at an endpoint, whose topics the caller is to find at a ``port``."""
         reached = self._context.addressing.outside(port)
         if call.reached_locally:

@@ -1,20 +1,23 @@
-"""TCPROS through a lease: read the connection header, find the node's port, relay."""
+"""TCPROS through a lease: read the connection header, find the node's port, relay.
+
+A client sends a connection header that names a topic or a service. The node behind the lease has a
+TCPROS port of its own, which it has named itself (in a reply to ``requestTopic``, in a service URI)
+or is asked for now. The header is sent on to that port, and the bytes are relayed from then on.
+"""
 
 import asyncio
 import logging
 import socket
 
-from rosproxy.forwarding.relay import Relay, reset_on_close
+from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
-from rosproxy.net.acceptor import read_header
+from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.net.dialing import CONNECT_TIMEOUT, dial
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.upkeep.resubscription.policy import Connection
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
@@ -41,7 +44,7 @@ class TcprosServer:
         """The open connections."""
         return list(self._relays)
 
-    def topic_connections(self) -> set[Connection]:
+    def topic_connections(self) -> set[tuple[int, str, str]]:
         """The open connections of topics: port, topic and the subscriber's name."""
         return {(r.port, r.name, r.caller_id) for r in self._relays if r.kind == "topic"}
 
@@ -59,10 +62,10 @@ class TcprosServer:
         for relay in self._relays:
             relay.sample(now)
 
-    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+    async def serve(self, endpoint: Endpoint, peer: str, conn: socket.socket) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
-            header = await read_header(conn)
+            header = await _read_header(conn)
             fields = decode_header(header[4:])
         except HeaderError as error:
             await self._answer_error(conn, f"rosproxy: {error}")
@@ -106,8 +109,7 @@ class TcprosServer:
 
     async def _ask_port(self, endpoint: Endpoint) -> int | None:
         info = await self._nodes.inspect(endpoint.slave)
-        endpoint.topic_ports.clear()
-        endpoint.tcpros_port = info.tcpros_port if info else None
+        endpoint.replace_tcpros_ports(info.tcpros_port if info else None)
         return endpoint.tcpros_port
 
     def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
@@ -130,8 +132,7 @@ class TcprosServer:
         relay = Relay(
             endpoint.port, kind, name, caller_id, peer, conn, inside, splice=self._may_splice
         )
-        endpoint.connections += 1
-        endpoint.idle_since = None
+        endpoint.note_connection()
         self._relays.start(relay, lambda ended: self._finished(endpoint, ended))
 
     def _registered_name(self, endpoint: Endpoint, kind: str, name: str) -> str:
@@ -140,13 +141,13 @@ class TcprosServer:
         return name if name in endpoint.names(wanted) else "unregistered"
 
     def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
-        endpoint.connections -= 1
+        endpoint.note_disconnection()
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
     def _fail(self, endpoint: Endpoint, conn: socket.socket, fields: dict[str, str]) -> None:
         """Reset, as a node that is gone would: roscpp and rospy try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
-        reset_on_close(conn)
+        sockets.reset_on_close(conn)
         conn.close()
         if endpoint.registrations:
             self._report(endpoint, fields)
@@ -170,9 +171,19 @@ class TcprosServer:
             conn.close()
 
 
+async def _read_header(conn: socket.socket) -> bytes:
+    """Take a connection header off the socket: its four bytes of length and its body.
+
+    Raises HeaderError if it is too long, EOFError, TimeoutError, OSError.
+    """
+    async with asyncio.timeout(sockets.SILENCE_TIMEOUT):
+        first = await sockets.read_exactly(conn, 4)
+        return first + await sockets.read_exactly(conn, header_length(first))
+
+
 async def _dial(address: str, port: int) -> socket.socket | None:
     try:
-        return await dial(HostPort(address, port))
+        return await sockets.dial(HostPort(address, port))
     except (OSError, TimeoutError) as error:
         log.debug("connecting to %s:%d: %s", address, port, error)
         return None
@@ -181,7 +192,7 @@ async def _dial(address: str, port: int) -> socket.socket | None:
 async def _hand_on(header: bytes, inside: socket.socket) -> bool:
     """Send a node the header that was read; closes the connection to it if that fails."""
     try:
-        async with asyncio.timeout(CONNECT_TIMEOUT):
+        async with asyncio.timeout(sockets.CONNECT_TIMEOUT):
             await asyncio.get_running_loop().sock_sendall(inside, header)
     except (OSError, TimeoutError) as error:
         log.debug("handing a header on: %s", error)

@@ -101,12 +101,16 @@ def swapped_booleans(value: Any) -> Any:
     return str(int(value)) if isinstance(value, bool) else value
 
 
+def exported(request: master_api.Request) -> master_api.Exported:
+    """The request for the master, of a node that is not admitted."""
+    return master_api.export_request(request, [None] * len(request.calls), WORLD)
+
+
 @given(st.sampled_from(METHODS), st.lists(VALUES, max_size=4))
 def test_a_call_without_addresses_comes_out_byte_for_byte(method: str, values: list[Any]) -> None:
     body = py_call(method, *values)
     request = master_api.read_request(body, ASKER)
-    request.admissions = [None] * len(request.calls)
-    assert master_api.export_request(request, WORLD) == body
+    assert exported(request).body == body
 
 
 @given(st.sampled_from(METHODS), VALUES, st.sampled_from([1, 0, -1]))
@@ -114,10 +118,9 @@ def test_a_reply_without_addresses_comes_out_byte_for_byte(
     method: str, value: Any, status: int
 ) -> None:
     request = master_api.read_request(py_call(method, "/node"), ASKER)
-    request.admissions = [None] * len(request.calls)
     for reply in (py_reply(value), py_reply([status, "said", value])):
-        answer = master_api.read_answer(request, reply)
-        assert master_api.import_answer(request, answer, WORLD) == reply
+        answer = master_api.read_reply(exported(request), reply)
+        assert master_api.import_reply(answer, WORLD) == reply
 
 
 @given(
@@ -141,8 +144,7 @@ def test_the_slave_side_leaves_other_values_alone(
 def everything(body: bytes) -> None:
     """Do all that the shell does with a body from somebody else."""
     request = master_api.read_request(body, ASKER)
-    request.admissions = [None] * len(request.calls)
-    master_api.export_request(request, WORLD)
+    exported(request)
     parsed = xmlrpc.parse_call(body)
     slave_api.import_call(body, parsed, VISIT, WORLD)
     for call in (parsed, *multicall.inner_calls(parsed)):
@@ -156,7 +158,7 @@ def everything_in_reply(reply: bytes) -> None:
     slave_api.topic_port(call, reply)
     slave_api.export_reply(call, reply, VISIT, WORLD)
     request = master_api.read_request(py_call("system.multicall", []), ASKER)
-    master_api.import_answer(request, master_api.read_answer(request, reply), WORLD)
+    master_api.import_reply(master_api.read_reply(exported(request), reply), WORLD)
     multicall.results_reply([multicall.result_value(reply)])
 
 

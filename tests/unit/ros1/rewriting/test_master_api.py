@@ -318,10 +318,9 @@ def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None
     request = master_api.read_request(
         py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_RELAYED), NODE
     )
-    request.admissions = [None]
-    body = master_api.export_request(request, addressing)
-    assert body == py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_OUT)
-    assert master_api.noted(master_api.read_answer(request, py_reply([1, "", []])), 7.0) == []
+    exported = master_api.export_request(request, [None], addressing)
+    assert exported.body == py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_OUT)
+    assert master_api.read_reply(exported, py_reply([1, "", []])).facts(7.0) == []
 
 
 def test_a_fault_is_passed_on_and_nothing_is_noted() -> None:
@@ -359,6 +358,5 @@ def test_the_published_master_renames_itself_only() -> None:
         (py_call("lookupNode", ID, ID), [1, "", OUT], [1, "", OUT]),
     ):
         request = master_api.read_request(body, asker)
-        request.admissions = [None]
-        answer = master_api.read_answer(request, py_reply(reply))
-        assert master_api.rename_master(answer, "robot-host:1") == py_reply(expected)
+        renamed = master_api.rename_master(request, py_reply(reply), "robot-host:1")
+        assert renamed == py_reply(expected)

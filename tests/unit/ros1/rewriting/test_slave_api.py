@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.rewriting import slave_api
@@ -15,6 +16,7 @@ from tests.unit.builders import (
     DIALECTS,
     PROXY,
     add_node,
+    add_registration,
     make_addressing,
     make_asker,
     py_call,
@@ -251,3 +253,23 @@ def test_methods_that_are_not_rewritten(method: str) -> None:
 
 def test_what_only_the_master_calls() -> None:
     assert {"shutdown", "publisherUpdate", "paramUpdate"} == slave_api.MASTER_ONLY
+
+
+def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    add_registration(addressing, endpoint, Kind.PUBLISHER, "/a")
+    ours, other = addressing.advertised_uri(endpoint), "http://laptop:1/"
+    endpoint.settles_at = 5.0
+
+    def outdated(topic: str, publishers: list[str], now: float) -> bool:
+        call = xmlrpc.parse_call(py_call("publisherUpdate", "/master", topic, publishers))
+        return slave_api.is_outdated(call, addressing, now)
+
+    assert outdated("/a", [other], now=4.0)
+    assert outdated("/a", [], now=4.0)
+    assert not outdated("/a", [other, ours], now=4.0)
+    assert not outdated("/a", [other], now=5.0)
+    assert not outdated("/b", [other], now=4.0)
+    addressing.registry.unregister(Kind.PUBLISHER, "/a", "/talker")
+    assert not outdated("/a", [other], now=4.0)

@@ -12,7 +12,7 @@ from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.upkeep.adoption import policy
 from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
 from rosproxy.ros1.upkeep.registration.policy import known_as
-from tests.unit.builders import add_node, add_registration, make_addressing
+from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
 C1 = Arrival("10.0.0.5", frozenset({"c1", "3f2a91c0b7de"}))
@@ -147,21 +147,6 @@ def test_by_what_uris_an_endpoint_may_be_known() -> None:
 def test_a_loopback_address_is_everybodys_own(host: str) -> None:
     endpoint = add_node(make_addressing(), f"http://{host}:40001/", "10.0.0.5", False)
     assert not known_as(endpoint, endpoint.uri)
-
-
-def test_an_update_from_before_a_publisher_was_registered_anew() -> None:
-    addressing = make_addressing()
-    endpoint = add_node(addressing)
-    add_registration(addressing, endpoint, PUB, "/a")
-    ours, other = addressing.advertised_uri(endpoint), "http://laptop:1/"
-    endpoint.settles_at = 5.0
-    assert policy.is_outdated("/a", [other], addressing, now=4.0)
-    assert policy.is_outdated("/a", [], addressing, now=4.0)
-    assert not policy.is_outdated("/a", [other, ours], addressing, now=4.0)
-    assert not policy.is_outdated("/a", [other], addressing, now=5.0)
-    assert not policy.is_outdated("/b", [other], addressing, now=4.0)
-    addressing.registry.unregister(PUB, "/a", "/talker")
-    assert not policy.is_outdated("/a", [other], addressing, now=4.0)
 
 
 REASONS = [

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from rosproxy.admin.requests import Arrival
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
@@ -21,8 +22,8 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.upkeep.adoption import policy
 from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
 from rosproxy.ros1.upkeep.registration.policy import known_as
@@ -47,9 +48,14 @@ class Adopter:
     """Finds nodes that registered around the proxy, and makes the master know them through it."""
 
     def __init__(
-        self, context: Context, leases: Leases, nodes: NodeClient, registrar: Registrar
+        self,
+        context: Context,
+        leases: Leases[Endpoint],
+        admission: NodeAdmission,
+        nodes: NodeClient,
+        registrar: Registrar,
     ) -> None:
-        self._context, self._leases = context, leases
+        self._context, self._leases, self._admission = context, leases, admission
         self._nodes, self._registrar = nodes, registrar
         self._one_at_a_time = asyncio.Lock()
 
@@ -176,7 +182,7 @@ class Adopter:
         named = place.host in await resolve(self._context.upstream.reach(own).host)
         asker = Asker(place.host, "", nodes[0].caller_id)
         where = Place(place.host, named, confirmed=False)
-        endpoint = self._leases.take_in(uri, own, where, asker)
+        endpoint = self._admission.take_in(uri, own, where, asker)
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.pending += 1

@@ -106,20 +106,6 @@ def shutdown_cause(endpoint: Endpoint, uri: str | None, advertised: str) -> Shut
     return ShutdownCause.REGISTERED_DIRECTLY if itself else ShutdownCause.NAME_TAKEN
 
 
-def is_outdated(topic: str, uris: Iterable[str], addressing: Addressing, now: float) -> bool:
-    """Whether a ``publisherUpdate`` lacks a publisher that is being registered anew.
-
-    A newer one follows; a subscriber inside need not drop its connection in between.
-    """
-    listed = set(uris)
-    return any(
-        endpoint.settles_at > now
-        and endpoint.publishes(topic)
-        and addressing.advertised_uri(endpoint) not in listed
-        for endpoint in addressing.registry
-    )
-
-
 def _score(node: DirectNode, topics: set[str]) -> int | None:
     """How well the topics of whoever answers at a place fit a node; None if not at all."""
     shared = node.topics & topics

@@ -12,12 +12,12 @@ What follows from a probe: `Health.note` says how the node is, `policy` what is 
 import asyncio
 import logging
 
+from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import Change, ProbeResult
-from rosproxy.ros1.registry.leases import Leases
 from rosproxy.ros1.upkeep.prober import policy
 from rosproxy.ros1.upkeep.recovery.recovery import Recovery
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
@@ -36,7 +36,7 @@ class Prober:
     def __init__(
         self,
         context: Context,
-        leases: Leases,
+        leases: Leases[Endpoint],
         nodes: NodeClient,
         registrar: Registrar,
         resubscriber: Resubscriber,
@@ -90,7 +90,7 @@ class Prober:
     async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
         health = endpoint.health
         if not endpoint.trusted:
-            await self._recovery.verify_and_announce(endpoint)
+            await self._recovery.serve(endpoint)
             return
         if health.cleaned:
             await self._registrar.come_back(endpoint, pid)

@@ -134,8 +134,7 @@ class Registrar:
         started = self._context.now()
         info = await self._nodes.inspect(endpoint.slave)
         if info is not None:
-            endpoint.topic_ports.clear()
-            endpoint.tcpros_port = info.tcpros_port
+            endpoint.replace_tcpros_ports(info.tcpros_port)
             await self._forget(endpoint, policy.left_over(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:

@@ -1,4 +1,4 @@
-"""The HTTP side of XML-RPC: aiohttp reads requests, this module answers them.
+"""The HTTP server of XML-RPC: aiohttp reads requests, a service makes the replies.
 
 What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
 no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
@@ -14,9 +14,9 @@ from typing import Any
 
 from aiohttp import HttpVersion, HttpVersion11, web
 
-from rosproxy.forwarding.relay import reset_on_close
 from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
 from rosproxy.net.http_client import pieces, read_bounded
+from rosproxy.net.sockets import reset_on_close
 from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 
@@ -30,7 +30,7 @@ STOP_TIMEOUT = 0.5
 """Seconds that calls under way get to end when the server stops."""
 
 
-class Call:
+class IncomingCall:
     """One XML-RPC request: its body, who sent it and where it arrived."""
 
     def __init__(self, request: web.BaseRequest, body: bytes) -> None:
@@ -46,7 +46,7 @@ class Call:
         """Whether a proxy itself made this call."""
         return self.loop_id.partition(" ")[0] == instance
 
-    def with_body(self, body: bytes) -> "Call":
+    def with_body(self, body: bytes) -> "IncomingCall":
         """The same call with another body."""
         other = copy(self)
         other.body = body
@@ -62,10 +62,11 @@ class Call:
         return parse_host_port(self.host_header) == self.local
 
 
-Service = Callable[[Call], Awaitable[bytes]]
+XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
+"""Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
 
 
-class Connections:
+class PortConnections:
     """The connections of a port; those that have ended are forgotten now and then."""
 
     def __init__(self) -> None:
@@ -87,10 +88,10 @@ class Connections:
 class XmlRpcServer:
     """Turns accepted sockets into XML-RPC calls to a service."""
 
-    def __init__(self, service: Service, greeting: str) -> None:
+    def __init__(self, service: XmlRpcService, greeting: str) -> None:
         self._service, self._greeting = service, greeting
         self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
-        self._by_port: dict[int, Connections] = {}
+        self._by_port: dict[int, PortConnections] = {}
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
@@ -100,7 +101,7 @@ class XmlRpcServer:
         _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
         self._mute.add(handler)
         loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
-        self._by_port.setdefault(port, Connections()).add(handler)
+        self._by_port.setdefault(port, PortConnections()).add(handler)
 
     def connections(self, port: int) -> int:
         """How many connections are open that came in on a port."""
@@ -108,7 +109,7 @@ class XmlRpcServer:
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in self._by_port.pop(port, Connections()).alive():
+        for handler in self._by_port.pop(port, PortConnections()).alive():
             if handler in self._busy:
                 handler.close()
             else:
@@ -141,7 +142,7 @@ class XmlRpcServer:
 
     async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
         try:
-            reply = await self._service(Call(request, body))
+            reply = await self._service(IncomingCall(request, body))
         except xmlrpc.XmlRpcError as error:
             reply = xmlrpc.dump_fault(error.code, f"rosproxy: {error}")
         except Unreachable as error:
