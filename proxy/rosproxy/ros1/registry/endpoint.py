@@ -170,6 +170,11 @@ class Endpoint:
         """How messages name this endpoint: node name and own URI."""
         return f"{', '.join(self.caller_ids) or 'unnamed node'} ({self.uri})"
 
+    @property
+    def log_fields(self) -> dict[str, str | int]:
+        """What a log entry about it has as fields, to be given as ``extra``."""
+        return {"node": ", ".join(self.caller_ids), "port": self.port}
+
     def names(self, kind: Kind) -> list[str]:
         """The topics, services or parameters registered as ``kind``."""
         return sorted(held.name for held in self.registrations.values() if held.kind is kind)

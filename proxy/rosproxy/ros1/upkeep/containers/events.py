@@ -154,7 +154,9 @@ class ContainerEvents:
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)
-        log.info("%s is at %s now", endpoint.label, endpoint.place.address)
+        log.info(
+            "%s is at %s now", endpoint.label, endpoint.place.address, extra=endpoint.log_fields
+        )
 
     async def _adopt(self, arrived: Sequence[requests.Arrival]) -> int:
         return len((await self.adopter.adopt(arrived)).names) if arrived else 0

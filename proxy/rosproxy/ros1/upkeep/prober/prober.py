@@ -100,13 +100,13 @@ class Prober:
             await self._registrar.reconcile(endpoint)
         health.pid = pid
         if not self._leases.is_open(endpoint):
-            log.info("%s answers again", endpoint.label)
+            log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)
             self._leases.open(endpoint)
             await self._resubscriber.remind(endpoint)
 
     def _report_down(self, endpoint: Endpoint, reason: str) -> None:
         if endpoint.registrations:
-            log.warning("%s does not answer: %s", endpoint.label, reason)
+            log.warning("%s does not answer: %s", endpoint.label, reason, extra=endpoint.log_fields)
             self._context.problems.add(endpoint.label, f"does not answer: {reason}", endpoint.port)
 
     def _end_if_unused(self, endpoint: Endpoint) -> None:
@@ -119,5 +119,7 @@ class Prober:
             endpoint.idle_since = now
         lasts = policy.lease_lasts(endpoint, self._context.settings.linger)
         if now - endpoint.idle_since >= lasts:
-            log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
+            log.info(
+                "port %d is free again: %s", endpoint.port, endpoint.uri, extra=endpoint.log_fields
+            )
             self._leases.end(endpoint)

@@ -82,7 +82,12 @@ class Registrar:
         for held in found:
             self._context.registry.register(endpoint, held)
         if found:
-            log.info("%s: %d topics were not registered; they are now", endpoint.label, len(found))
+            log.info(
+                "%s: %d topics were not registered; they are now",
+                endpoint.label,
+                len(found),
+                extra=endpoint.log_fields,
+            )
             await self.register([(endpoint, held) for held in found])
 
     async def register_lost(self) -> None:
@@ -108,7 +113,12 @@ class Registrar:
         await self._unregister(endpoint, held)
         endpoint.health.cleaned, endpoint.health.cleaned_at = True, started
         self._context.metrics.cleanups.inc()
-        log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
+        log.info(
+            "cleaned up %s: %d registrations taken back",
+            endpoint.label,
+            len(held),
+            extra=endpoint.log_fields,
+        )
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
         """Register a node again that was cleaned up and answers after all, as process ``pid``.
@@ -124,7 +134,12 @@ class Registrar:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
         endpoint.health.pid, endpoint.health.cleaned = pid, False
         await self.register([(endpoint, held) for held in kept])
-        log.info("%s is back: %d registrations made again", endpoint.label, len(kept))
+        log.info(
+            "%s is back: %d registrations made again",
+            endpoint.label,
+            len(kept),
+            extra=endpoint.log_fields,
+        )
 
     async def unregister_left_over(self, endpoint: Endpoint) -> None:
         """Take back what a former process left: topics that the node there does not have.
@@ -170,7 +185,13 @@ class Registrar:
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
         for held in ended:
-            log.info("%s of %s is no longer at %s", held.name, held.caller_id, endpoint.uri)
+            log.info(
+                "%s of %s is no longer at %s",
+                held.name,
+                held.caller_id,
+                endpoint.uri,
+                extra=endpoint.log_fields,
+            )
             self._context.registry.unregister(held.kind, held.name, held.caller_id)
 
     async def _unregister(self, endpoint: Endpoint, held: Sequence[Registration]) -> None:
