@@ -19,12 +19,12 @@ class StateCollector(Collector):
         registry: Registry,
         totals: Callable[[], Traffic],
         open_connections: Callable[[], int],
-        mirrored: Callable[[], int],
+        alias_ports: Callable[[], int],
         master_up: Callable[[], bool],
         kernel: Callable[[], KernelTally],
     ) -> None:
         self._registry, self._totals = registry, totals
-        self._open_connections, self._mirrored = open_connections, mirrored
+        self._open_connections, self._alias_ports = open_connections, alias_ports
         self._master_up, self._kernel = master_up, kernel
 
     def collect(self) -> Iterable[Metric]:
@@ -37,9 +37,9 @@ class StateCollector(Collector):
         yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
         yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())
         yield _gauge(
-            "mirrored_ports",
+            "alias_ports",
             "Ports that stand in for nodes on the master's host.",
-            self._mirrored(),
+            self._alias_ports(),
         )
         yield _gauge("master_up", "Whether the master answers.", int(self._master_up()))
         yield self._endpoints()

@@ -51,7 +51,7 @@ def describe(
         master=_master(context, monitor),
         ports=_ports(context),
         data_plane=msgspec.convert(plane.status(), DataPlaneStatus),
-        mirrored=msgspec.convert(alias.status(), tuple[AliasPortStatus, ...]),
+        alias_ports=msgspec.convert(alias.status(), tuple[AliasPortStatus, ...]),
         nodes=tuple(_node(context, e, relays.get(e.port, []), plane) for e in endpoints),
         problems=tuple(
             ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)

@@ -145,7 +145,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` is another one after each start; ``retired``: it registers nothing any more;
-    ``mirrored`` are the ports that stand in for nodes on the master's host.
+    ``alias_ports`` are the ports that stand in for nodes on the master's host.
     """
 
     version: str = ""
@@ -157,7 +157,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     master: MasterStatus = MasterStatus()
     ports: PortsStatus = PortsStatus()
     data_plane: DataPlaneStatus | None = None
-    mirrored: tuple[AliasPortStatus, ...] = ()
+    alias_ports: tuple[AliasPortStatus, ...] = ()
     nodes: tuple[EndpointStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
 

@@ -63,8 +63,8 @@ def _head(status: ProxyStatus) -> Iterator[str]:
     yield (
         f"inside   ROS_MASTER_URI=http://<this host>:{settings.master_port}, networks {networks}"
     )
-    if mirrored := status.mirrored:
-        yield f"mirrored {_mirrored(mirrored)}"
+    if ports := status.alias_ports:
+        yield f"alias    {_alias_ports(ports)}"
     if settings.publish_master:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
@@ -94,7 +94,7 @@ def _plane(plane: DataPlaneStatus) -> str:
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _mirrored(ports: Sequence[AliasPortStatus]) -> str:
+def _alias_ports(ports: Sequence[AliasPortStatus]) -> str:
     open_ones = plural(sum(port.connections for port in ports), "connection")
     numbers = listed(str(port.port) for port in ports)
     return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
