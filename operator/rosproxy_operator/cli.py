@@ -5,14 +5,52 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.options import Commands, log_options
+from rosproxy.cli.options import (
+    BIND_ADDRESS,
+    GROUP_SETTINGS,
+    HOST,
+    PORT_RANGE,
+    Commands,
+    Parsed,
+    Seconds,
+    log_options,
+    setting_errors,
+)
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.settings import read_bind, read_image
+from rosproxy_operator.docker.planner.model import MOST_PORTS
+from rosproxy_operator.docker.settings import (
+    DEFAULT_ADMIN,
+    make_docker_settings,
+    read_shared_master_uri,
+    read_uplink,
+)
+from rosproxy_operator.kubernetes.settings import DEFAULT_ADMIN as CLUSTER_ADMIN
+from rosproxy_operator.kubernetes.settings import (
+    DEFAULT_LIVENESS,
+    DEFAULT_WEBHOOK,
+    make_kubernetes_settings,
+    read_name,
+    read_namespace,
+    read_object_name,
+)
 
-DEFAULT_ADMIN = "http://127.0.0.1:11313"
+IMAGE = Parsed("image", read_image)
+MASTER_URI = Parsed("URI of a master", read_shared_master_uri)
+NAME = Parsed("namespace/name", read_name)
+NAMESPACE = Parsed("namespace", read_namespace)
+OBJECT_NAME = Parsed("name", read_object_name)
+UPLINK = Parsed("network", read_uplink)
+
+
+def _bind(example: HostPort, optional: bool = False) -> Parsed:
+    return Parsed("host:port", partial(read_bind, example, optional))
 
 
 class OperatorCommands(Commands):
@@ -21,10 +59,7 @@ class OperatorCommands(Commands):
     program = "rosproxy-operator"
 
 
-@click.group(
-    cls=OperatorCommands,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-)
+@click.group(cls=OperatorCommands, context_settings=GROUP_SETTINGS)
 @click.version_option(__version__, prog_name="rosproxy-operator")
 def main() -> None:
     """Sets up rosproxy by itself for the containers of a host or the pods of a cluster."""
@@ -37,34 +72,46 @@ def main() -> None:
 )
 @click.option(
     "--master-uri",
+    type=MASTER_URI,
     envvar=["ROSPROXY_MASTER_URI", "ROS_MASTER_URI"],
     metavar="URI",
     help="The real ROS master of containers that name none.",
 )
 @click.option(
     "--advertise-host",
+    type=HOST,
     metavar="HOST",
     help="Name or address under which outside nodes and masters reach this host. Default: this "
     "host's address towards the master.",
 )
 @click.option(
-    "--ports", type=int, default=32, metavar="N", help="Ports of a proxy, one per node behind it."
+    "--ports",
+    type=click.IntRange(1, MOST_PORTS),
+    default=32,
+    metavar="N",
+    help="Ports of a proxy, one per node behind it.",
 )
 @click.option(
     "--port-window",
+    type=PORT_RANGE,
     default="11400-65535",
     metavar="A-B",
     help="Where ranges of ports are looked for.",
 )
 @click.option(
     "--publish-address",
+    type=BIND_ADDRESS,
     multiple=True,
     default=("0.0.0.0",),
     metavar="ADDRESS",
     help="Address of this host on which ports are published (repeatable).",
 )
 @click.option(
-    "--proxy-image", default="rosproxy:latest", metavar="IMAGE", help="The proxies' image."
+    "--proxy-image",
+    type=IMAGE,
+    default="rosproxy:latest",
+    metavar="IMAGE",
+    help="The proxies' image.",
 )
 @click.option(
     "--data-plane",
@@ -79,22 +126,24 @@ def main() -> None:
 )
 @click.option(
     "--grace",
-    type=float,
+    type=Seconds(0.0),
     default=60.0,
     metavar="S",
     help="Time for which a proxy outlives its last container.",
 )
 @click.option(
-    "--resync", type=float, default=30.0, metavar="S", help="Longest time between two looks."
+    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
 )
 @click.option(
     "--uplink",
+    type=UPLINK,
     default="0-rosproxy",
     metavar="NETWORK",
     help="Network that is created for the proxies; it has to sort before all others.",
 )
 @click.option(
     "--admin-bind",
+    type=_bind(DEFAULT_ADMIN),
     default="127.0.0.1:11313",
     metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz and /metrics are served.",
@@ -115,18 +164,14 @@ def docker(
     environment variable: ROSPROXY_ and its name (ROSPROXY_PORTS); the master's is also
     ROS_MASTER_URI.
     """
-    from rosproxy.settings import SettingError
     from rosproxy.telemetry import logs
-    from rosproxy_operator.docker.settings import parse_docker_settings
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
     logging.getLogger("docker").setLevel(logging.INFO)  # the SDK tells of each request otherwise
     logging.getLogger("urllib3").setLevel(logging.INFO)
-    try:
-        context.obj = parse_docker_settings(options)
-    except SettingError as error:
-        raise click.UsageError(str(error)) from None
+    with setting_errors():
+        context.obj = make_docker_settings(options)
     if context.invoked_subcommand is None:
         _run(context.obj, once)
     elif once:
@@ -145,14 +190,11 @@ def _need(library: str, extra: str) -> None:
 
 
 def _run(settings: Any, once: bool) -> None:
-    from rosproxy.settings import SettingError
     from rosproxy_operator.docker.run import run, run_once
 
     if not once:
-        try:
+        with setting_errors():
             run(settings)
-        except SettingError as error:
-            raise click.UsageError(str(error)) from None
         return
     problems = _or_exit(lambda: run_once(settings))
     for problem in problems:
@@ -191,12 +233,14 @@ def plan(settings: Any) -> None:
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
 @click.option(
     "--namespace",
+    type=NAMESPACE,
     multiple=True,
     metavar="NAME",
     help="Look after the RosProxies of this namespace only (repeatable). Default: of all.",
 )
 @click.option(
     "--proxy-image",
+    type=IMAGE,
     default="rosproxy:latest",
     metavar="IMAGE",
     help="Image of the proxies whose RosProxy names none.",
@@ -208,37 +252,43 @@ def plan(settings: Any) -> None:
 )
 @click.option(
     "--node-port-range",
+    type=PORT_RANGE,
     default="30000-32767",
     metavar="A-B",
     help="The API server's --service-node-port-range: no proxy gets a port of it.",
 )
 @click.option(
     "--ephemeral-range",
+    type=PORT_RANGE,
     default="32768-60999",
     metavar="A-B",
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
 @click.option(
-    "--resync", type=float, default=30.0, metavar="S", help="Longest time between two looks."
+    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
 )
 @click.option(
     "--webhook-bind",
+    type=_bind(DEFAULT_WEBHOOK, optional=True),
     default="none",
     metavar="ADDRESS:PORT",
     help="Where the admission webhook is served that wires pods; none: it is not.",
 )
 @click.option(
     "--webhook-service",
+    type=NAME,
     metavar="NAMESPACE/NAME",
     help="The webhook's Service: the names for which its certificate is made.",
 )
 @click.option(
     "--webhook-secret",
+    type=NAME,
     metavar="NAMESPACE/NAME",
     help="An existing Secret in which that certificate is kept over restarts.",
 )
 @click.option(
     "--webhook-configuration",
+    type=OBJECT_NAME,
     metavar="NAME",
     help="The MutatingWebhookConfiguration into which its CA is written.",
 )
@@ -249,12 +299,14 @@ def plan(settings: Any) -> None:
 )
 @click.option(
     "--admin-bind",
+    type=_bind(CLUSTER_ADMIN),
     default="0.0.0.0:11313",
     metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz and /metrics are served.",
 )
 @click.option(
     "--liveness-bind",
+    type=_bind(DEFAULT_LIVENESS),
     default="0.0.0.0:8080",
     metavar="ADDRESS:PORT",
     help="Where /healthz is served for the kubelet: it fails when any part hangs.",
@@ -266,20 +318,13 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     The cluster is the one that this runs in, else the one that KUBECONFIG names. Every option has
     an environment variable: ROSPROXY_ and its name (ROSPROXY_PROXY_IMAGE).
     """
-    from rosproxy.settings import SettingError
-    from rosproxy_operator.kubernetes.settings import parse_kubernetes_settings
-
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")
-    try:
-        settings = parse_kubernetes_settings(options)
-    except SettingError as error:
-        raise click.UsageError(str(error)) from None
-    _run_kubernetes(settings, log_format, log_level)
+    with setting_errors():
+        _run_kubernetes(make_kubernetes_settings(options), log_format, log_level)
 
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
-    from rosproxy.settings import SettingError
     from rosproxy.telemetry import logs
     from rosproxy_operator.kubernetes.errors import ApiError
     from rosproxy_operator.kubernetes.kopf_log import quieten
@@ -289,8 +334,6 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     quieten()
     try:
         run(settings)
-    except SettingError as error:
-        raise click.UsageError(str(error)) from None
     except ApiError as error:
         click.echo(f"rosproxy-operator: {error}", err=True)
         sys.exit(1)
@@ -301,7 +344,7 @@ def health() -> None:
     """Exit with 0 if the controller is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.client import AdminClient, AdminError, default_url
 
-    url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else DEFAULT_ADMIN
+    url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:

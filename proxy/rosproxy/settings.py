@@ -192,21 +192,6 @@ def parse_host(option: str, text: str) -> str:
     return _named(option, read_host, text)
 
 
-def parse_admin(text: str, default: HostPort) -> HostPort:
-    """Parse ``--admin-bind``; ``default`` serves as the example. Raises SettingError."""
-    where = parse_host_port(text)
-    if where is None:
-        raise SettingError("--admin-bind", f"{text!r} is not of the form {default}")
-    return where
-
-
-def parse_seconds(option: str, value: float, low: float) -> float:
-    """Check a time between ``low`` and a day. Raises SettingError that names ``option``."""
-    if not low <= value <= 86400:
-        raise SettingError(option, f"{value:g} s is not between {low:g} and 86400 s")
-    return float(value)
-
-
 def _named(option: str, read: Callable[[str], _Value], text: str) -> _Value:
     try:
         return read(text)

@@ -9,7 +9,7 @@ import pytest
 
 from rosproxy import __version__
 from rosproxy_operator.cli import main
-from rosproxy_operator.kubernetes.settings import WebhookSettings, parse_kubernetes_settings
+from rosproxy_operator.kubernetes.settings import WebhookSettings, make_kubernetes_settings
 from tests.chart.chart import (
     CHART,
     NAMESPACE,
@@ -90,7 +90,7 @@ def test_arguments(combination: str) -> None:
     (pod,) = operator(rendered(combination))
     command, *words = pod["containers"][0]["args"]
     context = main.commands[command].make_context(command, words)
-    settings = parse_kubernetes_settings(context.params)
+    settings = make_kubernetes_settings(context.params)
     values: Json = dict(ALL[combination])
     assert settings.namespaces == tuple(values.get("namespaces", ()))
     image = values.get("proxy", {}).get("image", {"repository": "rosproxy", "tag": __version__})

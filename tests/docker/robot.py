@@ -1,9 +1,12 @@
 """Robots: machines outside that run a roscore."""
 
 import json
+import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from http.client import HTTPConnection
+from typing import Any
 
 from tests.docker.engine import wait_until
 from tests.docker.machines import Machine, addresses, join, machine, reach
@@ -23,9 +26,13 @@ print(json.dumps({name: master.lookupNode("/test", name)[2] for name in names}))
 
 @dataclass(frozen=True)
 class Robot(Machine):
-    """A machine with a master, which ``name`` stands for in URIs."""
+    """A machine with a master, which ``name`` stands for in URIs.
+
+    ``hidden``: it is beside another network namespace, and this host does not reach it.
+    """
 
     name: str
+    hidden: bool = False
 
     @property
     def master_uri(self) -> str:
@@ -37,6 +44,8 @@ class Robot(Machine):
 
     def nodes(self, port: int = 11311) -> dict[str, str]:
         """Every node that the master knows, with its URI."""
+        if not self.hidden:
+            return nodes_at(f"http://{self.address}:{port}")
         text = self.run("python3", "-c", _NODES, f"http://{self.address}:{port}", check=False)
         found: dict[str, str] = json.loads(text) if text.startswith("{") else {}
         return found
@@ -48,6 +57,27 @@ class Robot(Machine):
     def knows_proxied(self, node: str, port: int = 11311) -> bool:
         """Whether the master knows a node by an address of this host."""
         return self.uri(node, port).startswith(f"http://{self.host_address}:")
+
+
+def nodes_at(master_uri: str) -> dict[str, str]:
+    """Every node that a master knows, with its URI; none if it does not answer."""
+    master: Any = xmlrpc.client.ServerProxy(master_uri, _Transport())
+    try:
+        with master:
+            state = master.getSystemState("/test")[2]
+            names = {name for kind in state for _, nodes in kind for name in nodes}
+            return {name: master.lookupNode("/test", name)[2] for name in names}
+    except (OSError, xmlrpc.client.Error):
+        return {}
+
+
+class _Transport(xmlrpc.client.Transport):
+    """One that waits for five seconds at most."""
+
+    def make_connection(self, host: Any) -> HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = 5
+        return connection
 
 
 @contextmanager
@@ -64,7 +94,7 @@ def named_robot(
 ) -> Iterator[Robot]:
     """A robot as most are: it calls itself by its name, in URIs too."""
     with machine(image, name, number, *_names(name, number), namespace=namespace) as found:
-        yield _robot(found, name)
+        yield _robot(found, name, hidden=bool(namespace))
 
 
 @contextmanager
@@ -84,5 +114,5 @@ def _names(name: str, number: int) -> tuple[str, ...]:
             "--env", f"ROS_MASTER_URI=http://{name}:11311")  # fmt: skip
 
 
-def _robot(found: Machine, name: str) -> Robot:
-    return Robot(found.container, found.address, found.host_address, found.engine, name)
+def _robot(found: Machine, name: str, hidden: bool = False) -> Robot:
+    return Robot(**vars(found), name=name, hidden=hidden)

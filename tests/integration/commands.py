@@ -4,7 +4,7 @@ import asyncio
 import sys
 from dataclasses import dataclass
 
-from tests.integration.process import clean_environment
+from rosproxy.demo.proxy_process import clean_environment
 from tests.integration.proxy import Proxy
 
 

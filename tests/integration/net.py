@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Any
 
 from rosproxy.demo.fake_http import Where, call, where
+from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import Header
 from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 
@@ -37,6 +38,12 @@ async def until(condition: Callable[[], Any], what: str, within: float = PATIENC
             return
         assert monotonic() < end, f"waited {within:g} s in vain: {what}"
         await asyncio.sleep(0.01)
+
+
+async def looks(master: FakeMaster, count: int = 3) -> None:
+    """Wait until the proxy has looked at its master so often: long enough for it to act."""
+    so_far = len(master.named("getPid"))
+    await until(lambda: len(master.named("getPid")) >= so_far + count, "the proxy looks")
 
 
 async def refuses(address: Where, source: str = OUTSIDE) -> bool:
@@ -146,6 +153,16 @@ class Wire:
                 return "answered" if await self.reader.read(1) else "closed"
         except ConnectionResetError:
             return "reset"
+
+    async def stalls(self) -> None:
+        """Wait until the peer takes nothing of what is being sent any more."""
+        left: list[int] = []
+
+        def stuck() -> bool:
+            left.append(self.writer.transport.get_write_buffer_size())
+            return left[-1] > 0 and left[-10:] == [left[-1]] * 10
+
+        await until(stuck, "the peer stops reading")
 
     async def half_close(self) -> None:
         """End the outgoing direction."""

@@ -10,6 +10,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from rosproxy.demo.fake_http import Where
+from rosproxy.demo.proxy_process import clean_environment
 from tests.integration.net import PROXY
 from tests.integration.proxy import options_for
 
@@ -23,12 +24,6 @@ def command_line(options: dict[str, Any]) -> list[str]:
         for one in values:
             command += [option] if one is True else [option, str(one)]
     return command
-
-
-def clean_environment(**more: str) -> dict[str, str]:
-    """The environment without anything that is meant for a proxy or for ROS."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "ROSPROXY_"))}
-    return kept | more
 
 
 class Process:

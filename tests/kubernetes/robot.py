@@ -1,15 +1,14 @@
 """The robot outside the cluster: its roscore and its nodes."""
 
 import itertools
-import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tests.docker.engine import docker, inspect, wait_until
 from tests.docker.nodes import Log, node_command
+from tests.docker.robot import nodes_at
 from tests.kubernetes.cluster.layout import NODES, ROBOT, ROBOT_ADDRESS, node_named
 
 _ports = itertools.count(11311)
@@ -80,18 +79,6 @@ class Robot:
             return (self.root / f"tmp/{self.port}/{name}.log").read_text(errors="replace")
         except OSError:
             return ""
-
-
-def nodes_at(master_uri: str) -> dict[str, str]:
-    """Every node that a master knows, with its URI; none if it does not answer."""
-    master: Any = xmlrpc.client.ServerProxy(master_uri)
-    try:
-        with master:
-            state = master.getSystemState("/test")[2]
-            names = {name for kind in state for _, nodes in kind for name in nodes}
-            return {name: master.lookupNode("/test", name)[2] for name in names}
-    except (OSError, xmlrpc.client.Error):
-        return {}
 
 
 @contextmanager

@@ -7,9 +7,10 @@ import pytest
 
 from tests.docker.engine import wait_until
 from tests.docker.nodes import LIBRARIES
+from tests.docker.robot import nodes_at
 from tests.kubernetes import api
 from tests.kubernetes.pods import Namespace, namespace, unique
-from tests.kubernetes.robot import Robot, nodes_at
+from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import RosProxy, rosproxy
 
 PUBLISHED = 11302

@@ -88,76 +88,56 @@ class Executor:
         ``seen`` is when the look began (monotonic) that the groups were planned from: it may not
         have seen what work did that was over only after that.
         """
-        self._forget_refusals()
-        groups = [group for group in groups if self._over.get(group.key, 0.0) < seen]
+        now = time.monotonic()
+        self._refused = {a: each for a, each in self._refused.items() if each[1] > now - QUIET}
         by_key: dict[Key | None, list[Group]] = {}
         for group in groups:
-            by_key.setdefault(group.key, []).append(group)
+            if self._over.get(group.key, 0.0) < seen:
+                by_key.setdefault(group.key, []).append(group)
         self._failures = {
             key: each
             for key, each in self._failures.items()
             if key in by_key or self._over.get(key, 0.0) >= seen
         }
-        first = by_key.pop(None, [])
-        if first:
-            self._start(None, first, carry_out)
-        uplink = self._busy.get(None)
-        for key, some in by_key.items():
-            self._start(key, some, carry_out, uplink)
-
-    def _start(
-        self,
-        key: Key | None,
-        groups: list[Group],
-        carry_out: CarryOut,
-        after: "asyncio.Task[None] | None" = None,
-    ) -> None:
-        failure = self._failures.get(key)
-        actions = tuple(action for group in groups for action in group.actions)
-        waiting = failure and failure.actions == actions and time.monotonic() < failure.again
-        if key in self._busy or waiting or not actions:
-            return
-        name = f"work for {key.master_uri if key else 'the uplink'}"
-        work = self._run(key, groups, actions, carry_out, after)
-        self._busy[key] = self._tasks.spawn(work, name)
+        for key in sorted(by_key, key=lambda key: key is not None):  # the uplink first
+            actions = _actions(by_key[key])
+            failure = self._failures.get(key)
+            waiting = failure and failure.actions == actions and now < failure.again
+            if actions and not waiting and key not in self._busy:
+                after = self._busy.get(None) if key else None
+                work = self._run(key, by_key[key], carry_out, after)
+                name = f"work for {key.master_uri if key else 'the uplink'}"
+                self._busy[key] = self._tasks.spawn(work, name)
 
     async def _run(
         self,
         key: Key | None,
         groups: list[Group],
-        actions: tuple[Action, ...],
         carry_out: CarryOut,
         after: "asyncio.Task[None] | None",
     ) -> None:
+        """Carry out all groups, and note the first thing that goes wrong."""
         try:
             if after is not None:
                 await asyncio.wait([after])
-            problem = await self._all(key, groups, carry_out)
-            if problem is None:
-                self._failures.pop(key, None)
-            else:
-                self._failed(key, actions, problem)
+            problems = [await self._group(group, carry_out) for group in groups]
+            self._note(key, groups, next((problem for problem in problems if problem), None))
+        except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
+            log.exception("work for %s failed", key)
+            problem = Problem(_subject(key), f"the operator failed: {error!r}")
+            self._note(key, groups, problem)
         finally:
             del self._busy[key]
             self._over[key] = time.monotonic()
             self._finished()
 
-    async def _all(
-        self, key: Key | None, groups: Iterable[Group], carry_out: CarryOut
-    ) -> Problem | None:
-        """Carry out all groups; the first thing that went wrong."""
-        try:
-            problems = [await self._group(group, carry_out) for group in groups]
-        except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
-            log.exception("work for %s failed", key)
-            return Problem(_subject(key), f"the operator failed: {error!r}")
-        return next((problem for problem in problems if problem), None)
-
-    def _failed(self, key: Key | None, actions: tuple[Action, ...], problem: Problem) -> None:
-        before = self._failures.get(key)
-        count = before.count + 1 if before and before.actions == actions else 1
-        pause = BACK_OFF[min(count, len(BACK_OFF)) - 1]
-        self._failures[key] = _Failure(actions, count, time.monotonic() + pause, problem)
+    def _note(self, key: Key | None, groups: list[Group], problem: Problem | None) -> None:
+        before = self._failures.pop(key, None)
+        if problem is not None:
+            actions = _actions(groups)
+            count = before.count + 1 if before and before.actions == actions else 1
+            pause = BACK_OFF[min(count, len(BACK_OFF)) - 1]
+            self._failures[key] = _Failure(actions, count, time.monotonic() + pause, problem)
 
     async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
         """Carry a group out as far as possible; what went wrong.
@@ -168,12 +148,11 @@ class Executor:
         for action in group.actions:
             try:
                 await self._one(action, carry_out)
-            except PortTaken as error:
-                self._refuse(action, error)
-                self._port_taken(getattr(action, "name", ""), error.port)
-                return problem
             except EngineError as error:
                 self._refuse(action, error)
+                if isinstance(error, PortTaken):
+                    self._port_taken(getattr(action, "name", ""), error.port)
+                    break
                 problem = Problem(_subject(group.key), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
@@ -202,9 +181,9 @@ class Executor:
         log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", action, error)
         self._refused[action] = reason, time.monotonic()
 
-    def _forget_refusals(self) -> None:
-        long_ago = time.monotonic() - QUIET
-        self._refused = {a: each for a, each in self._refused.items() if each[1] > long_ago}
+
+def _actions(groups: Iterable[Group]) -> tuple[Action, ...]:
+    return tuple(action for group in groups for action in group.actions)
 
 
 def _subject(key: Key | None) -> str:

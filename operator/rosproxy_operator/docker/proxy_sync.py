@@ -1,26 +1,17 @@
 """Keeping the proxies up to date about the containers on their networks, each apart."""
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Collection
-from ipaddress import IPv4Network
-from typing import Any
 
-from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.docker.planner.model import Member
-from rosproxy_operator.docker.planner.proxy_news import (
-    AGAIN,
-    ContainerArrival,
-    NetworkFacts,
-    Places,
-    facts,
-    gone,
-)
+from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, facts
 from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
@@ -28,8 +19,6 @@ log = logging.getLogger(__name__)
 
 PAUSES = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
 """Seconds until a proxy is asked again that did not answer; the last is repeated."""
-AGAIN_MOVED = 1.0
-"""Seconds until a move is told again: the new address may not be reachable at once."""
 STARTING = 8.0
 """Seconds for which a proxy may be silent before that is a problem: it may just be starting."""
 
@@ -37,8 +26,7 @@ STARTING = 8.0
 class ProxyUpdater:
     """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
-    The proxy is asked for its nodes after each look, and told what has changed since it was last
-    told: nothing gets lost while it can't be reached.
+    The proxy is asked for its nodes after each look, and told what is new (`ProxyNews`).
     """
 
     def __init__(
@@ -47,13 +35,9 @@ class ProxyUpdater:
         self.name, self.access = name, access
         self.error: ProxyError | None = None
         self._proxies, self._answered = proxies, answered
-        self._facts = NetworkFacts()
-        self._subnets: set[IPv4Network] = set()
-        self._places = Places()
-        self._moving = False
-        self._due: dict[ContainerArrival, list[float]] = {}
+        self._news = ProxyNews()
         self._heard = False
-        self._news = asyncio.Event()
+        self._looked = asyncio.Event()
         self._since = time.monotonic()
 
     @property
@@ -63,21 +47,21 @@ class ProxyUpdater:
 
     def update(self, known: NetworkFacts) -> None:
         """Take note of what a look has found."""
-        now = time.monotonic()
-        self._facts = known
-        self._subnets |= set(known.subnets)
-        self._due = {
-            arrival: self._due.get(arrival, [now + after for after in AGAIN])
-            for arrival in known.arrivals
-        }
-        self._news.set()
+        self._news.look(known, time.monotonic())
+        self._looked.set()
 
     async def run(self) -> None:
         """Tell what there is to be told, for good."""
         failures = 0
         while True:
-            pause = PAUSES[min(failures, len(PAUSES)) - 1] if failures else self._next_due()
-            await self._wait(pause)
+            pause = (
+                PAUSES[min(failures, len(PAUSES)) - 1]
+                if failures
+                else self._news.next_due(time.monotonic())
+            )
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._looked.wait()
             try:
                 await self._tell()
                 failures = 0
@@ -88,30 +72,21 @@ class ProxyUpdater:
                 else:
                     self._unwell(error)
 
-    async def _wait(self, seconds: float | None) -> None:
-        try:
-            async with asyncio.timeout(seconds):
-                await self._news.wait()
-        except TimeoutError:
-            pass
-
     async def _tell(self) -> None:
-        self._news.clear()
+        self._looked.clear()
         where, token = self.access.admin, self.access.token
         status = await self._proxies.status(where)
-        known = self._facts  # not older than need be: its nodes may have come since the last look
-        address = known.master_address
+        # The facts are not older than need be: its nodes may have come since the last look.
+        address = self._news.facts.master_address
         if address and status.master.address != address:
             await self._proxies.master_address(where, token, address)
             log.info("%s: its master is now at %s", self.name, address)
         now = time.monotonic()
-        body = self._body(status, known, now)
+        body = self._news.body(nodes_by_address(status).keys(), now)
         if body:
             log.debug("%s is told %s", self.name, body)
             self._log(await self._proxies.containers(where, token, body))
-        self._due = {
-            arrival: [when for when in times if when > now] for arrival, times in self._due.items()
-        }
+        self._news.told(now)
         self._well()
 
     def _well(self) -> None:
@@ -123,30 +98,6 @@ class ProxyUpdater:
         if self.error is None and self._heard:
             self._since = time.monotonic()
         self.error = error
-
-    def _body(self, status: ProxyStatus, known: NetworkFacts, now: float) -> dict[str, Any]:
-        self._places.look(known, now)
-        nodes = nodes_by_address(status).keys()
-        arrived = [
-            {"address": arrival.address, "names": sorted(arrival.names)}
-            for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
-            if times and times[0] <= now
-        ]
-        body = {
-            "gone": gone(nodes, known.taken | self._places.held, self._subnets),
-            "moved": self._places.moved(nodes),
-            "arrived": arrived,
-        }
-        self._moving = bool(body["moved"])
-        return {key: value for key, value in body.items() if value}
-
-    def _next_due(self) -> float | None:
-        """Seconds until there is something to be told again; None if there is nothing."""
-        now = time.monotonic()
-        times = [when for due in self._due.values() for when in due[:1]]
-        times += [self._places.until] if self._places.until else []
-        times += [now + AGAIN_MOVED] if self._moving else []
-        return max(min(times) - now, 0.0) if times else None
 
     def _log(self, done: Json) -> None:
         counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}

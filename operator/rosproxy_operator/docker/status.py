@@ -93,8 +93,8 @@ def _name(key: Key | None) -> str | None:
 def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
     """One row per proxy; its sandbox is only told of where it is what is wrong."""
     observed, name = found.look.state, proxy_name(key)
-    process = _best([p for p in observed.proxies if p.key == key], name)
-    box = _best([box for box in observed.sandboxes if box.key == key], sandbox_name(key))
+    process = _best(observed.proxies_of(key), name)
+    box = _best(observed.sandboxes_of(key), sandbox_name(key))
     said = found.answer(process.container.name) if process else None
     own = box or process
     networks = box.container.networks if box else frozenset()

@@ -1,4 +1,4 @@
-"""The API server as far as the controller needs it: a thin layer over the `kubernetes` client.
+"""The API server as far as the operator needs it: a thin layer over the `kubernetes` client.
 
 Its service account may do exactly this; ``watch`` is what kopf does. Those of the second part are
 for single objects, by name::
@@ -77,7 +77,7 @@ class Api:
         return self._cached("", "nodes", {})
 
     def own(self, kind: str) -> list[Found]:
-        """The ``pods`` or ``services`` that the controller has made."""
+        """The ``pods`` or ``services`` that the operator has made."""
         query = {"labelSelector": OWN_SELECTOR}
         return [found for place in self._places for found in self._cached(place, kind, query)]
 

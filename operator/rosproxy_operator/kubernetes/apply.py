@@ -76,10 +76,10 @@ class ClusterApplier:
                 if isinstance(action, PatchStatus):
                     await self._status(action, observed)
         emits = [action for action in actions if isinstance(action, Emit)]
-        told = [each for each in emits if not (failures and each.type == "Normal")]
-        await asyncio.gather(*(self._tell(each, observed) for each in told))
+        wanted = [each for each in emits if not (failures and each.type == "Normal")]
+        await asyncio.gather(*(self._emit(each, observed) for each in wanted))
 
-    async def _tell(self, event: Emit, observed: ClusterSnapshot) -> None:
+    async def _emit(self, event: Emit, observed: ClusterSnapshot) -> None:
         async with self._room:
             await self._one(event, observed)
 
@@ -104,7 +104,7 @@ class ClusterApplier:
             return self._failed(action, str(error))
         except Exception as error:  # a mistake of ours must not stop the others
             log.exception("%s failed", line(action))
-            return self._failed(action, f"the controller failed: {error!r}")
+            return self._failed(action, f"the operator failed: {error!r}")
         self._done(action)
         return None
 
@@ -216,7 +216,7 @@ def _create(api: Api, kind: str, body: Json) -> None:
 
 
 def _check_ours(api: Api, kind: str, body: Json) -> None:
-    """Raise ApiError if the object that has the name already is not the controller's.
+    """Raise ApiError if the object that has the name already is not the operator's.
 
     If it is, the list that was planned from was a little old, or a RosProxy of the same name has
     just been deleted.
@@ -231,7 +231,7 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
     if not is_own(there.get("labels") or {}) or KIND not in {one.get("kind") for one in owners}:
         raise ApiError(
             ErrorKind.CONFLICT,
-            f"a {body.get('kind')} of this name that is not the controller's is there: rename it, "
+            f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
             "or rename the RosProxy",
         )
 

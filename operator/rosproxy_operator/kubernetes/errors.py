@@ -19,7 +19,7 @@ class ErrorKind(Enum):
     """Why the API server did not do what it was asked, as far as that makes a difference."""
 
     AWAY = "away"  # it can't be reached, or is not ready to answer
-    DENIED = "denied"  # a rule is missing in the controller's role
+    DENIED = "denied"  # a rule is missing in the operator's role
     GONE = "gone"
     CONFLICT = "conflict"  # the name is taken, or the object is another one by now
     INVALID = "invalid"  # the object is not one that the API server takes
@@ -50,7 +50,7 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
     if status == 403:
         return _forbidden(message)
     if status == 401:
-        message = f"the API server does not know the controller's token or certificate ({message})"
+        message = f"the API server does not know the operator's token or certificate ({message})"
     elif status >= 500 or status == 429:
         message = f"the API server answers HTTP {status}: {message}"
         return ApiError(ErrorKind.AWAY, message)
@@ -66,13 +66,13 @@ def unreachable(server: str, error: BaseException) -> ApiError:
 
 
 def missing_rule(message: str) -> str:
-    """The rule that the controller's role lacks, by the API server's words; empty if it is none."""
+    """The rule that the operator's role lacks, by the API server's words; empty if it is none."""
     found = _RBAC.search(message)
     if found is None:
         return ""
     where = f" in the namespace {found['namespace']}" if found["namespace"] else ""
     return (
-        f"the controller's role lacks a rule{where}: "
+        f"the operator's role lacks a rule{where}: "
         f'apiGroups ["{found["group"]}"], resources ["{found["resource"]}"], '
         f'verbs ["{found["verb"]}"]'
     )

@@ -53,7 +53,7 @@ class EventFilter:
         return self._selected(body) and self._new("pod", type, body, lambda: parse_pod(body))
 
     def service(self, type: str | None, body: Json) -> bool:
-        """Whether an event of a Service matters: of the controller's own, or a master's."""
+        """Whether an event of a Service matters: of the operator's own, or a master's."""
         if not _own(body) and (self._last is None or _id(body) not in self._last.masters):
             return False
         return self._new("service", type, body, lambda: body.get("spec"))

@@ -1,4 +1,4 @@
-"""Making Kubernetes Events (core/v1), each of them once, however often the controller restarts."""
+"""Making Kubernetes Events (core/v1), each of them once, however often the operator restarts."""
 
 import hashlib
 import time

@@ -1,4 +1,4 @@
-"""What kopf calls: events only wake the controller, and pods are wired at admission.
+"""What kopf calls: events only wake the operator, and pods are wired at admission.
 
 kopf writes nothing to any object for ``on.event``: no annotation, no finalizer.
 """
@@ -29,7 +29,7 @@ class Wakeable(Protocol):
 
 
 class NotAlive(Exception):
-    """The controller is not alive."""
+    """The operator is not alive."""
 
 
 def registry(

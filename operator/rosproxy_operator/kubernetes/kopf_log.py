@@ -14,7 +14,7 @@ _LOUD = ("kubernetes", "urllib3")
 class KopfLog(logging.Handler):
     """Tells once which rule is missing for watching, and everything else only at debug level.
 
-    kopf logs each try at an API server that is away, for every kind of object; the controller's own
+    kopf logs each try at an API server that is away, for every kind of object; the operator's own
     looks say so once, in one line. But for the rule that only watching needs nobody else asks.
     """
 

@@ -2,8 +2,8 @@
 
 Each proxy's pod that has an address is asked for its ``/status`` every few seconds, by a
 `ProxyPoller` of its own, and told which pods on its node are gone (``/containers``) until it has
-confirmed that. What it says lands in `ClusterProxySync.reports`, from where the controller takes it
-with each look; a report that is another one than before wakes the controller.
+confirmed that. What it says lands in `ClusterProxySync.reports`, from where the operator takes it
+with each look; a report that is another one than before wakes the operator.
 """
 
 import asyncio

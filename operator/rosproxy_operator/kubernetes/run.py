@@ -1,4 +1,4 @@
-"""Running the Kubernetes controller."""
+"""Running the Kubernetes operator."""
 
 import asyncio
 import logging
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def run(settings: KubernetesSettings) -> None:
-    """Run the controller until a signal ends it; its proxies go on.
+    """Run the operator until a signal ends it; its proxies go on.
 
     Raises SettingError if it can't listen where it is told to, ApiError if no cluster is known.
     """

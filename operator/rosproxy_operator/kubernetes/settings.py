@@ -1,13 +1,15 @@
-"""The settings of ``rosproxy-operator kubernetes``, validated."""
+"""The settings of ``rosproxy-operator kubernetes``: plain data, checked.
+
+``read_…`` makes one value of a text and raises ValueError; see `rosproxy.settings`.
+"""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy.settings import SettingError, parse_admin, parse_range, parse_seconds
-from rosproxy_operator.common.settings import parse_image
+from rosproxy.net.addresses import HostPort
+from rosproxy.settings import SettingError
 from rosproxy_operator.kubernetes.planner.model import Name
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 
@@ -51,53 +53,59 @@ class KubernetesSettings:
     webhook: WebhookSettings | None = None
 
 
-def parse_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
-    """Settings from the values of the command line's options.
+def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
+    """Settings from the values of the command line's options, by their names.
 
-    Raises SettingError for the first value that can't be used.
+    Raises SettingError if they don't go together.
     """
-    plan = ClusterSettings(
-        image=parse_image(options["proxy_image"]),
-        image_pull_policy=options.get("proxy_image_pull_policy") or "",
-        node_ports=parse_range("--node-port-range", options["node_port_range"]),
-        ephemeral=parse_range("--ephemeral-range", options["ephemeral_range"]),
-    )
     return KubernetesSettings(
-        plan=plan,
-        namespaces=_namespaces(options["namespace"]),
-        resync=parse_seconds("--resync", options["resync"], 1.0),
-        admin=parse_admin(options["admin_bind"], DEFAULT_ADMIN),
-        liveness=_bind("--liveness-bind", options["liveness_bind"], DEFAULT_LIVENESS),
-        webhook=_webhook(options),
+        plan=ClusterSettings(
+            image=options["proxy_image"],
+            image_pull_policy=options["proxy_image_pull_policy"] or "",
+            node_ports=options["node_port_range"],
+            ephemeral=options["ephemeral_range"],
+        ),
+        namespaces=tuple(dict.fromkeys(options["namespace"])),
+        resync=options["resync"],
+        admin=options["admin_bind"],
+        liveness=options["liveness_bind"],
+        webhook=_make_webhook(options) if options["webhook_bind"] else None,
     )
 
 
-def _namespaces(names: Iterable[str]) -> tuple[str, ...]:
-    for name in names:
-        if not _LABEL.fullmatch(name):
-            raise SettingError("--namespace", f"{name!r} is not a namespace's name")
-    return tuple(dict.fromkeys(names))
+def read_namespace(text: str) -> str:
+    """The name of a namespace. Raises ValueError."""
+    if not _LABEL.fullmatch(text):
+        raise ValueError(f"{text!r} is not a namespace's name")
+    return text
 
 
-def _bind(option: str, text: str, example: HostPort) -> HostPort:
-    where = parse_host_port(text)
-    if where is None:
-        raise SettingError(option, f"{text!r} is not of the form {example}")
-    return where
+def read_object_name(text: str) -> str:
+    """The name of an object that has no namespace; empty for no text. Raises ValueError."""
+    if text and not _SUBDOMAIN.fullmatch(text):
+        raise ValueError(f"{text!r} is not an object's name")
+    return text
 
 
-def _webhook(options: Mapping[str, Any]) -> WebhookSettings | None:
-    if options["webhook_bind"] == "none":
+def read_name(text: str) -> Name | None:
+    """``NAMESPACE/NAME``; None for no text. Raises ValueError."""
+    namespace, slash, name = text.partition("/")
+    if not text:
         return None
+    if not slash or not _LABEL.fullmatch(namespace) or not _SUBDOMAIN.fullmatch(name):
+        raise ValueError(f"{text!r} is not of the form NAMESPACE/NAME")
+    return Name(namespace, name)
+
+
+def _make_webhook(options: Mapping[str, Any]) -> WebhookSettings:
     settings = WebhookSettings(
-        bind=_bind("--webhook-bind", options["webhook_bind"], DEFAULT_WEBHOOK),
-        service=_object("--webhook-service", options.get("webhook_service")),
-        secret=_object("--webhook-secret", options.get("webhook_secret")),
-        configuration=options.get("webhook_configuration") or "",
-        directory=options.get("webhook_cert_dir") or "",
+        bind=options["webhook_bind"],
+        service=options["webhook_service"],
+        secret=options["webhook_secret"],
+        configuration=options["webhook_configuration"] or "",
+        directory=options["webhook_cert_dir"] or "",
     )
-    made = settings.secret or settings.configuration
-    if settings.directory and made:
+    if settings.directory and (settings.secret or settings.configuration):
         raise SettingError(
             "--webhook-cert-dir",
             "the certificate comes from there: leave out --webhook-secret and "
@@ -108,17 +116,4 @@ def _webhook(options: Mapping[str, Any]) -> WebhookSettings | None:
             "--webhook-service",
             "NAMESPACE/NAME is needed to make the webhook's certificate (or --webhook-cert-dir)",
         )
-    if settings.configuration and not _SUBDOMAIN.fullmatch(settings.configuration):
-        raise SettingError(
-            "--webhook-configuration", f"{settings.configuration!r} is not an object's name"
-        )
     return settings
-
-
-def _object(option: str, text: str | None) -> Name | None:
-    if not text:
-        return None
-    namespace, slash, name = text.partition("/")
-    if not slash or not _LABEL.fullmatch(namespace) or not _SUBDOMAIN.fullmatch(name):
-        raise SettingError(option, f"{text!r} is not of the form NAMESPACE/NAME")
-    return Name(namespace, name)

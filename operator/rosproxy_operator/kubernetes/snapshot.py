@@ -6,16 +6,17 @@ Services and selected pods, then all pods on the nodes that matter. All of it or
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from dataclasses import replace
 from functools import partial
+from ipaddress import ip_address
 from typing import TypeVar
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
-from rosproxy_operator.kubernetes.masters import master_service
+from rosproxy_operator.kubernetes.planner.fields import InvalidField
 from rosproxy_operator.kubernetes.planner.model import (
     ClusterSnapshot,
     InvalidRosProxy,
@@ -31,7 +32,7 @@ from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_prox
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.planner.spec import InvalidField, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import invalid, rosproxy
 
 T = TypeVar("T")
 AT_ONCE = 8
@@ -182,3 +183,43 @@ def _steady(message: str) -> str:
 
 def _when(event: Found) -> str:
     return str(event.get("lastTimestamp") or event.get("eventTime") or "")
+
+
+def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str]:
+    """A Service's cluster IP and what is wrong with it; one of them is empty. Raises ApiError.
+
+    ``ports`` are those that RosProxies name; one of them has to be there.
+    """
+    try:
+        return read_master(api.get("services", id), id, ports)
+    except ApiError as error:
+        if error.kind is not ErrorKind.GONE:
+            raise
+        return "", f"there is no Service {id.name} in the namespace {id.namespace}: create it"
+
+
+def read_master(service: Found, id: Name, ports: Collection[int]) -> tuple[str, str]:
+    """The same, from a Service as the API server gives it."""
+    spec = service.get("spec") or {}
+    address = str(spec.get("clusterIP") or "")
+    if not _is_address(address):
+        return "", (
+            f"the Service {id} has no cluster IP ({spec.get('type') or 'headless'}): "
+            "make it one of type ClusterIP with an address of its own"
+        )
+    offered = {port.get("port") for port in spec.get("ports") or () if isinstance(port, dict)}
+    if not offered & set(ports):
+        has, wanted = (", ".join(sorted(map(str, some))) or "none" for some in (offered, ports))
+        return (
+            "",
+            f"the Service {id} has no port {wanted} (it has {has}): set spec.master.service.port",
+        )
+    return address, ""
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ip_address(text)
+    except ValueError:
+        return False
+    return True

@@ -227,3 +227,6 @@ class Adder(Player):
             self.answered += 1
             writer.write(b"\x01" + SUM.pack(8, a + b))
             await writer.drain()
+
+
+Actor = Talker | Listener | Adder

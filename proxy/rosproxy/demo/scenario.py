@@ -20,7 +20,7 @@ from typing import Any
 
 from rosproxy.demo.fake_http import free_ports, is_free, where
 from rosproxy.demo.fake_master import CALL_ERRORS, FakeMaster
-from rosproxy.demo.players import Adder, Listener, Player, Talker, in_words
+from rosproxy.demo.players import Actor, Adder, Listener, Player, Talker, in_words
 from rosproxy.demo.proxy_process import DemoError, ProxyProcess
 
 PATIENCE = 10.0
@@ -88,25 +88,16 @@ class Scenario:
     def __post_init__(self) -> None:
         robot = self.layout.robot
         self.master = FakeMaster(robot)
-        self.talker = Talker("/inside/talker", *self._inside("talker", 0), topic="/from_inside")
-        self.listener = Listener(
-            "/inside/listener", *self._inside("listener", 1), topic="/from_outside"
-        )
-        self.adder = Adder("/inside/adder", *self._inside("adder", 2), service="/inside/add")
-        self.inside: tuple[Talker | Listener | Adder, ...] = (
-            self.talker,
-            self.listener,
-            self.adder,
-        )
+        self.talker = Talker("/inside/talker", *self._inside(0), topic="/from_inside")
+        self.listener = Listener("/inside/listener", *self._inside(1), topic="/from_outside")
+        self.adder = Adder("/inside/adder", *self._inside(2), service="/inside/add")
         self.far_talker = Talker("/outside/talker", robot, topic="/from_outside")
         self.far_listener = Listener("/outside/listener", robot, topic="/from_inside")
         self.far_adder = Adder("/outside/adder", robot, service="/outside/add")
-        self.outside: tuple[Talker | Listener | Adder, ...] = (
-            self.far_talker,
-            self.far_listener,
-            self.far_adder,
-        )
-        for number, node in enumerate((*self.inside, *self.outside)):
+        self.inside: list[Actor] = [self.talker, self.listener, self.adder]
+        self.outside: list[Actor] = [self.far_talker, self.far_listener, self.far_adder]
+        self.nodes = [*self.inside, *self.outside]
+        for number, node in enumerate(self.nodes):
             node.pid = 101 + number
         for node in self.inside:
             node.slave.admits = node.tcpros.admits = self.layout.admits
@@ -114,8 +105,9 @@ class Scenario:
         self.seen: dict[str, str] = {}
         self._talking: dict[Talker, asyncio.Task[None]] = {}
 
-    def _inside(self, name: str, number: int) -> tuple[str, str, Callable[[str], str]]:
-        own = self.layout.inside[number]
+    def _inside(self, number: int) -> tuple[str, str, Callable[[str], str]]:
+        """Address and host of an inside node, and where it leaves from."""
+        own, name = self.layout.inside[number], ("talker", "listener", "adder")[number]
         return own, f"{name}.inside", lambda host: self.layout.source_from_inside(host, own)
 
     @property
@@ -150,7 +142,7 @@ class Scenario:
         ending.push_async_callback(self.master.stop)
         self.tell(f"ROS master at {self.master.uri}, outside")
         self.proxy = await ending.enter_async_context(ProxyProcess(self.proxy_options()))
-        for node in (*self.outside, *self.inside):
+        for node in self.nodes:
             await node.start()
             ending.push_async_callback(node.stop)
         ending.callback(self._fall_silent)

@@ -11,13 +11,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from rosproxy.demo.players import Adder, Listener, Talker
+from rosproxy.demo.players import Actor, Adder, Listener, Talker
 from rosproxy.demo.scenario import Scenario
 
 EVENTS_SHOWN = 8
 
 
-def state_of(node: Talker | Listener | Adder) -> str:
+def state_of(node: Actor) -> str:
     """What a node is up to, in few words."""
     if not node.slave.listening:
         return "stopped"
@@ -30,7 +30,7 @@ def state_of(node: Talker | Listener | Adder) -> str:
     return "connected" if node.connected else node.problem or "no publisher"
 
 
-def rate_of(node: Talker | Listener | Adder) -> int:
+def rate_of(node: Actor) -> int:
     """How many messages it sent or received in the last second."""
     if isinstance(node, Adder):
         return 0
@@ -47,7 +47,7 @@ def frame(scenario: Scenario) -> Group:
     for name in ("SENT", "RECV", "RATE"):
         table.add_column(name, justify="right")
     table.add_column("STATE", no_wrap=True)
-    for node in (*scenario.inside, *scenario.outside):
+    for node in scenario.nodes:
         _, side, name = node.name.split("/")
         table.add_row(
             *(side, name, f"{node.host}:{node.slave.address[1]}", scenario.seen.get(node.name)),
@@ -68,7 +68,7 @@ def event_line(moment: float, text: str) -> str:
 def counts_line(scenario: Scenario) -> str:
     """Where the play is and what has been counted so far."""
     counts = []
-    for node in (*scenario.inside, *scenario.outside):
+    for node in scenario.nodes:
         if not isinstance(node, Adder):
             number = len(node.sent) if isinstance(node, Talker) else len(node.received)
             counts.append(f"{node.name[1:].replace('/', ' ')}: {number} ({state_of(node)})")

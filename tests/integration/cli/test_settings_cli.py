@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from rosproxy.demo.fake_http import End, Where, where
+from rosproxy.demo.proxy_process import clean_environment
 from rosproxy.settings import SettingError
 from tests.integration.net import (
     HOST,
@@ -28,7 +29,7 @@ from tests.integration.net import (
     until,
     xml,
 )
-from tests.integration.process import Process, clean_environment, command_line
+from tests.integration.process import Process, command_line
 from tests.integration.proxy import Proxy, options_for, settings_for
 
 GOOD = {"master_uri": "http://robot:11311", "advertise_host": "host"}

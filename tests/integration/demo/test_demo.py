@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from rosproxy.demo.players import Listener, Talker
+from rosproxy.demo.fake_http import value
+from rosproxy.demo.players import Listener, Player, Talker
 from rosproxy.demo.proxy_process import ProxyProcess
 from rosproxy.demo.scenario import NAMES_ONLY, Scenario, count
 from rosproxy.demo.screen import frame, print_summary, show
@@ -72,6 +73,24 @@ async def test_a_proxy_that_comes_back_as_another_is_noticed(monkeypatch):
     scenario = Scenario(4)
     await scenario.play()
     assert [check.detail for check in failed(scenario)] == ["messages flow again: not within 2 s"]
+
+
+async def test_what_did_not_work_is_named(monkeypatch):
+    async def add_wrongly(*_):
+        return 6
+
+    monkeypatch.setattr(Player, "add", add_wrongly)
+    monkeypatch.setattr("rosproxy.demo.scenario.RECOVERY_SECONDS", -1.0)
+    scenario = Scenario(4, NAMES_ONLY)
+    scenario.talker.answers["getPid"] = value([1, "", 7])
+    await scenario.play()
+    assert [check.promise for check in failed(scenario)] == [
+        "service calls cross both ways before the kill",
+        "recovered in less than -1 s",
+        "the same ports serve the same nodes",
+        "service calls cross both ways after the restart",
+    ]
+    assert not scenario.ok
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])

@@ -11,6 +11,7 @@ from rosproxy.forwarding.kernel import tools as kernel_tools
 from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from tests.integration.kernel_fake import FakeTools
+from tests.integration.net import until
 
 
 @pytest.fixture
@@ -134,10 +135,14 @@ async def test_a_program_that_hangs_is_ended(
 
 
 async def test_what_a_cancelled_task_began_is_finished(programs: Path) -> None:
-    program(programs, "nft", f"/bin/sleep 0.3; echo done >{programs}/said; exit 1")
+    program(
+        programs,
+        "nft",
+        f"echo >{programs}/begun; /bin/sleep 0.3; echo done >{programs}/said; exit 1",
+    )
     tools = Tools()
     task = asyncio.ensure_future(tools.nft("list", "chains"))
-    await asyncio.sleep(0.1)
+    await until((programs / "begun").exists, "it begins")
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task

@@ -10,6 +10,7 @@ import socket
 import threading
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -79,8 +80,7 @@ async def test_a_reset_passes_as_a_reset(proxy, node, lease, who, after):
             assert await other.exactly(100_000) == b"x" * 100_000
         elif after == "a half close":
             await other.half_close()
-            await one.exactly(0)
-            await asyncio.sleep(0.05)
+            await until(one.reader.at_eof, "the half close arrives")
         one.reset()
         assert await other.end() == "reset"
     await proxy.quiet()
@@ -92,8 +92,7 @@ async def test_a_reset_passes_once_the_other_side_reads_on(proxy, node, lease, w
         one, other = getattr(ends, who), ends.inside if who == "outside" else ends.outside
         one.sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 65536)
         flood = asyncio.create_task(one.send(b"x" * 50_000_000))
-        await asyncio.sleep(0.3)
-        assert not flood.done()
+        await one.stalls()
         one.reset()
         await asyncio.gather(flood, return_exceptions=True)
         with pytest.raises(ConnectionResetError):
@@ -107,7 +106,7 @@ async def test_a_reader_that_stalls_and_leaves_ends_the_writer(proxy, node, leas
         reader = getattr(ends, stalled)
         writer = ends.inside if stalled == "outside" else ends.outside
         flood = asyncio.create_task(writer.send(b"x" * 50_000_000))
-        await asyncio.sleep(0.2)
+        await writer.stalls()
         reader.reset()
         with pytest.raises(ConnectionError):
             await flood
@@ -228,8 +227,7 @@ async def test_connections_leave_neither_descriptors_nor_threads(proxy, node, le
         for _ in range(4):
             await asyncio.gather(*(once(i) for i in range(30 * (1 + round_))))
         await proxy.quiet()
-    await asyncio.sleep(0.1)
-    assert len(os.listdir("/proc/self/fd")) <= before[0] + 2
+    await until(lambda: len(os.listdir("/proc/self/fd")) <= before[0] + 2, "all are closed")
     assert threading.active_count() <= before[1]
     assert proxy.endpoint(node).connections == 0
 
@@ -353,12 +351,15 @@ async def test_a_crowd_of_streams_does_not_exhaust_the_memory_of_tcp(
     await node.publish(proxy.master)
     async with AsyncExitStack() as stack:
         streams = [await stack.enter_async_context(relayed(node, proxy.lease(node)))]
-        floods = [asyncio.create_task(flood(streams[0]))]
-        await until(lambda: buffers(proxy) != set(), "a stream runs")
-        assert buffers(proxy) != {SHARED}
+        read_on = asyncio.Event()
+        floods = [asyncio.create_task(flood(streams[0], read_on))]
+        await streams[0].inside.stalls()
+        assert buffers(streams) != {SHARED}
         streams.append(await stack.enter_async_context(relayed(node, proxy.lease(node))))
-        floods.append(asyncio.create_task(flood(streams[1])))
-        await until(lambda: buffers(proxy) == {SHARED}, "both share")
+        floods.append(asyncio.create_task(flood(streams[1], read_on)))
+        await streams[1].inside.stalls()
+        read_on.set()
+        await until(lambda: buffers(streams) == {SHARED}, "both share")
         assert await asyncio.gather(*floods) == [FLOOD, FLOOD]
     await proxy.quiet()
 
@@ -368,24 +369,35 @@ SHARED = (2 * relay.SHARED_RECEIVE, 2 * relay.SHARED_SEND)
 FLOOD = 100_000_000
 
 
-async def flood(ends: Ends) -> int:
-    """Many bytes from inside; how many arrive outside, where nobody hurries."""
+async def flood(ends: Ends, read_on: asyncio.Event) -> int:
+    """Many bytes from inside; how many arrive outside, where nobody reads before it is told."""
     sending = asyncio.create_task(ends.inside.send(bytes(FLOOD)))
-    await asyncio.sleep(1)
+    await read_on.wait()
     size = len(await ends.outside.exactly(FLOOD))
     await sending
     return size
 
 
-def buffers(proxy: Any) -> set[tuple[int, int]]:
-    """The sizes of the buffers towards outside of all relays, as (receive, send)."""
+def buffers(streams: list[Ends]) -> set[tuple[int, int]]:
+    """The sizes of the proxy's buffers towards outside, as (receive, send) of each stream."""
     return {
         (
-            one.inside.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF),
-            one.outside.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF),
+            peer_option(ends.inside, socket.SO_RCVBUF),
+            peer_option(ends.outside, socket.SO_SNDBUF),
         )
-        for one in proxy.app.tcpros.relays
+        for ends in streams
     }
+
+
+def peer_option(wire: Wire, option: int) -> int:
+    """An option of the proxy's socket at the other end; the proxy runs in this process."""
+    for entry in Path("/proc/self/fd").iterdir():
+        if not entry.is_socket():
+            continue
+        with suppress(OSError), socket.socket(fileno=os.dup(int(entry.name))) as sock:
+            if sock.getpeername() == wire.sock.getsockname():
+                return sock.getsockopt(socket.SOL_SOCKET, option)
+    raise AssertionError("the proxy has no such connection")
 
 
 async def test_without_large_pipes_bulk_is_copied(proxy, node, lease, monkeypatch):

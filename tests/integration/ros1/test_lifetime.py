@@ -2,8 +2,10 @@
 
 import asyncio
 import os
+from time import monotonic
 
 from rosproxy.demo.fake_http import End
+from rosproxy.ros1.context import Context
 from tests.integration.net import (
     HOST,
     NODE,
@@ -11,6 +13,7 @@ from tests.integration.net import (
     OUTSIDE,
     connect,
     greet,
+    looks,
     post,
     read_header,
     refuses,
@@ -68,7 +71,7 @@ async def test_nobody_is_cleaned_up_where_that_is_off(make_proxy, master, node):
     uri = proxy.uri(node)
     await node.stop()
     await until(lambda: refuses(proxy.lease(node)), "the port refuses")
-    await asyncio.sleep(0.5)
+    await looks(master)
     assert master.holds("publishers", "/chatter") == [uri]
 
 
@@ -77,7 +80,8 @@ async def test_clean_up_waits_for_a_master_that_is_down(make_proxy, master, node
     await node.publish(proxy.master)
     await node.stop()
     await master.stop()
-    await asyncio.sleep(0.5)
+    await until(lambda: refuses(proxy.lease(node)), "the port refuses")
+    await until(lambda: proxy.app.status()["master"]["error"], "the master is missed")
     await master.start()
     await until(lambda: not master.nodes, "the master forgets it")
 
@@ -143,7 +147,7 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     await until(lambda: not master.nodes, "it is cleaned up")
     far = f"http://{OUTSIDE}:4000/"
     await rpc(master.uri, "registerPublisher", "/far", "/news", "std_msgs/String", far)
-    await asyncio.sleep(0.5)
+    await looks(master)
     node.hang = False
     await until(lambda: rpc_works(lease), "the port is served again")
     await until(lambda: master.holds("params", "/p"), "all is registered again")
@@ -181,7 +185,7 @@ async def test_a_new_process_that_registers_at_a_cleaned_uri_keeps_what_it_regis
     await node.start()
     await node.serve(proxy.master, "/new")
     await node.publish(proxy.master)
-    await asyncio.sleep(0.5)
+    await looks(master)
     endpoint = proxy.endpoint(node)
     held = {(kind.value, name) for kind, name, _ in endpoint.registrations}
     assert held == {("publisher", "/chatter"), ("service", "/new")}
@@ -204,7 +208,7 @@ async def test_a_node_restarted_on_its_uri_is_reachable_as_soon_as_it_registers(
     await node.publish(proxy.master)
     assert (await rpc(lease, "getPid", "/outside"))[2] == node.pid
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
-    await asyncio.sleep(0.5)
+    await looks(master)
     assert not await refuses(lease)
 
 
@@ -236,17 +240,18 @@ async def test_a_restart_under_the_same_name_elsewhere_ends_the_old_process(
     assert proxy.endpoint(new).registrations
 
 
-async def test_a_lease_lingers_and_ends(make_proxy, node):
-    proxy = await make_proxy(**{**FAST, "linger": 0.4})
+async def test_a_lease_lingers_and_ends(make_proxy, master, node, monkeypatch):
+    proxy = await make_proxy(**{**FAST, "linger": 60})
     await node.publish(proxy.master)
     lease = proxy.lease(node)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-    await asyncio.sleep(0.15)
+    await looks(master)
     assert await rpc_works(lease)
-    await until(lambda: refuses(lease), "the lease ends", 2)
+    monkeypatch.setattr(Context, "now", lambda _: monotonic() + 60)
+    await until(lambda: refuses(lease), "the lease ends")
 
 
-async def test_a_lease_with_a_connection_does_not_end(make_proxy, node):
+async def test_a_lease_with_a_connection_does_not_end(make_proxy, master, node):
     proxy = await make_proxy(**{**FAST, "linger": 0.0})
     await node.publish(proxy.master)
     lease = proxy.lease(node)
@@ -254,7 +259,7 @@ async def test_a_lease_with_a_connection_does_not_end(make_proxy, node):
         await wire.send(topic_header())
         await read_header(wire)
         await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-        await asyncio.sleep(0.3)
+        await looks(master)
         assert not await refuses(lease)
         await wire.send(b"x")
         assert await wire.exactly(1) == b"x"

@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy.demo.fake_http import where
 from rosproxy.demo.fake_node import FakeNode
-from tests.integration.net import refuses, until
+from tests.integration.net import looks, refuses, until
 from tests.integration.proxy import Proxy
 
 NODES = 7
@@ -36,7 +36,7 @@ async def test_each_node_is_asked_once_what_it_is(make_proxy, master, nodes):
         node.delay = 0.6  # the keeper looks at them meanwhile
     await proxy.restart()
     await until(lambda: all_served(proxy), "all are served")
-    await asyncio.sleep(0.5)  # two looks of the keeper
+    await looks(master)  # and the prober, more often
     for node in nodes:
         assert [method for method, _ in node.calls].count("getPublications") == 1
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from rosproxy.demo.fake_http import where
+from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode
 from rosproxy.demo.players import Adder, Listener, Talker
 from tests.integration.net import (
@@ -21,6 +22,7 @@ from tests.integration.net import (
     THIRD_NODE,
     greet,
     knock,
+    looks,
     refuses,
     rpc,
     service_header,
@@ -93,7 +95,7 @@ async def test_a_killed_proxy_serves_the_same_nodes_on_the_same_ports_within_a_s
         assert (await greet(uri, topic_header(f"{node.name}/out")))["callerid"] == node.name
         assert (await greet(uri, service_header(f"{node.name}/add")))["callerid"] == node.name
     assert monotonic() - ready < 1
-    await asyncio.sleep(0.3)
+    await looks(master)
     assert everything(master) == before
     assert not [call for node in nodes for call, _ in node.calls if call == "shutdown"]
 
@@ -198,15 +200,20 @@ async def test_recovery_waits_for_a_master_that_is_down(proxy, master, nodes):
     assert uri_of(master, "/a") == uri
 
 
+def asks_again(master: FakeMaster, asked: int) -> bool:
+    return len(master.named("getSystemState")) > asked
+
+
 async def test_killed_again_and_again(start_process, master, nodes):
     process = start_process()
     await populate(process, *nodes)
     before = everything(master)
     for _ in range(3):
+        asked = len(master.named("getSystemState"))
         await restart(process)
-        await asyncio.sleep(0.03)
+        await until(partial(asks_again, master, asked), "recovery begins")
     await until(lambda: answers(uri_of(master, "/a")), "it is served")
-    await asyncio.sleep(0.3)
+    await looks(master)
     assert everything(master) == before
 
 
@@ -239,7 +246,7 @@ async def test_a_restarted_master_that_kept_its_memory_is_left_alone(proxy, mast
     master.pid += 1
     await master.start()
     await until(lambda: proxy.app.status()["master"]["pid"] == master.pid, "it is noticed")
-    await asyncio.sleep(0.3)
+    await looks(master)
     assert len(master.named("registerPublisher", "registerSubscriber", "registerService")) == calls
 
 
@@ -254,10 +261,11 @@ async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_them(
     master.register("publishers", "/a/out", "/a", successor.uri)
     await master.start()
     await until(lambda: "/b" in master.nodes, "the others are registered again")
-    await asyncio.sleep(0.5)
+    await looks(master)
     assert uri_of(master, "/a") == successor.uri
     assert "shutdown" not in dict(successor.calls)
-    assert not proxy.endpoint(nodes[0]).registrations
+    key = nodes[0].address, nodes[0].slave.address[1]
+    assert not [e for e in proxy.app.context.registry if e.key == key and e.registrations]
 
 
 async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy, master, nodes):
@@ -267,7 +275,7 @@ async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy,
     await until(lambda: refuses(proxy.lease(nodes[0])), "its port refuses")
     await master.restart()
     await until(lambda: "/c" in master.nodes, "the others are registered again")
-    await asyncio.sleep(0.3)
+    await looks(master)
     assert "/a" not in master.nodes
 
 

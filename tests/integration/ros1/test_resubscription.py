@@ -1,6 +1,5 @@
 """Subscribers outside that have no connection after a restart are told again; no others are."""
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from functools import partial
@@ -20,6 +19,7 @@ from tests.integration.net import (
     OUTSIDE,
     THIRD_NODE,
     connect,
+    looks,
     read_header,
     refuses,
     rpc,
@@ -30,7 +30,8 @@ from tests.integration.proxy import Proxy
 
 LOOKS = (0.8, 1.6)
 """Seconds after which the proxy of these tests looks; long enough to connect before."""
-AFTERWARDS = 2.2
+AFTERWARDS = 11
+"""Looks of the proxy at its master, five a second, after which both are over."""
 
 
 @pytest.fixture(autouse=True)
@@ -87,7 +88,7 @@ async def test_who_has_no_connection_is_told_at_each_look(proxy, talker, master,
     uri = proxy.uri(talker)
     often = [[], [uri]] * (1 + len(LOOKS))
     await until(lambda: lost.updates() == often, "it is told after the start and at each look")
-    await asyncio.sleep(1)
+    await looks(master, 5)
     assert lost.updates() == often
 
 
@@ -136,7 +137,7 @@ async def test_who_is_served_by_udpros_is_left_alone(proxy, talker, master, make
     await served(proxy, talker)
     await told(ear, proxy.uri(talker))
     ear.calls.clear()
-    await asyncio.sleep(AFTERWARDS)
+    await looks(master, AFTERWARDS)
     assert [] not in ear.updates()
 
 
@@ -153,12 +154,12 @@ async def test_a_publisher_that_does_not_tell_its_connections_hinders_nobody(
     await until(lambda: [] in ear.updates(), "it is told at a look")
 
 
-async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, make_node):
+async def test_neighbours_that_need_no_proxy_are_left_alone(proxy, talker, master, make_node):
     neighbour = await make_node("/neighbour", THIRD_NODE)
     await neighbour.subscribe(proxy.master)
     await proxy.restart()
     await served(proxy, talker, neighbour)
-    await asyncio.sleep(AFTERWARDS)
+    await looks(master, AFTERWARDS)
     assert [] not in neighbour.updates()
 
 

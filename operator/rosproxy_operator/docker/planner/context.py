@@ -40,12 +40,12 @@ class PlanContext:
     @property
     def sandboxes(self) -> tuple[Sandbox, ...]:
         """The key's sandboxes."""
-        return tuple(one for one in self.observed.sandboxes if one.key == self.key)
+        return self.observed.sandboxes_of(self.key)
 
     @property
     def proxies(self) -> tuple[Proxy, ...]:
         """The key's proxies."""
-        return tuple(one for one in self.observed.proxies if one.key == self.key)
+        return self.observed.proxies_of(self.key)
 
     def taken(self, own: tuple[Container, ...]) -> frozenset[str]:
         """The names of all containers but these."""

@@ -183,6 +183,14 @@ class HostState:
         """The keys of all that is the operator's own."""
         return frozenset(one.key for one in self.own)
 
+    def sandboxes_of(self, key: Key) -> tuple[Sandbox, ...]:
+        """The sandboxes of a key."""
+        return tuple(one for one in self.sandboxes if one.key == key)
+
+    def proxies_of(self, key: Key) -> tuple[Proxy, ...]:
+        """The proxies of a key."""
+        return tuple(one for one in self.proxies if one.key == key)
+
     @property
     def busy_keys(self) -> frozenset[Key]:
         """The keys of those to which nothing can be done now."""

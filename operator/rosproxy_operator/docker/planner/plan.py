@@ -129,18 +129,18 @@ class _View:
 
     def sandboxes(self, key: Key) -> tuple[Sandbox, ...]:
         """The sandboxes of a key but those that are being removed."""
-        own = (one for one in self.observed.sandboxes if one.key == key)
+        own = self.observed.sandboxes_of(key)
         return tuple(one for one in own if one.container.state != "removing")
 
     def proxies(self, key: Key) -> tuple[Proxy, ...]:
         """The proxies of a key but those that are being removed."""
-        own = (one for one in self.observed.proxies if one.key == key)
+        own = self.observed.proxies_of(key)
         return tuple(one for one in own if one.container.state != "removing")
 
     def waiting(self, key: Key) -> bool:
         """Whether a container of the key is being removed."""
-        own = (one for one in self.observed.own if one.key == key)
-        return any(one.container.state == "removing" for one in own)
+        own = self.observed.own
+        return any(one.key == key and one.container.state == "removing" for one in own)
 
     def left(self, since: float) -> float:
         """The seconds until the grace ends of what began then."""

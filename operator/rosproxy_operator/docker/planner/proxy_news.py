@@ -1,9 +1,15 @@
-"""What a proxy is to be told of the containers on its networks."""
+"""What a proxy is to be told of the containers on its networks.
+
+`facts` is what one look says to one proxy. `ProxyNews` compares it with what the proxy was told
+before and with the nodes that it has, and says what is new and when something is due again. Nothing
+is forgotten until the proxy has heard it. Times are seconds of a monotonic clock.
+"""
 
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, ip_address
+from typing import Any
 
 from rosproxy.net.addresses import is_address
 from rosproxy_operator.docker.planner.model import STARTED, Container, HostState, Member, Proxy
@@ -11,6 +17,8 @@ from rosproxy_operator.docker.planner.specs import master
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
 """Seconds after a container's arrival at which its proxy is told: nodes take time to register."""
+AGAIN_MOVED = 1.0
+"""Seconds until a move is told again: the new address may not be reachable at once."""
 AWAY = 2.0
 """Seconds for which a running container may be off a network before its address counts as gone."""
 MOVING = 5.0
@@ -111,6 +119,57 @@ class Places:
     def moved(self, nodes: Collection[str]) -> dict[str, str]:
         """Old address to new one, of those where the proxy still believes its ``nodes`` to be."""
         return {old: new for old, (new, _) in self._moves.items() if old in nodes}
+
+
+class ProxyNews:
+    """What one run of a proxy has yet to be told."""
+
+    def __init__(self) -> None:
+        self.facts = NetworkFacts()
+        self._subnets: set[IPv4Network] = set()
+        self._places = Places()
+        self._due: dict[ContainerArrival, list[float]] = {}
+        self._moving = False
+
+    def look(self, known: NetworkFacts, now: float) -> None:
+        """Take note of what a look has found."""
+        self.facts = known
+        self._subnets |= set(known.subnets)
+        self._due = {
+            arrival: self._due.get(arrival, [now + after for after in AGAIN])
+            for arrival in known.arrivals
+        }
+
+    def body(self, nodes: Collection[str], now: float) -> dict[str, Any]:
+        """The body of ``POST /containers`` for a proxy with nodes at these addresses; or nothing.
+
+        Addresses that are ``gone``, have ``moved`` or where containers have ``arrived``.
+        """
+        self._places.look(self.facts, now)
+        body = {
+            "gone": gone(nodes, self.facts.taken | self._places.held, self._subnets),
+            "moved": self._places.moved(nodes),
+            "arrived": [
+                {"address": arrival.address, "names": sorted(arrival.names)}
+                for arrival, times in sorted(self._due.items(), key=lambda item: item[0].address)
+                if times and times[0] <= now
+            ],
+        }
+        self._moving = bool(body["moved"])
+        return {key: value for key, value in body.items() if value}
+
+    def told(self, now: float) -> None:
+        """Take note that the proxy has heard what was due until then."""
+        self._due = {
+            arrival: [when for when in times if when > now] for arrival, times in self._due.items()
+        }
+
+    def next_due(self, now: float) -> float | None:
+        """Seconds until there is something to be told again; None if there is nothing."""
+        times = [when for due in self._due.values() for when in due[:1]]
+        times += [self._places.until] if self._places.until else []
+        times += [now + AGAIN_MOVED] if self._moving else []
+        return max(min(times) - now, 0.0) if times else None
 
 
 def facts(

@@ -114,7 +114,7 @@ class _Allocation:
         """Whether a range where nothing runs now can be had.
 
         Ports of pods that are about to end are let go in time for one that has served; those of
-        the controller's own also for one that waits for them already.
+        the operator's own also for one that waits for them already.
         """
         served = place in self.state.served
         waits = served or self.view.current(place) is not None

@@ -37,7 +37,7 @@ class Condition:
 def serving(state: NodeState) -> bool:
     """Whether a node's proxy has its ports and works.
 
-    One that has not been asked since the controller started counts if the kubelet finds it ready.
+    One that has not been asked since the operator started counts if the kubelet finds it ready.
     """
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting or not proxy.ready or proxy.stuck is not None:
@@ -95,7 +95,7 @@ def condition(status: Json, type: str) -> Json:
     return next(found, {})
 
 
-def told(problem: Problem) -> str:
+def one_line(problem: Problem) -> str:
     """A problem in one line."""
     return f"{problem.subject}: {problem.text}"
 
@@ -122,7 +122,7 @@ def _ready(
         return Condition(READY, "True", "Serving", text)
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:
-        return Condition(READY, "False", reason_of(blocking[0]), told(blocking[0]))
+        return Condition(READY, "False", reason_of(blocking[0]), one_line(blocking[0]))
     return Condition(READY, "False", "ProxiesStarting", _starting(waiting[0]))
 
 
@@ -155,7 +155,7 @@ def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Conditio
     if not lacking and not refused:
         return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
     reason = CONFLICT if refused else EXHAUSTED
-    lines = [told(one) for one in problems if reason_of(one) in (CONFLICT, EXHAUSTED)]
+    lines = [one_line(one) for one in problems if reason_of(one) in (CONFLICT, EXHAUSTED)]
     names = ", ".join(state.name for state in (*refused, *lacking))
     return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
 
@@ -164,12 +164,12 @@ def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Js
     """Of proxies that are not asked yet nothing is known: what was so far holds on."""
     proxies = [state for state in states if state.proxy is not None]
     answers = [state.answer for state in proxies]
-    heard = [answer for answer in answers if answer is not None and answer.answered]
-    if any(not answer.master_up for answer in heard):
-        lines = [told(one) for one in problems if reason_of(one) == NO_MASTER]
+    answered_reports = [answer for answer in answers if answer is not None and answer.answered]
+    if any(not answer.master_up for answer in answered_reports):
+        lines = [one_line(one) for one in problems if reason_of(one) == NO_MASTER]
         return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
     was = condition(former, MASTER)
-    if len(heard) == len(proxies) and proxies:
+    if len(answered_reports) == len(proxies) and proxies:
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
     if proxies and was:
         return Condition(MASTER, word(was, "status"), word(was, "reason"), word(was, "message"))
@@ -181,5 +181,5 @@ def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Js
 def _degraded(problems: Sequence[Problem]) -> Condition:
     if not problems:
         return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
-    lines = "; ".join(map(told, problems))
+    lines = "; ".join(map(one_line, problems))
     return Condition(DEGRADED, "True", reason_of(problems[0]), lines)

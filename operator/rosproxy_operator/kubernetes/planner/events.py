@@ -36,7 +36,7 @@ def warnings(
 ) -> NewEvents:
     """Warning Events for problems that were not there before.
 
-    One that comes and goes all the time is told once. After a restart of the controller all are
+    One that comes and goes all the time is told once. After a restart of the operator all are
     told again: who makes the Events counts those that are there already.
 
     Args:

@@ -120,9 +120,9 @@ def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator
 
 
 def _silent(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> ClusterFinding:
-    """No Event: a controller that is cut off would make one for each proxy."""
+    """No Event: an operator that is cut off would make one for each proxy."""
     text = (
-        f"it does not answer the controller ({error}): let the controller's pod connect to port "
+        f"it does not answer the operator ({error}): let the operator's pod connect to port "
         f"{ADMIN_PORT} of this one (NetworkPolicy)"
     )
     return ClusterFinding(_subject(proxy), text, reason=SILENT, of=rosproxy.id, about=None)
@@ -160,8 +160,8 @@ def _remedy(said: str, rosproxy: RosProxy) -> str:
     if "is invalid" in low:
         return "mend the field that is named in the RosProxy's spec"
     if "cannot" in low and "user" in low:
-        return "the controller lacks a right: install its chart or manifests anew"
-    if "not the controller's" in low:
+        return "the operator lacks a right: install its chart or manifests anew"
+    if "not the operator's" in low:
         return "delete or rename that object, or the RosProxy"
     return "it is tried again"
 

@@ -79,7 +79,7 @@ def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | N
     """
     if not cluster_ip or pod.ended or pod.deleting:
         return None
-    text = _astray(pod, rosproxy.id, cluster_ip)
+    text = _wrong_master(pod, rosproxy.id, cluster_ip)
     about = Reference("Pod", pod.id, pod.uid)
     subject = f"pod {pod.id}"
     return (
@@ -89,7 +89,7 @@ def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | N
     )
 
 
-def _astray(pod: Pod, of: Name, cluster_ip: str) -> str:
+def _wrong_master(pod: Pod, of: Name, cluster_ip: str) -> str:
     others = [uri for uri in pod.own_masters if not _is_proxys(uri, of, cluster_ip)]
     if others:
         return (

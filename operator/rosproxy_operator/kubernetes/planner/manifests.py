@@ -1,4 +1,4 @@
-"""What the controller creates in a cluster, as the API server takes it."""
+"""What the operator creates in a cluster, as the API server takes it."""
 
 import copy
 import hashlib
@@ -34,7 +34,7 @@ STOPS_WITHIN = 5
 _LINGERS = 2
 """Seconds for which a proxy goes on after its deletion.
 
-The garbage collector deletes the proxies of a RosProxy that is gone before the controller knows:
+The garbage collector deletes the proxies of a RosProxy that is gone before the operator knows:
 this is the time to tell them that nobody takes over.
 """
 _TAINTS = (

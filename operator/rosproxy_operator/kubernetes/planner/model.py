@@ -1,4 +1,4 @@
-"""What the controller sees in a Kubernetes cluster, in Kubernetes' words."""
+"""What the operator sees in a Kubernetes cluster, in Kubernetes' words."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -77,7 +77,7 @@ class RosProxySpec:
 
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
     RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
-    controller's default. ``resources``, ``tolerations``, ``host_aliases`` and
+    operator's default. ``resources``, ``tolerations``, ``host_aliases`` and
     ``image_pull_secrets`` go into the pods as they are.
     """
 
@@ -179,7 +179,7 @@ class Stuck(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ProxyPod:
-    """A pod of the controller in which a proxy runs, or is to run.
+    """A pod of the operator in which a proxy runs, or is to run.
 
     ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
     (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
@@ -203,7 +203,7 @@ class ProxyPod:
 
 @dataclass(frozen=True, slots=True)
 class ProxyService:
-    """A Service of the controller: under its address pods find the proxy on their node."""
+    """A Service of the operator: under its address pods find the proxy on their node."""
 
     of: Name
     owner: str
@@ -300,7 +300,7 @@ class ClusterSnapshot:
     wrong; one of them is empty. ``selected`` are the uids of the pods that a RosProxy selects.
     ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
     ``reports`` are what the proxies say of themselves, by the uid of the pod, ``failures`` those of
-    the last try to carry something out: neither is listed, the controller puts them here.
+    the last try to carry something out: neither is listed, the operator puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()

@@ -1,4 +1,4 @@
-"""What the controller calls things in a cluster: names, labels, annotations, ports."""
+"""What the operator calls things in a cluster: names, labels, annotations, ports."""
 
 import hashlib
 import re
@@ -33,7 +33,7 @@ _OWN = {
     MANAGED_BY_LABEL: "rosproxy-operator",
 }
 OWN_SELECTOR = ",".join(f"{label}={value}" for label, value in _OWN.items())
-"""Label selector, in the API's words, of everything that the controller makes."""
+"""Label selector, in the API's words, of everything that the operator makes."""
 
 MASTER_PORT = 11311
 ADMIN_PORT = 11312
@@ -54,7 +54,7 @@ def own_labels(of: str) -> dict[str, str]:
 
 
 def is_own(labels: Mapping[str, str]) -> bool:
-    """Whether labels are those that the controller gives to what it makes."""
+    """Whether labels are those that the operator gives to what it makes."""
     return all(labels.get(label) == value for label, value in _OWN.items()) and PROXY_OF in labels
 
 

@@ -1,13 +1,22 @@
-"""Objects of the API server, read: nodes, pods, Services.
+"""Objects of the API server, read: what the planner wants to know of nodes, pods and Services.
 
 The API server has checked their types; what is missing is as if it were empty.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import SettingError, parse_range
 from rosproxy_operator.kubernetes.planner import names
+from rosproxy_operator.kubernetes.planner.api_objects import (
+    Metadata,
+    NodeObject,
+    ObjectCondition,
+    PodObject,
+    PodSpec,
+    ServiceObject,
+)
+from rosproxy_operator.kubernetes.planner.fields import lenient
 from rosproxy_operator.kubernetes.planner.model import (
     ELSEWHERE,
     ClusterNode,
@@ -18,143 +27,125 @@ from rosproxy_operator.kubernetes.planner.model import (
     ProxyService,
 )
 from rosproxy_operator.kubernetes.planner.pod_failures import stuck
-from rosproxy_operator.kubernetes.planner.values import number, part, parts, word, words
 
 VARIABLE = "ROS_MASTER_URI"
 
 
 def node(obj: Json) -> ClusterNode:
     """A node."""
-    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
-    addresses: dict[str, str] = {}
-    for one in parts(status, "addresses"):
-        addresses.setdefault(word(one, "type"), word(one, "address"))
-    networks = spec.get("podCIDRs") or [spec.get("podCIDR")]
+    found = lenient(obj, NodeObject)
+    meta, spec, status = found.metadata, found.spec, found.status
     return ClusterNode(
-        name=word(meta, "name"),
-        labels=words(meta, "labels"),
-        addresses=addresses,
-        advertise_host=words(meta, "annotations").get(names.ADVERTISE_HOST, "").strip(),
-        pod_networks=tuple(one for one in networks if one),
-        ready=condition(obj, "Ready").get("status") == "True",
-        cordoned=spec.get("unschedulable") is True,
-        deleting="deletionTimestamp" in meta,
+        name=meta.name,
+        labels=meta.labels,
+        addresses={one.type: one.address for one in reversed(status.addresses)},
+        advertise_host=meta.annotations.get(names.ADVERTISE_HOST, "").strip(),
+        pod_networks=tuple(filter(None, spec.pod_cidrs or (spec.pod_cidr,))),
+        ready=_is_ready(status.conditions),
+        cordoned=spec.unschedulable,
+        deleting=meta.deleting,
     )
 
 
 def pod(obj: Json, namespace: str = "") -> Pod:
-    """A pod. ``namespace`` is used where the object has none, as at admission.
+    """A pod. ``namespace`` is used where the object has none, as at admission."""
+    return _pod(lenient(obj, PodObject), namespace)
 
-    There it may have no name, uid, node and address either.
-    """
-    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
-    wired = words(meta, "annotations").get(names.MASTER_URI, "")
-    host_network = spec.get("hostNetwork") is True
+
+def _pod(found: PodObject, namespace: str = "") -> Pod:
+    meta, spec, status = found.metadata, found.spec, found.status
+    wired = meta.annotations.get(names.MASTER_URI, "")
     return Pod(
-        id=Name(word(meta, "namespace") or namespace, word(meta, "name")),
-        uid=word(meta, "uid"),
-        labels=words(meta, "labels"),
-        node=word(spec, "nodeName"),
-        phase=word(status, "phase") or "Pending",
-        ip=word(status, "podIP"),
+        id=Name(meta.namespace or namespace, meta.name),
+        uid=meta.uid,
+        labels=meta.labels,
+        node=spec.node_name,
+        phase=status.phase or "Pending",
+        ip=status.pod_ip,
         host_ports=frozenset(_host_ports(spec)),
-        host_network=host_network,
-        deleting="deletionTimestamp" in meta,
+        host_network=spec.host_network,
+        deleting=meta.deleting,
         own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
         wired=wired,
     )
 
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
-    """A proxy's pod; None if the object is not one that this controller made, or not whole."""
-    found, notes = pod(obj), words(obj, "metadata", "annotations")
-    container = _container(part(obj, "spec"))
+    """A proxy's pod; None if the object is not one that this operator made, or not whole."""
+    found = lenient(obj, PodObject)
+    meta, notes = found.metadata, found.metadata.annotations
+    container = next((one for one in found.spec.containers if one.name == names.CONTAINER), None)
     ports = _range(notes.get(names.PORT_RANGE, ""))
-    on, owner = notes.get(names.NODE, ""), _owner(obj)
-    if not names.is_own(found.labels) or ports is None or not (on and owner and container):
+    on, owner = notes.get(names.NODE, ""), _owner(meta)
+    if not names.is_own(meta.labels) or ports is None or not (on and owner and container):
         return None
-    reason, message = stuck(obj)
+    reason, message = stuck(found.status)
+    tokens = (one.value for one in container.env if one.name == names.TOKEN_VARIABLE)
     return ProxyPod(
-        pod=found,
-        of=Name(found.id.namespace, found.labels[names.PROXY_OF]),
+        pod=_pod(found),
+        of=Name(meta.namespace, meta.labels[names.PROXY_OF]),
         owner=owner,
         on=on,
         range=ports,
         fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=word(container, "image"),
-        token=_variable(container, names.TOKEN_VARIABLE),
-        ready=condition(obj, "Ready").get("status") == "True",
+        image=container.image,
+        token=next(tokens, ""),
+        ready=_is_ready(found.status.conditions),
         stuck=reason,
         message=message,
-        restarts=sum(
-            number(one, "restartCount") for one in parts(part(obj, "status"), "containerStatuses")
-        ),
+        restarts=sum(one.restart_count for one in found.status.container_statuses),
     )
 
 
 def service(obj: Json) -> ProxyService | None:
-    """A Service; None if the object is not one that this controller made."""
-    meta = part(obj, "metadata")
-    labels, owner = words(meta, "labels"), _owner(obj)
-    if not names.is_own(labels) or not owner:
+    """A Service; None if the object is not one that this operator made."""
+    found = lenient(obj, ServiceObject)
+    meta, owner = found.metadata, _owner(found.metadata)
+    if not names.is_own(meta.labels) or not owner:
         return None
-    of = Name(word(meta, "namespace"), labels[names.PROXY_OF])
-    if names.service_id(of) != Name(of.namespace, word(meta, "name")):
+    of = Name(meta.namespace, meta.labels[names.PROXY_OF])
+    if names.service_id(of) != Name(of.namespace, meta.name):
         return None
-    address = word(part(obj, "spec"), "clusterIP")
     return ProxyService(
         of=of,
         owner=owner,
-        uid=word(meta, "uid"),
-        cluster_ip="" if address == "None" else address,
-        fingerprint=words(meta, "annotations").get(names.FINGERPRINT, ""),
-        deleting="deletionTimestamp" in meta,
+        uid=meta.uid,
+        cluster_ip="" if found.spec.cluster_ip == "None" else found.spec.cluster_ip,
+        fingerprint=meta.annotations.get(names.FINGERPRINT, ""),
+        deleting=meta.deleting,
     )
 
 
-def condition(obj: Json, type: str) -> Json:
-    """One of the conditions in an object's status, empty if it is not there."""
-    found = (one for one in parts(part(obj, "status"), "conditions") if one.get("type") == type)
-    return next(found, {})
+def _is_ready(conditions: Iterable[ObjectCondition]) -> bool:
+    return any(one.type == "Ready" and one.status == "True" for one in conditions)
 
 
-def _host_ports(spec: Json) -> Iterator[int]:
+def _host_ports(spec: PodSpec) -> Iterator[int]:
     """Those of containers that run all the time, as the scheduler counts them.
 
     That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
     """
-    lasting = (one for one in parts(spec, "initContainers") if one.get("restartPolicy") == "Always")
-    for container in (*parts(spec, "containers"), *lasting):
-        for port in parts(container, "ports"):
-            if port.get("protocol", "TCP") == "TCP" and number(port, "hostPort"):
-                yield number(port, "hostPort")
+    lasting = (one for one in spec.init_containers if one.restart_policy == "Always")
+    for container in (*spec.containers, *lasting):
+        for port in container.ports:
+            if port.protocol == "TCP" and port.host_port:
+                yield port.host_port
 
 
-def _masters(spec: Json) -> Iterator[str]:
-    for container in (*parts(spec, "initContainers"), *parts(spec, "containers")):
-        for variable in parts(container, "env"):
-            if word(variable, "name") == VARIABLE:
-                value = word(variable, "value")
-                later = "valueFrom" in variable or "$(" in value
-                yield ELSEWHERE if later else value
+def _masters(spec: PodSpec) -> Iterator[str]:
+    for container in (*spec.init_containers, *spec.containers):
+        for variable in container.env:
+            if variable.name == VARIABLE:
+                later = variable.value_from is not None or "$(" in variable.value
+                yield ELSEWHERE if later else variable.value
 
 
-def _container(spec: Json) -> Json:
-    found = (one for one in parts(spec, "containers") if one.get("name") == names.CONTAINER)
-    return next(found, {})
-
-
-def _variable(container: Json, name: str) -> str:
-    found = (one for one in parts(container, "env") if one.get("name") == name)
-    return word(next(found, {}), "value")
-
-
-def _owner(obj: Json) -> str:
+def _owner(meta: Metadata) -> str:
     """The uid of the RosProxy that owns an object, empty if none does."""
-    for owner in parts(part(obj, "metadata"), "ownerReferences"):
-        group = word(owner, "apiVersion").partition("/")[0]
-        if group == names.GROUP and owner.get("kind") == names.KIND and owner.get("controller"):
-            return word(owner, "uid")
+    for owner in meta.owner_references:
+        group = owner.api_version.partition("/")[0]
+        if group == names.GROUP and owner.kind == names.KIND and owner.controller:
+            return owner.uid
     return ""
 
 

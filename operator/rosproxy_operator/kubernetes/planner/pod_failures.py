@@ -6,9 +6,14 @@ The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes
 import re
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.planner.model import Json, Stuck
+from rosproxy_operator.kubernetes.planner.api_objects import (
+    ContainerStatus,
+    ObjectCondition,
+    PodStatus,
+    Terminated,
+)
+from rosproxy_operator.kubernetes.planner.model import Stuck
 from rosproxy_operator.kubernetes.planner.names import CONTAINER
-from rosproxy_operator.kubernetes.planner.values import number, part, parts, word
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
@@ -57,20 +62,19 @@ the CNI plugin portmap the port is silently taken over.
 _LONGEST = 300
 
 
-def stuck(obj: Json) -> tuple[Stuck | None, str]:
+def stuck(status: PodStatus) -> tuple[Stuck | None, str]:
     """Why a pod does not run, and the same in the words of Kubernetes; None if it does, or may yet.
 
     The words don't change while the trouble is the same.
     """
-    status = part(obj, "status")
-    if word(status, "phase") == "Failed":
+    if status.phase == "Failed":
         return _failed(status)
-    for one in parts(status, "conditions"):
-        if one.get("type") == "PodScheduled" and one.get("status") == "False":
-            return _unscheduled(one)
-    for one in parts(status, "containerStatuses"):
-        if word(one, "name") == CONTAINER:
-            return _waiting(one)
+    for condition in status.conditions:
+        if condition.type == "PodScheduled" and condition.status == "False":
+            return _unscheduled(condition)
+    for container in status.container_statuses:
+        if container.name == CONTAINER:
+            return _waiting(container)
     return None, ""
 
 
@@ -80,41 +84,38 @@ def stuck_by_event(message: str) -> Stuck:
     return Stuck.PORTS if any(text in low for text in _TAKEN) else Stuck.SANDBOX
 
 
-def _failed(status: Json) -> tuple[Stuck, str]:
+def _failed(status: PodStatus) -> tuple[Stuck, str]:
     """The kubelet did not admit the pod, or ended it (``rejectPod`` in pkg/kubelet/kubelet.go)."""
-    reason, message = word(status, "reason"), word(status, "message")
-    ports = reason == _REASON_PORTS or PORTS_TAKEN in message
-    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(reason, message)
+    ports = status.reason == _REASON_PORTS or PORTS_TAKEN in status.message
+    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(status.reason, status.message)
 
 
-def _unscheduled(condition: Json) -> tuple[Stuck | None, str]:
+def _unscheduled(condition: ObjectCondition) -> tuple[Stuck | None, str]:
     """The scheduler found no place: reason Unschedulable or SchedulingGated.
 
     After a SchedulerError, as when a pod of the same name has just been deleted, it tries again by
     itself (``handleSchedulingFailure`` in pkg/scheduler/schedule_one.go).
     """
-    reason, message = word(condition, "reason"), word(condition, "message")
+    reason, message = condition.reason, condition.message
     if reason in ("", _REASON_TRANSIENT):
         return None, ""
     return Stuck.PORTS if PORTS_TAKEN in message else Stuck.SCHEDULING, _text(reason, message)
 
 
-def _waiting(container: Json) -> tuple[Stuck | None, str]:
+def _waiting(container: ContainerStatus) -> tuple[Stuck | None, str]:
     """What a container waits for. One that has ended for the second time waits as well.
 
     The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
     """
-    ended = part(container, "state", "terminated")
-    if number(ended, "exitCode") and number(container, "restartCount"):
+    ended, waiting = container.state.terminated, container.state.waiting
+    if ended.exit_code and container.restart_count:
         return _crashing(ended)
-    waiting = part(container, "state", "waiting")
-    reason, message = word(waiting, "reason"), word(waiting, "message")
-    if reason in _IMAGE:
-        return Stuck.IMAGE, _image(reason, message)
-    if reason == _CRASHING:
-        return _crashing(part(container, "lastState", "terminated"))
-    if reason in _SANDBOX:
-        return Stuck.SANDBOX, _text(reason, message)
+    if waiting.reason in _IMAGE:
+        return Stuck.IMAGE, _image(waiting.reason, waiting.message)
+    if waiting.reason == _CRASHING:
+        return _crashing(container.last_state.terminated)
+    if waiting.reason in _SANDBOX:
+        return Stuck.SANDBOX, _text(waiting.reason, waiting.message)
     return None, ""
 
 
@@ -123,19 +124,19 @@ def _image(reason: str, message: str) -> str:
     return _text("", bare) or reason
 
 
-def _crashing(terminated: Json) -> tuple[Stuck, str]:
+def _crashing(ended: Terminated) -> tuple[Stuck, str]:
     """Between two tries to start a container that never ran, the kubelet calls that a crash too."""
-    if word(terminated, "reason") in _NOT_STARTED:
-        return Stuck.SANDBOX, _text("RunContainerError", word(terminated, "message"))
-    return Stuck.CRASHING, _crash(terminated)
+    if ended.reason in _NOT_STARTED:
+        return Stuck.SANDBOX, _text("RunContainerError", ended.message)
+    return Stuck.CRASHING, _crash(ended)
 
 
-def _crash(terminated: Json) -> str:
+def _crash(ended: Terminated) -> str:
     """How the container ended; the kubelet's own words count the seconds until it is started."""
-    lines = word(terminated, "message").strip().splitlines() or [""]
-    how = f"exit code {number(terminated, 'exitCode')}"
-    if word(terminated, "reason") not in ("", "Error", "Completed"):
-        how = f"{word(terminated, 'reason')}, {how}"
+    lines = ended.message.strip().splitlines() or [""]
+    how = f"exit code {ended.exit_code}"
+    if ended.reason not in ("", "Error", "Completed"):
+        how = f"{ended.reason}, {how}"
     return _text(how, _STAMP.sub("", lines[-1]))
 
 

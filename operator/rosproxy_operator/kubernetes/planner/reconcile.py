@@ -120,7 +120,7 @@ def obstacle(context: ClusterContext, place: ProxyPlace) -> tuple[str, str]:
     name = proxy_id(place.of, place.node)
     own = {one.pod.uid for one in context.observed.proxies}
     if any(pod.id == name and pod.uid not in own for pod in context.observed.pods):
-        text = "is there already, and is not the controller's: delete or rename it"
+        text = "is there already, and is not the operator's: delete or rename it"
         return "NameTaken", f"a pod called {name} {text}"
     return "", ""
 
@@ -253,7 +253,7 @@ def _creation(place: ProxyPlace) -> Task:
 def _change(one: ProxyPod, site: Site) -> str:
     if one.range != site.ports:
         return f"made anew: its ports are to be {site.ports} instead of {one.range}"
-    return "made anew: its RosProxy, its node or the controller's options have changed"
+    return "made anew: its RosProxy, its node or the operator's options have changed"
 
 
 def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:

@@ -12,7 +12,7 @@ EPHEMERAL = PortRange(32768, 60999)
 
 @dataclass(frozen=True, slots=True)
 class ClusterSettings:
-    """The controller's options that decide what is planned.
+    """The operator's options that decide what is planned.
 
     ``image`` and ``image_pull_policy`` are those of proxies whose RosProxy names none; an empty
     policy leaves it to Kubernetes. ``node_ports`` is the API server's --service-node-port-range,

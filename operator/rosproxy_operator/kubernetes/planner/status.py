@@ -10,8 +10,8 @@ from rosproxy_operator.kubernetes.planner.conditions import (
     READY,
     Condition,
     conditions,
+    one_line,
     serving,
-    told,
     verdicts,
 )
 from rosproxy_operator.kubernetes.planner.findings import findings, invalid_finding, of_node
@@ -49,7 +49,7 @@ def status_of(
 ) -> Json:
     """The status of a RosProxy, as in the CRD.
 
-    What only proxies can tell stays as it was until they have been asked, so that a controller that
+    What only proxies can tell stays as it was until they have been asked, so that an operator that
     is started changes nothing.
 
     Args:
@@ -62,7 +62,7 @@ def status_of(
         stamp: The time for conditions that change, as RFC 3339 has it.
     """
     former = rosproxy.status
-    shown = _told(states)
+    shown = _shown_nodes(states)
     names = min(MOST_NAMES, MOST_NAMES_OF_ALL // max(len(shown), 1))
     lines = [_line(rosproxy, state, names) for state in shown]
     nodes = sum(number(line, "rosNodes") for line in lines)
@@ -107,7 +107,7 @@ def _same(was: Json) -> Condition:
     return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
 
 
-def _told(states: Sequence[NodeState]) -> list[NodeState]:
+def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
     """The nodes to be told, by name; those without pods are the first to be left out."""
     first = sorted(states, key=lambda one: (not one.pods, one.proxy is None, one.name))
     return sorted(first[:MOST_NODES], key=lambda one: one.name)
@@ -130,7 +130,7 @@ def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]
 
 def _ros(state: NodeState, most: int, former: Json) -> dict[str, object]:
     """What a proxy tells of its ROS nodes, now or when it was asked last."""
-    if _heard(state.answer):
+    if _has_answered(state.answer):
         names = sorted({name for found in state.answer.nodes.values() for name in found})
         shown = [shorten(clean(name), _NAME) for name in names[:most]]
         return {"rosNodes": len(names), "names": shown, "topics": len(state.answer.topics)}
@@ -143,19 +143,19 @@ def _ros(state: NodeState, most: int, former: Json) -> dict[str, object]:
     }
 
 
-def _heard(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
+def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
     return answer is not None and answer.answered
 
 
 def _message(rosproxy: RosProxy, state: NodeState) -> str:
     found = next(of_node(rosproxy, state), None)
-    return bounded(told(found), _MESSAGE) if found else ""
+    return bounded(one_line(found), _MESSAGE) if found else ""
 
 
 def _topics(states: Sequence[NodeState], former: Json) -> int:
     answers = [state.answer for state in states if state.proxy is not None]
-    known = len({topic for answer in answers if _heard(answer) for topic in answer.topics})
-    return known if all(map(_heard, answers)) else max(known, number(former, "topics"))
+    known = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
+    return known if all(map(_has_answered, answers)) else max(known, number(former, "topics"))
 
 
 def _ports(states: Sequence[NodeState]) -> str:

@@ -1,27 +1,16 @@
-"""Values out of objects: those of users with errors that name the field, others without any."""
+"""What is a name, a label or a host to Kubernetes; and values out of JSON that may be anything."""
 
 import re
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.settings import SettingError, parse_host
+from rosproxy_operator.kubernetes.planner.fields import quoted
 from rosproxy_operator.kubernetes.planner.model import Json
 
-_SHOWN = 80
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*")
 _QUALIFIED = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
-
-
-class InvalidField(Exception):
-    """Why an object can't be used: which field, what is wrong, and what to do."""
-
-
-def quoted(value: object) -> str:
-    """A value as it may be shown: not too long, and harmless."""
-    text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…"
 
 
 def host_problem(host: str) -> str:
@@ -85,78 +74,3 @@ def number(obj: Any, key: str) -> int:
 def words(obj: Any, *keys: str) -> dict[str, str]:
     """The texts of a map, by their keys."""
     return {key: value for key, value in part(obj, *keys).items() if isinstance(value, str)}
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """A field of an object that a user writes. ``path`` names it: ``spec.ports``.
-
-    ``value`` None means that it is not given. All methods raise Unusable for another type.
-    """
-
-    path: str
-    value: Any
-
-    @property
-    def given(self) -> bool:
-        """Whether it is there."""
-        return self.value is not None
-
-    def wrong(self, what: str, fix: str) -> InvalidField:
-        """The error to raise for this field."""
-        return InvalidField(f"{self.path}: {quoted(self.value)} {what}: {fix}")
-
-    def child(self, name: str) -> "Field":
-        """A field of the map that this one is."""
-        return Field(f"{self.path}.{name}", self.map().get(name))
-
-    def map(self) -> Json:
-        """The map, empty if not given."""
-        if self.given and not isinstance(self.value, Mapping):
-            raise self.wrong("is not a map", f"write {self.path} as a map of fields")
-        return part(self.value)
-
-    def list(self) -> tuple["Field", ...]:
-        """The elements, none if not given."""
-        if self.given and not isinstance(self.value, list | tuple):
-            raise self.wrong("is not a list", f"write {self.path} as a list")
-        return tuple(Field(f"{self.path}[{i}]", one) for i, one in enumerate(self.value or ()))
-
-    def maps(self) -> tuple[Json, ...]:
-        """The elements of a list of maps."""
-        return tuple(one.map() for one in self.list())
-
-    def text(self, default: str = "") -> str:
-        """The text, without spaces around it."""
-        if self.given and not isinstance(self.value, str):
-            raise self.wrong("is not a text", "put it in quotes")
-        return self.value.strip() if self.given else default
-
-    def texts(self) -> dict[str, str]:
-        """The map of texts."""
-        return {key: self.child(key).text() for key in self.map()}
-
-    def choice(self, allowed: Collection[str], default: str) -> str:
-        """One of some words."""
-        found = self.text(default)
-        if found not in allowed:
-            raise self.wrong("is unknown", f"write one of {', '.join(sorted(allowed))}")
-        return found
-
-    def integer(self, default: int, low: int, high: int) -> int:
-        """An integer between two bounds."""
-        if not self.given:
-            return default
-        whole = isinstance(self.value, int) and not isinstance(self.value, bool)
-        if not whole or not low <= self.value <= high:
-            raise self.wrong("does not fit", f"write an integer from {low} to {high}")
-        return int(self.value)
-
-    def seconds(self, default: float) -> float:
-        """A time, from none to a day."""
-        if not self.given:
-            return default
-        real = isinstance(self.value, int | float) and not isinstance(self.value, bool)
-        if not real or not 0 <= self.value <= 86400:
-            raise self.wrong("does not fit", "write a number of seconds from 0 to 86400")
-        return float(self.value)

@@ -2,9 +2,9 @@
 
 A pod with the label rosproxy.io/inject comes here from kopf (`handlers`). The RosProxies of its
 namespace and their Service are read as they are at this moment; the planner says which RosProxy
-takes the pod and what it needs. Nothing is written: the Service is the controller's alone to make,
+takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
 which knows its address, its owner and what to do when it is refused. Where it is not there yet,
-since pod and RosProxy were created together, the controller is woken and the pod waits. Whatever
+since pod and RosProxy were created together, the operator is woken and the pod waits. Whatever
 goes wrong, the pod is admitted; a warning says what is amiss and what to do.
 """
 
@@ -18,13 +18,14 @@ from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.planner.fields import InvalidField
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.model import Json, Pod, RosProxy
 from rosproxy_operator.kubernetes.planner.names import master_uri, service_id
 from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
-from rosproxy_operator.kubernetes.planner.spec import InvalidField, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import rosproxy
 
 log = logging.getLogger(__name__)
 
@@ -48,11 +49,11 @@ class NotWired(Exception):
 
 
 class NoService(NotWired):
-    """It can't be wired yet: its RosProxy has no Service, which the controller is about to make."""
+    """It can't be wired yet: its RosProxy has no Service, which the operator is about to make."""
 
 
 class Injector:
-    """Wires pods. ``wake`` lets the controller look at the cluster soon."""
+    """Wires pods. ``wake`` lets the operator look at the cluster soon."""
 
     def __init__(self, api: Api, metrics: ClusterMetrics, wake: Callable[[], None]) -> None:
         self._api, self._metrics, self._wake = api, metrics, wake

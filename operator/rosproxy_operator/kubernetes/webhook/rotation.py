@@ -61,7 +61,7 @@ class CertificateRotation:
             problems.append(Problem(_SUBJECT, f"no certificate: {error}"))
         except Exception as error:  # a mistake of ours must not end the certificate
             log.exception("checking the webhook's certificate failed; going on")
-            problems.append(Problem(_SUBJECT, f"the controller failed: {error!r}"))
+            problems.append(Problem(_SUBJECT, f"the operator failed: {error!r}"))
         else:
             if pair != self.pair:
                 log.info("webhook: serving a certificate that is valid until %s", pair.expires)
@@ -166,7 +166,7 @@ class SelfSigned:
     def _complain(self, error: ApiError) -> None:
         """Tell that the Secret can't be used: the certificate is then this process's alone.
 
-        That the API server is away the controller's looks tell.
+        That the API server is away the operator's looks tell.
         """
         if error.kind is ErrorKind.AWAY:
             return

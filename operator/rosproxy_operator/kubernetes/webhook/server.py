@@ -91,7 +91,7 @@ def _application(fn: kopf.WebhookFn) -> web.Application:
 
 def _allowed(review: dict[str, Any], uid: str, reason: str) -> dict[str, Any]:
     """An answer that lets the pod pass as it is."""
-    warning = f"{NOT_WIRED}the controller failed: {reason}"
+    warning = f"{NOT_WIRED}the operator failed: {reason}"
     return {
         "apiVersion": review.get("apiVersion", "admission.k8s.io/v1"),
         "kind": review.get("kind", "AdmissionReview"),

@@ -4,21 +4,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rosproxy_operator.cli import main
-from rosproxy_operator.docker.settings import DEFAULT_ADMIN, parse_docker_settings
-
-GIVEN = {
-    "master_uri": None,
-    "advertise_host": None,
-    "ports": 32,
-    "port_window": "11400-65535",
-    "publish_address": (),
-    "proxy_image": "rosproxy:latest",
-    "expose_by_default": False,
-    "grace": 60.0,
-    "resync": 30.0,
-    "uplink": "0-rosproxy",
-    "admin_bind": "127.0.0.1:11313",
-}
+from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, DockerSettings, make_docker_settings
 
 
 def run(*words: str, **variables: str) -> Result:
@@ -26,7 +13,9 @@ def run(*words: str, **variables: str) -> Result:
 
 
 def test_the_defaults() -> None:
-    settings = parse_docker_settings(GIVEN)
+    context = main.commands["docker"].make_context("docker", [])
+    settings = make_docker_settings(context.params)
+    assert settings == DockerSettings(PlanSettings())
     assert settings.admin == DEFAULT_ADMIN
     assert settings.resync == 30.0
     assert settings.plan.publish == ("0.0.0.0",)
@@ -36,8 +25,8 @@ def test_the_defaults() -> None:
 @pytest.mark.parametrize(
     ("option", "value", "told"),
     [
-        ("--ports", "0", "0 is not between 1 and 1000"),
-        ("--ports", "1001", "1001 is not between 1 and 1000"),
+        ("--ports", "0", "0 is not in the range 1<=x<=1000; for example 32"),
+        ("--ports", "1001", "1001 is not in the range 1<=x<=1000; for example 32"),
         ("--port-window", "5-1", "'5-1' must rise"),
         ("--port-window", "11400-11410", "11400-11410 has 11 ports, --ports is 32"),
         ("--publish-address", "here", "'here' is not an IP address"),
@@ -47,6 +36,7 @@ def test_the_defaults() -> None:
         ("--proxy-image", "", "'' is not the name of an image"),
         ("--uplink", "-x", "'-x' is not a network's name"),
         ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
+        ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
         ("--grace", "-1", "-1 s is not between 0 and 86400 s"),
         ("--resync", "0", "0 s is not between 1 and 86400 s"),
     ],
@@ -61,7 +51,10 @@ def test_a_bad_value_names_its_option(option: str, value: str, told: str) -> Non
 
 def test_every_option_has_a_variable() -> None:
     result = run("docker", "plan", ROSPROXY_PORTS="0")
-    assert result.stderr == "rosproxy-operator: --ports: 0 is not between 1 and 1000\n"
+    assert (
+        result.stderr
+        == "rosproxy-operator: --ports: 0 is not in the range 1<=x<=1000; for example 32\n"
+    )
     result = run("docker", "plan", ROS_MASTER_URI="robot")
     assert result.stderr.startswith("rosproxy-operator: --master-uri: 'robot'")
 

@@ -15,12 +15,7 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.proxy_news import (
-    NetworkFacts,
-    Places,
-    facts,
-    gone,
-)
+from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, Places, ProxyNews, facts, gone
 
 KEY = Key("http://robot:11311", "192.0.2.10")
 PORTS = PortRange(11400, 11431)
@@ -185,3 +180,47 @@ def test_container_that_leaves_one_of_two_networks_is_found_on_the_other() -> No
     one = replace(both, addresses={other: "172.19.0.9"})
 
     assert places((0.0, both), (0.1, one)).moved({"172.18.0.5"}) == {"172.18.0.5": "172.19.0.9"}
+
+
+def test_an_arrival_is_told_again_until_its_nodes_had_time_to_register() -> None:
+    news = ProxyNews()
+    assert news.next_due(0.0) is None
+    news.look(told(look(talker()), member(talker())), 0.0)
+    (arrived,) = news.body(set(), 0.0)["arrived"]
+    assert arrived["address"] == OLD
+    assert "talker" in arrived["names"]
+    news.told(0.0)
+    assert news.next_due(0.0) == 1.0
+    assert news.body(set(), 0.5) == {}
+    for when in (1.0, 3.0, 10.0):
+        news.look(told(look(talker()), member(talker())), when)
+        assert news.body(set(), when)["arrived"]
+        news.told(when)
+    assert news.next_due(11.0) is None
+
+
+def test_what_was_not_heard_is_told_again() -> None:
+    news = ProxyNews()
+    news.look(told(look(talker()), member(talker())), 0.0)
+    assert news.body(set(), 0.0)["arrived"]
+    assert news.next_due(0.1) == 0.0
+    assert news.body(set(), 0.1)["arrived"]
+
+
+def test_nodes_of_a_container_that_is_no_more_are_gone() -> None:
+    news = ProxyNews()
+    news.look(HERE, 0.0)
+    assert news.body({OLD}, 0.0) == {}
+    news.look(replace(NOBODY, taken=frozenset(), subnets=()), 1.0)
+    assert news.body({OLD}, 1.0) == {"gone": [OLD]}  # also on a network that the proxy has left
+
+
+def test_a_move_is_told_until_the_proxy_knows() -> None:
+    news = ProxyNews()
+    news.look(HERE, 0.0)
+    news.body({OLD}, 0.0)
+    news.look(replace(THERE, taken=THERE.taken | {NEW}), 1.0)
+    assert news.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
+    news.told(1.0)
+    assert news.next_due(1.0) == 1.0
+    assert news.body({NEW}, 2.0) == {}

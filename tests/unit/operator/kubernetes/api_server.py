@@ -1,6 +1,6 @@
 """A small API server on loopback: objects in a dictionary, HTTP as Kubernetes speaks it.
 
-What it knows of kinds is what the controller and kopf ask for. `refuse` makes it say no.
+What it knows of kinds is what the operator and kopf ask for. `refuse` makes it say no.
 """
 
 import asyncio

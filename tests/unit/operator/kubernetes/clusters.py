@@ -150,7 +150,7 @@ class Clusters(World):
         self.delete(n, m)
         self.create(n, m)
 
-    # what people and clusters do to what the controller has made
+    # what people and clusters do to what the operator has made
 
     def delete_proxy(self, n: int, _: int) -> None:
         if self.own():
@@ -178,7 +178,7 @@ class Clusters(World):
     def toggle_master(self, n: int, _: int) -> None:
         self.cluster.master_ip = pick(("10.96.0.7", "", "10.96.0.8"), n)
 
-    # the controller
+    # the operator
 
     def step(self, _n: int, _m: int) -> None:
         self.cluster.step()

@@ -1,4 +1,4 @@
-"""RosProxies, nodes, pods and what the controller makes of them, for tests."""
+"""RosProxies, nodes, pods and what the operator makes of them, for tests."""
 
 import copy
 from collections.abc import Iterable, Mapping

@@ -64,7 +64,7 @@ def host_ports(pod: Object) -> set[int]:
 
 
 def is_own(obj: Object) -> bool:
-    """Whether the controller has made an object."""
+    """Whether the operator has made an object."""
     owned = any(ref["kind"] == names.KIND for ref in meta(obj).get("ownerReferences", ()))
     return names.is_own(meta(obj).get("labels", {})) and owned
 
@@ -253,7 +253,7 @@ class Cluster:
         if is_own(pod) and ready:
             self.ros.setdefault(uid, set())
 
-    # what the controller sees
+    # what the operator sees
 
     def observe(
         self, old: State | None, failures: dict[Name, tuple[Failure, ...]]
@@ -281,7 +281,7 @@ class Cluster:
             failures=failures,
         )
 
-    # what the controller does
+    # what the operator does
 
     def apply(self, action: Action) -> None:  # noqa: C901, PLR0912 - one case per action
         """Raises Refused. An AssertionError means that the plan is wrong in itself."""
@@ -317,7 +317,7 @@ class Cluster:
         found = objects.get(id)
         if found is None or meta(found)["uid"] != uid:
             return None
-        assert is_own(found), f"{id} is not the controller's"
+        assert is_own(found), f"{id} is not the operator's"
         self.made += 1
         return found
 
@@ -363,7 +363,7 @@ class Controller:
             kind = self.cluster.state.pods if isinstance(action, CreateProxy) else None
             there = (self.cluster.state.services if kind is None else kind).get(name)
             if str(error) == "AlreadyExists" and there is not None:
-                text = "a Pod of this name that is not the controller's is there"
+                text = "a Pod of this name that is not the operator's is there"
                 return None if is_own(there) else Failure(str(name), text)
             return Failure(str(name), str(error))
         return None

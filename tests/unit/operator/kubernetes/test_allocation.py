@@ -198,7 +198,7 @@ def test_who_has_left_his_ports_is_told() -> None:
 
 
 def served(**more: Any) -> ClusterState:
-    """The memory of a controller that has seen the proxy serve."""
+    """The memory of an operator that has seen the proxy serve."""
     return look(scene(proxy()), **more).state
 
 

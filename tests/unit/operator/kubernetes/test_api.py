@@ -160,7 +160,7 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
             ErrorKind.GONE,
             "terminated",
         ),
-        (401, "Unauthorized", ErrorKind.AWAY, "does not know the controller's token"),
+        (401, "Unauthorized", ErrorKind.AWAY, "does not know the operator's token"),
         (404, 'pods "p" not found', ErrorKind.GONE, 'pods "p" not found'),
         (409, "exists", ErrorKind.CONFLICT, "exists"),
         (422, "spec.clusterIP: Invalid value", ErrorKind.INVALID, "spec.clusterIP"),
@@ -184,5 +184,5 @@ def test_a_refusal_by_anything_else(body: bytes) -> None:
 
 def test_the_missing_rule_names_its_namespace() -> None:
     text = 'User "x" cannot get resource "secrets" in API group "" in the namespace "rosproxy"'
-    assert missing_rule(text).startswith("the controller's role lacks a rule in the namespace ros")
+    assert missing_rule(text).startswith("the operator's role lacks a rule in the namespace ros")
     assert missing_rule("violates PodSecurity") == ""

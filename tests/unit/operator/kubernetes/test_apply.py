@@ -99,7 +99,7 @@ async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carrie
     await carry.out(create_pod())
     (failure,) = carry.applier.failures[OF]
     assert failure.subject == f"{NAMESPACE}/proxy"
-    assert "not the controller's is there: rename it" in failure.text
+    assert "not the operator's is there: rename it" in failure.text
     assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
 
 
@@ -226,7 +226,7 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
 
 async def test_a_mistake_of_ours_is_a_failure_like_any(server: ApiServer, carry: Carried) -> None:
     await carry.out(CreateProxy(OF, "node1", body("Pod", "broken")), create_pod())
-    assert "the controller failed: KeyError('containers')" in carry.applier.failures[OF][0].text
+    assert "the operator failed: KeyError('containers')" in carry.applier.failures[OF][0].text
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["proxy"]
 
 

@@ -305,7 +305,7 @@ async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) ->
     one = CertificateRotation(Broken(), ClusterMetrics())
     await one.refresh()
     assert one.pair is None
-    assert "the controller failed: RuntimeError('oops')" in caplog.text
+    assert "the operator failed: RuntimeError('oops')" in caplog.text
 
 
 async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ HOOK = ["--webhook-bind=0.0.0.0:9443"]
 
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> list[KubernetesSettings]:
-    """The settings with which the controller would have been run."""
+    """The settings with which the operator would have been run."""
     found: list[KubernetesSettings] = []
     monkeypatch.setattr(cli, "_run_kubernetes", lambda settings, *_: found.append(settings))
     return found

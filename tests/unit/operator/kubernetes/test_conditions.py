@@ -106,7 +106,7 @@ def test_a_proxy_that_does_not_answer_the_controller():
     found = status(state(answer=no_answer("timed out")))
 
     assert judged(found, "Ready") == ("False", "ProxyUnreachable")
-    assert "(timed out): let the controller's pod connect to port 11312" in message(found)
+    assert "(timed out): let the operator's pod connect to port 11312" in message(found)
     assert judged(found, "MasterReachable") == ("Unknown", "NotAsked")
 
 
@@ -150,7 +150,7 @@ def test_a_problem_without_a_reason():
             'pods is forbidden: User "system:serviceaccount:a:b" cannot create resource "pods"',
             "install its chart or manifests anew",
         ),
-        ("a Pod of this name that is not the controller's is there: x", "rename"),
+        ("a Pod of this name that is not the operator's is there: x", "rename"),
         ("internal error", "tried again"),
     ],
 )

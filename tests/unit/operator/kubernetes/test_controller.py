@@ -93,7 +93,7 @@ async def test_a_labelled_pod_gets_a_proxy(server: ApiServer, running: Running) 
 async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
     server: ApiServer, api: Api, running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The webhook waits for the Service that the controller makes."""
+    """The webhook waits for the Service that the operator makes."""
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.0)
     await until(lambda: running.looks() > 0)
     put_all(server)

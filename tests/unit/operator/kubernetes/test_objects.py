@@ -99,6 +99,21 @@ def test_host_ports_are_those_that_the_scheduler_counts():
     assert found.host_ports == {8080, 8082}
 
 
+def test_what_does_not_fit_is_as_if_it_were_not_there_and_the_rest_is_read():
+    ports = [{"containerPort": 80, "hostPort": 8080}, {"hostPort": "many"}, "strange"]
+    obj = pod_obj(
+        labels={"app": "ros", "number": 7},
+        hostNetwork="yes",
+        initContainers=None,
+        containers=[{"name": "a", "ports": ports}, None],
+    )
+
+    found = pod(obj)
+
+    assert (found.labels, found.host_network) == ({"app": "ros"}, False)
+    assert (found.host_ports, found.ip) == (frozenset({8080}), "10.244.1.5")
+
+
 def test_masters_that_a_template_sets_itself():
     def container(**variable: Any) -> dict[str, Any]:
         return {"name": "x", "env": [{"name": "ROS_MASTER_URI", **variable}]}

@@ -259,7 +259,7 @@ def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
     found = look(observed(rosproxy(), service(), pod(), namesake))
     assert done(found) == []
     (text,) = told(found, "NameTaken")
-    assert f"a pod called {PROXY} is there already, and is not the controller's" in text
+    assert f"a pod called {PROXY} is there already, and is not the operator's" in text
     assert "delete or rename it" in text
 
 

@@ -1,7 +1,7 @@
-"""Whatever happens in a cluster, and wherever the controller is killed: it ends as it ought to.
+"""Whatever happens in a cluster, and wherever the operator is killed: it ends as it ought to.
 
 After each event what must always hold is checked, see `Clusters.check`. From time to time nothing
-else happens: then the controller must come to rest, with everything as wished.
+else happens: then the operator must come to rest, with everything as wished.
 """
 
 from hypothesis import given

@@ -4,14 +4,21 @@ from typing import Any
 
 import pytest
 
+from rosproxy_operator.kubernetes.planner.api_objects import PodObject
+from rosproxy_operator.kubernetes.planner.fields import lenient
 from rosproxy_operator.kubernetes.planner.model import Stuck
-from rosproxy_operator.kubernetes.planner.pod_failures import stuck, stuck_by_event
+from rosproxy_operator.kubernetes.planner.pod_failures import stuck as stuck_by_status
+from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
 
 NO_PORTS = (
     "0/2 nodes are available: 1 node(s) didn't have free ports for the requested pod ports, 1 "
     "node(s) didn't satisfy plugin(s) [NodeAffinity]. preemption: 0/2 nodes are available: 1 No "
     "preemption victims found for incoming pod, 1 Preemption is not helpful for scheduling."
 )
+
+
+def stuck(obj: dict[str, Any]) -> tuple[Stuck | None, str]:
+    return stuck_by_status(lenient(obj, PodObject).status)
 
 
 def scheduled(reason: str, message: str) -> dict[str, Any]:

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner.fields import InvalidField
 from rosproxy_operator.kubernetes.planner.model import Advertise, MasterSpec, Name, Selector
-from rosproxy_operator.kubernetes.planner.spec import RESOURCES, InvalidField, invalid, rosproxy
+from rosproxy_operator.kubernetes.planner.spec import RESOURCES, invalid, rosproxy
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
 
 
@@ -192,6 +193,30 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
 
     assert ": " in str(error.value)
     assert len(str(error.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        ({"ports": 501}, "spec.ports: 501 does not fit: write an integer <= 500"),
+        ({"ports": "32"}, "spec.ports: '32' does not fit: write an integer"),
+        ({"image": 7}, "spec.image: 7 does not fit: write a text, in quotes"),
+        (
+            {"nodeSelector": {"a": 1}},
+            "spec.nodeSelector.a: 1 does not fit: write a text, in quotes",
+        ),
+        ({"portWindow": [1]}, "spec.portWindow: [1] does not fit: write a map of fields"),
+        ({"dataPlane": "kernel"}, "spec.dataPlane: 'kernel' is unknown: write one of Auto, Copy, "),
+        ({"graceSeconds": -1}, "spec.graceSeconds: -1 does not fit: write a number >= 0.0"),
+    ],
+)
+def test_the_cure_is_told(spec, text):
+    with pytest.raises(InvalidField, match=re.escape(text)):
+        rosproxy(rosproxy_obj(spec))
+
+
+def test_null_is_as_if_it_were_not_given():
+    assert rosproxy(rosproxy_obj({"ports": None, "podSelector": None})) == rosproxy(rosproxy_obj())
 
 
 @pytest.mark.parametrize("name", ["a" * 47, "Arm", "arm.1", "", "-a"])

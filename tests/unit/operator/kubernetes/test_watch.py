@@ -333,7 +333,7 @@ async def test_a_mistake_of_ours_admits_the_pod(
 
 async def test_what_kopf_cannot_serve_is_admitted_too(running: Running) -> None:
     found = await running.admit(pod_obj("talker", INJECT), userInfo=None)
-    assert "the controller failed" in found["warnings"][0]
+    assert "the operator failed" in found["warnings"][0]
 
 
 async def test_nonsense_is_refused(running: Running) -> None:

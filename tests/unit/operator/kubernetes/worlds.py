@@ -66,7 +66,7 @@ class World:
             assert found is not None
             yield pod, found
 
-    # what the controller does
+    # what the operator does
 
     def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)
@@ -93,7 +93,7 @@ class World:
         self.controller.carry_out(found, most)
 
     def seen_ready(self, node: str) -> bool:
-        """Whether a node is ready, as far as the controller sees."""
+        """Whether a node is ready, as far as the operator sees."""
         nodes = (self.controller.old or self.cluster.state).nodes
         return node not in nodes or nodes[node]["status"]["conditions"][0]["status"] == "True"
 

@@ -8,7 +8,7 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, Subscription
+from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
@@ -24,11 +24,11 @@ def publisher(*topics: str) -> Endpoint:
     return endpoint
 
 
-def subscribed(endpoint: Endpoint, *names: str, topic: str = "/t") -> list[Subscription]:
-    return [Subscription(endpoint, topic, name) for name in names]
+def subscribed(endpoint: Endpoint, *names: str, topic: str = "/t") -> list[TopicSubscription]:
+    return [TopicSubscription(endpoint, topic, name) for name in names]
 
 
-def names(found: Iterable[Subscription]) -> list[str]:
+def names(found: Iterable[TopicSubscription]) -> list[str]:
     return [one.caller_id for one in found]
 
 
@@ -45,11 +45,11 @@ def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
         "/c": [Registration(SRV, "/t", "/c")],
     }
     assert policy.subscriptions(held, [first, second], addressing) == [
-        Subscription(first, "/t", "/a"),
-        Subscription(second, "/t", "/a"),
-        Subscription(second, "/u", "/b"),
+        TopicSubscription(first, "/t", "/a"),
+        TopicSubscription(second, "/t", "/a"),
+        TopicSubscription(second, "/u", "/b"),
     ]
-    assert policy.subscriptions(held, [first], addressing) == [Subscription(first, "/t", "/a")]
+    assert policy.subscriptions(held, [first], addressing) == [TopicSubscription(first, "/t", "/a")]
     assert policy.subscriptions({}, [first], addressing) == []
 
 
@@ -60,7 +60,7 @@ def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
         add_registration(addressing, endpoint, PUB, "/t", name)
     held = {"/a": [Registration(SUB, "/t", "/a")]}
     assert policy.subscriptions(held, [endpoint], addressing) == [
-        Subscription(endpoint, "/t", "/a")
+        TopicSubscription(endpoint, "/t", "/a")
     ]
 
 
@@ -99,7 +99,7 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
     ],
 )
 def test_a_relay_serves_one_subscriber_of_one_topic_of_one_publisher(
-    relay: policy.Connection, left: list[str]
+    relay: policy.TopicConnection, left: list[str]
 ) -> None:
     wanted = subscribed(publisher("/t"), "/a", "/b")
     assert names(policy.without_relay(wanted, {relay})) == left

@@ -9,7 +9,7 @@ import asyncio
 import logging
 from collections.abc import Awaitable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from rosproxy.admin import requests
 from rosproxy.forwarding.kernel.plane import KernelPlane
@@ -21,6 +21,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.adoption.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import policy
 from rosproxy.ros1.upkeep.recovery.recovery import Recovery
@@ -38,13 +39,6 @@ RETIRE_TIMEOUT = 3.0
 """Seconds that registrations under way get to end before a proxy retires."""
 
 
-class RelayedPorts(Protocol):
-    """What relays TCPROS for the endpoints."""
-
-    def cut(self, port: int) -> None:
-        """End the connections through a port."""
-
-
 @dataclass(slots=True)
 class ContainerEvents:
     """Acts on what an operator knows of containers before any time-out can tell."""
@@ -55,7 +49,7 @@ class ContainerEvents:
     registrar: Registrar
     adopter: Adopter
     recovery: Recovery
-    relayed: RelayedPorts
+    tcpros: TcprosServer
     plane: KernelPlane
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -178,7 +172,7 @@ class ContainerEvents:
 
     def _cut(self, endpoint: Endpoint) -> None:
         """End the connections to a node, also those that the kernel forwards."""
-        self.relayed.cut(endpoint.port)
+        self.tcpros.cut(endpoint.port)
         self.plane.cut(endpoint)
 
 

@@ -90,7 +90,7 @@ class Prober:
     async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
         health = endpoint.health
         if not endpoint.trusted:
-            await self._recovery.verify_and_announce(endpoint)
+            await self._recovery.serve(endpoint)
             return
         if health.cleaned:
             await self._registrar.come_back(endpoint, pid)

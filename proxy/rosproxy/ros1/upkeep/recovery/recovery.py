@@ -15,7 +15,7 @@ If ports are others after a start, look here: the log names each claim that was 
 
 import asyncio
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
@@ -39,7 +39,7 @@ PARALLEL_INSPECTIONS = 64
 class Recovery:
     """Rebuilds the registry from what the master holds.
 
-    ``verifying`` are the endpoints whose nodes are being asked just now.
+    ``verifying`` are the endpoints that wait to be verified, and need not be probed meanwhile.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class Recovery:
         self._context, self._leases, self._nodes = context, leases, nodes
         self._registrar, self._resubscriber, self._plane = registrar, resubscriber, plane
         self.verifying: set[Endpoint] = set()
+        self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
         self._done = False
         self._one_at_a_time = asyncio.Lock()
         self._failures = 0
@@ -79,11 +80,25 @@ class Recovery:
                 raise Unreachable(str(error)) from None
             self._done = True
 
-    async def verify_and_announce(self, endpoint: Endpoint) -> None:
-        """Serve a recovered endpoint if its node bears it out. Raises Unreachable, MasterError."""
-        await self._verify(endpoint)
-        if self._leases.is_open(endpoint):
-            await self._announce(endpoint)
+    async def serve(self, endpoint: Endpoint) -> None:
+        """Serve a recovered endpoint if its node bears it out, and have subscribers connect again.
+
+        Raises Unreachable, MasterError.
+        """
+        try:
+            async with self._limit:
+                await self._verify(endpoint)
+        finally:
+            self.verifying.discard(endpoint)
+        if not self._leases.is_open(endpoint):
+            return
+        # Each time the whole graph is read: one by one, that would grow with the square of nodes.
+        # So those that came up during the announcement before are announced together.
+        self._unannounced.append(endpoint)
+        async with self._announcing:
+            found, self._unannounced = self._unannounced, []
+            if found:
+                await self._resubscriber.announce(found)
 
     async def _recover(self) -> None:
         self._context.refresh_networks()
@@ -131,26 +146,12 @@ class Recovery:
             registry.register(endpoint, held)
         return endpoint
 
-    async def _resume(self, endpoints: Iterable[Endpoint]) -> None:
-        """Serve recovered endpoints, then make up for the calls that were missed.
-
-        None waits for another that does not answer, and none is probed meanwhile.
-        """
-        limit, resumed = asyncio.Semaphore(PARALLEL_INSPECTIONS), set(endpoints)
-
-        async def resume(endpoint: Endpoint) -> None:
-            try:
-                async with limit:
-                    await self._verify(endpoint)
-            finally:
-                self.verifying.discard(endpoint)
-            if self._leases.is_open(endpoint):
-                await self._announce(endpoint)
-
-        self.verifying |= resumed
+    async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
+        """Serve recovered endpoints; none waits for another that does not answer."""
+        self.verifying |= set(endpoints)
         try:
-            await asyncio.gather(*map(resume, resumed))
-            log.info("recovered %d nodes", sum(e.trusted for e in resumed))
+            await asyncio.gather(*map(self.serve, endpoints))
+            log.info("recovered %d nodes", sum(e.trusted for e in endpoints))
         except (Unreachable, MasterError) as error:
             log.warning("recovery is incomplete: %s", error)
 
@@ -165,23 +166,8 @@ class Recovery:
             return
         endpoint.note_verified(info.pid, info.tcpros_port)
         self._leases.open(endpoint)
-        await self._note_whether_named(endpoint)
-        await self._registrar.register_missing(endpoint, info)
-
-    async def _note_whether_named(self, endpoint: Endpoint) -> None:
-        """Find out whether neighbours can use a recovered node's host name."""
         address = endpoint.place.address
         addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
-        if endpoint.place.address == address:
+        if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
-
-    async def _announce(self, endpoint: Endpoint) -> None:
-        """Announce an endpoint, together with those that came up during the one before.
-
-        Each time the whole graph is read: one by one, that would grow with the square of nodes.
-        """
-        self._unannounced.append(endpoint)
-        async with self._announcing:
-            found, self._unannounced = self._unannounced, []
-            if found:
-                await self._resubscriber.announce(found)
+        await self._registrar.register_missing(endpoint, info)

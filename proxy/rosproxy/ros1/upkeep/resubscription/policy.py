@@ -19,14 +19,14 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing
 
-Connection = tuple[int, str, str]
+TopicConnection = tuple[int, str, str]
 """A connection through the proxy: its port, the topic and the subscriber's name."""
 Addresses = Mapping[str, Collection[str]]
 """Nodes' names with the addresses of their hosts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Subscription:
+class TopicSubscription:
     """A node's subscription to a topic that an endpoint's node publishes."""
 
     endpoint: Endpoint
@@ -34,7 +34,7 @@ class Subscription:
     caller_id: str
 
     @property
-    def connection(self) -> Connection:
+    def connection(self) -> TopicConnection:
         """The connection that it has while it is served by a relay."""
         return self.endpoint.port, self.topic, self.caller_id
 
@@ -52,7 +52,7 @@ def subscriptions(
     held: Mapping[str, Sequence[Registration]],
     endpoints: Iterable[Endpoint],
     addressing: Addressing,
-) -> list[Subscription]:
+) -> list[TopicSubscription]:
     """Subscriptions to what the nodes of some endpoints publish, but not those of neighbours.
 
     ``held`` is what each node has registered at the master. A neighbour that reaches a publisher
@@ -65,14 +65,14 @@ def subscriptions(
         joint = _networks_of(place.address, addressing) if literal else frozenset()
         for topic in dict.fromkeys(endpoint.names(Kind.PUBLISHER)):
             publishers.setdefault(topic, {}).setdefault(joint, []).append(endpoint)
-    found: list[Subscription] = []
+    found: list[TopicSubscription] = []
     for node, registrations in held.items():
         itself = addressing.registry.by_caller(node)
         near = _networks_of(itself.place.address, addressing) if itself else frozenset()
         for one in registrations:
             groups = publishers.get(one.name, {}) if one.kind is Kind.SUBSCRIBER else {}
             found += [
-                Subscription(endpoint, one.name, node)
+                TopicSubscription(endpoint, one.name, node)
                 for joint, group in groups.items()
                 if not joint & near
                 for endpoint in group
@@ -82,8 +82,8 @@ def subscriptions(
 
 
 def without_relay(
-    wanted: Iterable[Subscription], relays: Collection[Connection]
-) -> list[Subscription]:
+    wanted: Iterable[TopicSubscription], relays: Collection[TopicConnection]
+) -> list[TopicSubscription]:
     """Those that no relay serves."""
     return [one for one in wanted if one.connection not in relays]
 
@@ -102,14 +102,16 @@ def read_bus(rows: Any) -> list[BusRow]:
 
 
 def unconnected(
-    left: Iterable[Subscription], bus: Mapping[Endpoint, Sequence[BusRow]], addresses: Addresses
-) -> list[Subscription]:
+    left: Iterable[TopicSubscription],
+    bus: Mapping[Endpoint, Sequence[BusRow]],
+    addresses: Addresses,
+) -> list[TopicSubscription]:
     """Those of the subscriptions without relay that no other way serves either.
 
     UDPROS is known by the publisher's own word. It is not asked for TCPROS: it takes connections
     for open whose other end has vanished. What the kernel forwards is known by hosts alone.
     """
-    rest: dict[Endpoint, list[Subscription]] = {}
+    rest: dict[Endpoint, list[TopicSubscription]] = {}
     for one in left:
         if BusRow(one.topic, one.caller_id, "UDPROS") not in bus.get(one.endpoint, ()):
             rest.setdefault(one.endpoint, []).append(one)
@@ -134,8 +136,8 @@ def _networks_of(address: str, addressing: Addressing) -> frozenset[int]:
 
 
 def _not_forwarded(
-    endpoint: Endpoint, group: list[Subscription], rows: Sequence[BusRow], addresses: Addresses
-) -> list[Subscription]:
+    endpoint: Endpoint, group: list[TopicSubscription], rows: Sequence[BusRow], addresses: Addresses
+) -> list[TopicSubscription]:
     """Those of an endpoint's subscriptions that its connections in the kernel don't account for.
 
     Where none comes from a host of theirs, something on the way hides addresses (NAT, Docker's
@@ -143,7 +145,7 @@ def _not_forwarded(
     """
     if not endpoint.fast_peers:
         return group
-    hosts: dict[frozenset[str], list[Subscription]] = {}
+    hosts: dict[frozenset[str], list[TopicSubscription]] = {}
     for one in group:
         hosts.setdefault(frozenset(addresses.get(one.caller_id, ())), []).append(one)
     if not any(host & endpoint.fast_peers.keys() for host in hosts):
@@ -156,8 +158,8 @@ def _not_forwarded(
 
 
 def _short_of(
-    connections: int, group: list[Subscription], rows: Sequence[BusRow]
-) -> list[Subscription]:
+    connections: int, group: list[TopicSubscription], rows: Sequence[BusRow]
+) -> list[TopicSubscription]:
     """Which of some subscriptions have none of as many connections as there are.
 
     The publisher has all that are open among its own. If that does not tell enough of them apart,

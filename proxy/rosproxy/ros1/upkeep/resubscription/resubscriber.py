@@ -17,7 +17,6 @@ in the meantime takes up to three minutes.
 import asyncio
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import resolve
@@ -28,11 +27,12 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
 from rosproxy.ros1.upkeep.registration.policy import one_publisher_per_topic
 from rosproxy.ros1.upkeep.registration.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, Connection, Subscription
+from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +47,6 @@ RESUBSCRIBE_TICK = 1.0
 """Seconds between checks whether it is time to look at any."""
 
 
-class RelayedTopics(Protocol):
-    """What relays TCPROS for the endpoints."""
-
-    def topic_connections(self) -> set[Connection]:
-        """The subscribers' connections that are relayed now."""
-
-
 class Resubscriber:
     """Looks after the subscribers of publishers that were out of reach for a time."""
 
@@ -62,11 +55,11 @@ class Resubscriber:
         context: Context,
         registrar: Registrar,
         updates: PublisherUpdates,
-        relayed: RelayedTopics,
+        tcpros: TcprosServer,
         plane: KernelPlane,
     ) -> None:
         self._context, self._registrar, self._updates = context, registrar, updates
-        self._relayed, self._plane = relayed, plane
+        self._tcpros, self._plane = tcpros, plane
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
 
@@ -131,7 +124,7 @@ class Resubscriber:
         """
         held = await read_registrations(self._context.upstream)
         wanted = policy.subscriptions(held, endpoints, self._context.addressing)
-        left = policy.without_relay(wanted, self._relayed.topic_connections())
+        left = policy.without_relay(wanted, self._tcpros.topic_connections())
         if not left:
             return set()
         graph = await self._locate(held, left)
@@ -140,11 +133,11 @@ class Resubscriber:
         if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, left)
-        left = policy.without_relay(left, self._relayed.topic_connections())
+        left = policy.without_relay(left, self._tcpros.topic_connections())
         return await self._send_without(graph, policy.unconnected(left, bus, addresses))
 
     async def _locate(
-        self, held: Mapping[str, list[Registration]], left: Sequence[Subscription]
+        self, held: Mapping[str, list[Registration]], left: Sequence[TopicSubscription]
     ) -> Graph:
         """What is registered, with the URIs of those whom it is about."""
         topics = {one.topic for one in left}
@@ -156,14 +149,16 @@ class Resubscriber:
         names = publishers | {one.caller_id for one in left}
         return await locate(self._context.upstream, held, names)
 
-    def _through_proxy(self, graph: Graph, left: Iterable[Subscription]) -> list[Subscription]:
+    def _through_proxy(
+        self, graph: Graph, left: Iterable[TopicSubscription]
+    ) -> list[TopicSubscription]:
         """Those whose subscribers reach the publisher through the proxy."""
         addressing, subscribers = self._context.addressing, {one.caller_id for one in left}
         uris = {node: graph.uris[node] for node in subscribers if node in graph.uris}
         inside = {node: addressing.stands_for(uri) for node, uri in uris.items()}
         askers = {e: self._context.node_asker(e) for e in inside.values() if e}
 
-        def is_relayed(one: Subscription) -> bool:
+        def is_relayed(one: TopicSubscription) -> bool:
             subscriber = inside.get(one.caller_id)
             if subscriber is None:
                 return one.caller_id in inside
@@ -172,7 +167,7 @@ class Resubscriber:
 
         return [one for one in left if is_relayed(one)]
 
-    async def _read_buses(self, left: Iterable[Subscription]) -> dict[Endpoint, list[BusRow]]:
+    async def _read_buses(self, left: Iterable[TopicSubscription]) -> dict[Endpoint, list[BusRow]]:
         """What the publishers themselves say of their connections."""
 
         async def read(endpoint: Endpoint) -> list[BusRow]:
@@ -190,7 +185,7 @@ class Resubscriber:
         return dict(zip(endpoints, found, strict=True))
 
     async def _resolve_hosts(
-        self, graph: Graph, left: Iterable[Subscription]
+        self, graph: Graph, left: Iterable[TopicSubscription]
     ) -> dict[str, list[str]]:
         """The addresses of the subscribers' hosts, where the kernel's connections are by host."""
 
@@ -203,7 +198,7 @@ class Resubscriber:
         found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, found, strict=True))
 
-    async def _send_without(self, graph: Graph, found: Iterable[Subscription]) -> set[str]:
+    async def _send_without(self, graph: Graph, found: Iterable[TopicSubscription]) -> set[str]:
         """Send each subscriber its publishers without those that it misses; the topics."""
         missed: dict[tuple[str, str], set[Endpoint]] = {}
         for one in found:
