@@ -10,9 +10,9 @@ from rosproxy.admin.status_document import (
     AliasPortStatus,
     ConnectionStatus,
     DataPlaneStatus,
+    EndpointStatus,
     MasterStatus,
     NodePlaneStatus,
-    NodeStatus,
     PortsStatus,
     ProblemStatus,
     ProxyStatus,
@@ -99,8 +99,8 @@ def _ports(context: Context) -> PortsStatus:
 
 def _node(
     context: Context, endpoint: Endpoint, relays: list[Relay], plane: KernelPlane
-) -> NodeStatus:
-    return NodeStatus(
+) -> EndpointStatus:
+    return EndpointStatus(
         nodes=tuple(endpoint.caller_ids),
         uri=endpoint.uri,
         address=str(endpoint.slave),

@@ -106,7 +106,7 @@ class ConnectionStatus(msgspec.Struct, frozen=True):
     received_rate: Rate = 0.0
 
 
-class NodeStatus(msgspec.Struct, frozen=True):
+class EndpointStatus(msgspec.Struct, frozen=True):
     """What is registered with one slave URI: one node as a rule, several for nodelets.
 
     ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
@@ -158,7 +158,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     ports: PortsStatus = PortsStatus()
     data_plane: DataPlaneStatus | None = None
     alias_ports: tuple[AliasPortStatus, ...] = ()
-    nodes: tuple[NodeStatus, ...] = ()
+    nodes: tuple[EndpointStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
 
 

@@ -11,9 +11,9 @@ from rosproxy.admin.status_document import (
     AliasPortStatus,
     ConnectionStatus,
     DataPlaneStatus,
+    EndpointStatus,
     MasterStatus,
     NodePlaneStatus,
-    NodeStatus,
     ProxyStatus,
 )
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -121,7 +121,7 @@ def _nodes(status: ProxyStatus, columns: int, details: bool) -> Iterator[str]:
             yield from _detail("kernel", _kernel(node, status.data_plane), columns)
 
 
-def _row(node: NodeStatus) -> tuple[str, ...]:
+def _row(node: EndpointStatus) -> tuple[str, ...]:
     names = [clean(name) for name in node.nodes] or ["(unnamed)"]
     plane = node.data_plane or NodePlaneStatus()
     connections = [*node.connections, plane]
@@ -142,11 +142,11 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
     )
 
 
-def _outside(node: NodeStatus) -> str:
+def _outside(node: EndpointStatus) -> str:
     return clean(parse_slave_uri(node.advertised_uri) or node.advertised_uri)
 
 
-def _details(node: NodeStatus, columns: int) -> Iterator[str]:
+def _details(node: EndpointStatus, columns: int) -> Iterator[str]:
     for word, names in (
         ("also", node.nodes[1:]),
         ("publishes", node.publishes),
@@ -162,7 +162,7 @@ def _details(node: NodeStatus, columns: int) -> Iterator[str]:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
 
 
-def _kernel(node: NodeStatus, whole: DataPlaneStatus | None) -> str:
+def _kernel(node: EndpointStatus, whole: DataPlaneStatus | None) -> str:
     """What the kernel forwards for a node; why nothing, where it does for others."""
     plane = node.data_plane
     if plane is None or whole is None or whole.plane != "kernel":

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import (
     ConnectionStatus,
-    NodeStatus,
+    EndpointStatus,
     NotAStatus,
     ProxyStatus,
     parse_status,
@@ -82,7 +82,7 @@ _JSON = st.recursive(
     lambda inner: (
         st.lists(inner)
         | st.dictionaries(
-            st.sampled_from([*ProxyStatus.__struct_fields__, *NodeStatus.__struct_fields__])
+            st.sampled_from([*ProxyStatus.__struct_fields__, *EndpointStatus.__struct_fields__])
             | st.sampled_from(ConnectionStatus.__struct_fields__)
             | st.text(),
             inner,
