@@ -23,7 +23,7 @@ Where = tuple[str, int]
 """Host and port."""
 ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
-CALL_SECONDS = 5.0
+CALL_SECONDS = 20.0
 """How long a call may take in all."""
 
 
