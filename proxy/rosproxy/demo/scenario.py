@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from time import monotonic
@@ -309,9 +309,8 @@ class Scenario:
     async def _arrivals(self, killed: float) -> None:
         """Give what is on the way time to arrive, and what would arrive twice a moment to."""
         pairs = (self.talker, self.far_listener), (self.far_talker, self.listener)
-        end = monotonic() + PATIENCE
-        while monotonic() < end and not all(count(*pair, killed)[0] for pair in pairs):
-            await asyncio.sleep(0.05)
+        with suppress(DemoError):  # the count tells what is missing
+            await self._until(lambda: all(count(*pair, killed)[0] for pair in pairs), "all arrive")
         await asyncio.sleep(0.2)
 
     def _check(self, promise: str, kept: bool, detail: str) -> None:

@@ -42,7 +42,7 @@ class BlockingNode:
             thread.join(10)
 
     def _start(self, function: Any, *args: Any) -> threading.Thread:
-        thread = threading.Thread(target=function, args=args)
+        thread = threading.Thread(target=function, args=args, daemon=True)
         self._threads.append(thread)
         thread.start()
         return thread
@@ -72,12 +72,13 @@ def receive(conn: socket.socket, size: int) -> bytes:
 @contextmanager
 def blocking_node(node: Any, serve: Any) -> Iterator[None]:
     """Let a node's topics be served by threads."""
-    node.tcpros_port, before = (made := BlockingNode(node.address, serve)).port, node.tcpros_port
+    made, before = BlockingNode(node.address, serve), node.tcpros.address
+    node.tcpros.address = node.address, made.port
     try:
         yield
     finally:
         made.close()
-        node.tcpros_port = before
+        node.tcpros.address = before
 
 
 def subscribe(address: Where) -> socket.socket:
