@@ -224,7 +224,7 @@ def status(settings: Any, as_json: bool, watch: bool) -> None:
 @docker.command()
 @click.pass_obj
 def plan(settings: Any) -> None:
-    """Show what the controller would do now, and change nothing."""
+    """Show what the operator would do now, and change nothing."""
     from rosproxy_operator.docker import run
 
     _or_exit(lambda: run.show_plan(settings.plan))
@@ -341,7 +341,7 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 
 @main.command()
 def health() -> None:
-    """Exit with 0 if the controller is alive, with 1 if not; for container health checks."""
+    """Exit with 0 if the operator is alive, with 1 if not; for container health checks."""
     from rosproxy.admin.client import AdminClient, AdminError, default_url
 
     url = default_url() if os.environ.get("ROSPROXY_ADMIN_BIND") else f"http://{DEFAULT_ADMIN}"

@@ -92,7 +92,11 @@ class App:
             where = HostPort(settings.advertise_host, settings.publish_master)
             published = PublishedMaster(self.context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
-        self.context.metrics.registry.register(self._state_metrics())
+        self.context.metrics.registry.register(
+            StateCollector(
+                self.context.registry, self.tcpros, self.alias, self.master_monitor, self.plane
+            )
+        )
         await self._start_admin()
         repeat = self.context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
@@ -204,16 +208,6 @@ class App:
             raise SettingError(
                 "--admin-bind", f"{self.settings.admin} can't be bound: {error.strerror}"
             ) from None
-
-    def _state_metrics(self) -> StateCollector:
-        return StateCollector(
-            self.context.registry,
-            self.tcpros.traffic,
-            lambda: len(self.tcpros.relays),
-            lambda: len(self.alias),
-            lambda: bool(self.master_monitor.up),
-            self.plane.tally,
-        )
 
     def _log_start(self) -> None:
         settings = self.settings

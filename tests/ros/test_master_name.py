@@ -100,10 +100,10 @@ def test_subscribers_from_before_hear_publishers_from_after_the_proxy_was_killed
     )
 
 
-def mirrored(lab: Lab) -> set[int]:
+def alias_ports(lab: Lab) -> set[int]:
     """The ports on which the proxy stands in for nodes of the robot."""
     status = json.loads(lab.rosproxy("status", "--json").output)
-    return {row["port"] for row in status["mirrored"]}
+    return {row["port"] for row in status["alias_ports"]}
 
 
 @pytest.mark.boundary
@@ -115,7 +115,7 @@ def test_uris_are_the_same_inside_and_outside(lab: Lab, library: str) -> None:
     assert len(uris) == 1
     found = re.match(r"http://robot:(\d+)/ ", uris.pop())
     assert found
-    assert int(found[1]) in mirrored(lab)
+    assert int(found[1]) in alias_ports(lab)
     assert f" {found[1]}" in lab.rosproxy("status").output
     assert "Nothing wrong was found." in lab.rosproxy("doctor", name).output
 
@@ -177,16 +177,16 @@ def test_a_publisher_that_comes_back_at_the_same_port_is_heard(lab: Lab, library
         node.wait_for("^sent ")
         receiver = lab.node(library, "c1", "sub", topic=topic)
         receiver.wait_for_count(f"^got {word} ", 3)
-        assert 40001 in mirrored(lab)
+        assert 40001 in alias_ports(lab)
         node.kill()
         lab.run("c1", "rosnode", "ping", "-c", "1", name, check=False)
-        assert 40001 not in mirrored(lab)
+        assert 40001 not in alias_ports(lab)
 
 
 @pytest.mark.boundary
 @each_library
 def test_tools_go_on_after_the_proxy_was_killed(lab: Lab, library: str) -> None:
-    """Nothing is mirrored after a restart until a URI is asked for again."""
+    """No alias port is open after a restart until a URI is asked for again."""
     node, name = test_rosnode.talker(lab, library, "out")
     _, service = test_rosservice.server(lab, "out", library)
     restart_proxy(lab)

@@ -6,13 +6,13 @@ so no size in it is to be trusted.
 
 from collections.abc import Mapping
 
-from rosproxy.admin.status_document import NodeStatus, ProxyStatus
+from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
 from rosproxy.net.addresses import parse_host_port, plain_address
 
 
-def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[NodeStatus, ...]]:
+def nodes_by_address(status: ProxyStatus) -> Mapping[str, tuple[EndpointStatus, ...]]:
     """A proxy's nodes by the address where they are; not those that it has given up already."""
-    found: dict[str, tuple[NodeStatus, ...]] = {}
+    found: dict[str, tuple[EndpointStatus, ...]] = {}
     for node in status.nodes:
         where = parse_host_port(node.address)
         if where is not None and not node.given_up:

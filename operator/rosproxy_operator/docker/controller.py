@@ -1,4 +1,10 @@
-"""Reconciling a Docker host: look, plan, carry out, tell. The loop around that is `ControlLoop`."""
+"""Reconciling a Docker host: look, plan, carry out, tell. The loop around that is `ControlLoop`.
+
+The way of a label, in one direction: `events` tells that something has changed and wakes the loop.
+A look lists everything anew and reads the labels (`snapshot`), decides (`planner.plan`), begins to
+carry out what was decided (`executor`, action by action `apply`), and brings the running proxies up
+to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
+"""
 
 import logging
 import time

@@ -1,14 +1,17 @@
 """The proxy's state as Prometheus metrics, read when they are scraped."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases import fast_ports
+from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.registry.endpoint import STATES
 from rosproxy.ros1.registry.registry import Registry
-from rosproxy.telemetry.metrics import KernelTally, Traffic
+from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
 
 class StateCollector(Collector):
@@ -17,15 +20,13 @@ class StateCollector(Collector):
     def __init__(
         self,
         registry: Registry,
-        totals: Callable[[], Traffic],
-        open_connections: Callable[[], int],
-        mirrored: Callable[[], int],
-        master_up: Callable[[], bool],
-        kernel: Callable[[], KernelTally],
+        tcpros: TcprosServer,
+        alias: Alias,
+        monitor: MasterMonitor,
+        plane: KernelPlane,
     ) -> None:
-        self._registry, self._totals = registry, totals
-        self._open_connections, self._mirrored = open_connections, mirrored
-        self._master_up, self._kernel = master_up, kernel
+        self._registry, self._tcpros, self._alias = registry, tcpros, alias
+        self._monitor, self._plane = monitor, plane
 
     def collect(self) -> Iterable[Metric]:
         """All state metrics."""
@@ -35,13 +36,13 @@ class StateCollector(Collector):
         yield _gauge("leases_free", "Ports left for inside nodes.", left)
         yield _gauge("fast_ports", "Of the ports left, those that serve topics meanwhile.", fast)
         yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
-        yield _gauge("open_connections", "Relayed TCPROS connections.", self._open_connections())
+        yield _gauge("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays))
         yield _gauge(
-            "mirrored_ports",
+            "alias_ports",
             "Ports that stand in for nodes on the master's host.",
-            self._mirrored(),
+            len(self._alias),
         )
-        yield _gauge("master_up", "Whether the master answers.", int(self._master_up()))
+        yield _gauge("master_up", "Whether the master answers.", int(bool(self._monitor.up)))
         yield self._endpoints()
         yield self._bytes()
         yield from self._forwarded()
@@ -59,14 +60,14 @@ class StateCollector(Collector):
             "Bytes relayed by topic or service and direction.",
             labels=["kind", "name", "direction"],
         )
-        totals = self._totals()
+        totals = self._tcpros.traffic()
         for direction, sums in (("outward", totals.sent), ("inward", totals.received)):
             for (kind, name), size in sums.items():
                 family.add_metric([kind, name, direction], size)
         return family
 
     def _forwarded(self) -> Iterable[Metric]:
-        tally = self._kernel()
+        tally = self._plane.tally()
         yield _gauge("kernel_plane", "Whether the kernel forwards topics.", int(tally.usable))
         yield _gauge(
             "kernel_connections", "TCPROS connections that the kernel forwards.", tally.connections

@@ -10,9 +10,9 @@ from rosproxy.admin.status_document import (
     AliasPortStatus,
     ConnectionStatus,
     DataPlaneStatus,
+    EndpointStatus,
     MasterStatus,
     NodePlaneStatus,
-    NodeStatus,
     PortsStatus,
     ProblemStatus,
     ProxyStatus,
@@ -51,7 +51,7 @@ def describe(
         master=_master(context, monitor),
         ports=_ports(context),
         data_plane=msgspec.convert(plane.status(), DataPlaneStatus),
-        mirrored=msgspec.convert(alias.status(), tuple[AliasPortStatus, ...]),
+        alias_ports=msgspec.convert(alias.status(), tuple[AliasPortStatus, ...]),
         nodes=tuple(_node(context, e, relays.get(e.port, []), plane) for e in endpoints),
         problems=tuple(
             ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
@@ -99,8 +99,8 @@ def _ports(context: Context) -> PortsStatus:
 
 def _node(
     context: Context, endpoint: Endpoint, relays: list[Relay], plane: KernelPlane
-) -> NodeStatus:
-    return NodeStatus(
+) -> EndpointStatus:
+    return EndpointStatus(
         nodes=tuple(endpoint.caller_ids),
         uri=endpoint.uri,
         address=str(endpoint.slave),

@@ -106,7 +106,7 @@ class ConnectionStatus(msgspec.Struct, frozen=True):
     received_rate: Rate = 0.0
 
 
-class NodeStatus(msgspec.Struct, frozen=True):
+class EndpointStatus(msgspec.Struct, frozen=True):
     """What is registered with one slave URI: one node as a rule, several for nodelets.
 
     ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
@@ -145,7 +145,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` is another one after each start; ``retired``: it registers nothing any more;
-    ``mirrored`` are the ports that stand in for nodes on the master's host.
+    ``alias_ports`` are the ports that stand in for nodes on the master's host.
     """
 
     version: str = ""
@@ -157,8 +157,8 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     master: MasterStatus = MasterStatus()
     ports: PortsStatus = PortsStatus()
     data_plane: DataPlaneStatus | None = None
-    mirrored: tuple[AliasPortStatus, ...] = ()
-    nodes: tuple[NodeStatus, ...] = ()
+    alias_ports: tuple[AliasPortStatus, ...] = ()
+    nodes: tuple[EndpointStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
 
 

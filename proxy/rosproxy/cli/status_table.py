@@ -11,9 +11,9 @@ from rosproxy.admin.status_document import (
     AliasPortStatus,
     ConnectionStatus,
     DataPlaneStatus,
+    EndpointStatus,
     MasterStatus,
     NodePlaneStatus,
-    NodeStatus,
     ProxyStatus,
 )
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -63,8 +63,8 @@ def _head(status: ProxyStatus) -> Iterator[str]:
     yield (
         f"inside   ROS_MASTER_URI=http://<this host>:{settings.master_port}, networks {networks}"
     )
-    if mirrored := status.mirrored:
-        yield f"mirrored {_mirrored(mirrored)}"
+    if ports := status.alias_ports:
+        yield f"alias    {_alias_ports(ports)}"
     if settings.publish_master:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
@@ -94,7 +94,7 @@ def _plane(plane: DataPlaneStatus) -> str:
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _mirrored(ports: Sequence[AliasPortStatus]) -> str:
+def _alias_ports(ports: Sequence[AliasPortStatus]) -> str:
     open_ones = plural(sum(port.connections for port in ports), "connection")
     numbers = listed(str(port.port) for port in ports)
     return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
@@ -121,7 +121,7 @@ def _nodes(status: ProxyStatus, columns: int, details: bool) -> Iterator[str]:
             yield from _detail("kernel", _kernel(node, status.data_plane), columns)
 
 
-def _row(node: NodeStatus) -> tuple[str, ...]:
+def _row(node: EndpointStatus) -> tuple[str, ...]:
     names = [clean(name) for name in node.nodes] or ["(unnamed)"]
     plane = node.data_plane or NodePlaneStatus()
     connections = [*node.connections, plane]
@@ -142,11 +142,11 @@ def _row(node: NodeStatus) -> tuple[str, ...]:
     )
 
 
-def _outside(node: NodeStatus) -> str:
+def _outside(node: EndpointStatus) -> str:
     return clean(parse_slave_uri(node.advertised_uri) or node.advertised_uri)
 
 
-def _details(node: NodeStatus, columns: int) -> Iterator[str]:
+def _details(node: EndpointStatus, columns: int) -> Iterator[str]:
     for word, names in (
         ("also", node.nodes[1:]),
         ("publishes", node.publishes),
@@ -162,7 +162,7 @@ def _details(node: NodeStatus, columns: int) -> Iterator[str]:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
 
 
-def _kernel(node: NodeStatus, whole: DataPlaneStatus | None) -> str:
+def _kernel(node: EndpointStatus, whole: DataPlaneStatus | None) -> str:
     """What the kernel forwards for a node; why nothing, where it does for others."""
     plane = node.data_plane
     if plane is None or whole is None or whole.plane != "kernel":

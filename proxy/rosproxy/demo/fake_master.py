@@ -144,8 +144,13 @@ class FakeMaster:
 
     # Calling nodes back
 
-    def _notify(self, uri: str, method: str, *params: Any) -> None:
-        """Have a node called in the background: one call at a time, in order."""
+    def _notify(self, uri: object, method: str, *params: Any) -> None:
+        """Have a node called in the background: one call at a time, in order.
+
+        Where ``uri`` is none, nobody is called: a real master has refused it before.
+        """
+        if not isinstance(uri, str):
+            return
         waiting = self._outbox.setdefault(uri, deque())
         waiting.append((method, "/master", *params))
         if len(waiting) == 1:

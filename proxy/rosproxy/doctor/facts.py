@@ -11,7 +11,7 @@ from enum import Enum
 from functools import cached_property
 
 from rosproxy.admin.requests import RangeProbe
-from rosproxy.admin.status_document import NodeStatus, ProxyStatus
+from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -200,7 +200,7 @@ class DoctorFacts:
         return scope(self.graph or SystemState(), self.names)
 
     @cached_property
-    def leases(self) -> dict[int, NodeStatus]:
+    def leases(self) -> dict[int, EndpointStatus]:
         """The nodes of ``status`` by the port that outside sees."""
         if self.status is None:
             return {}

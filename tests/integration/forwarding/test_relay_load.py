@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from typing import Any
 
-from rosproxy.demo.fake_http import Where, where
+from rosproxy.demo.fake_http import Where, value, where
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import OUTSIDE, connect, exchange, post, read_header, topic_header, until
 
@@ -72,13 +72,13 @@ def receive(conn: socket.socket, size: int) -> bytes:
 @contextmanager
 def blocking_node(node: Any, serve: Any) -> Iterator[None]:
     """Let a node's topics be served by threads."""
-    made, before = BlockingNode(node.address, serve), node.tcpros.address
-    node.tcpros.address = node.address, made.port
+    made = BlockingNode(node.address, serve)
+    node.answers["requestTopic"] = value([1, "ready", ["TCPROS", node.address, made.port]])
     try:
         yield
     finally:
         made.close()
-        node.tcpros.address = before
+        del node.answers["requestTopic"]
 
 
 def subscribe(address: Where) -> socket.socket:

@@ -70,9 +70,9 @@ def service(node: FakeNode, address: str = PROXY) -> Where:
     return address, node.tcpros_port
 
 
-def mirrored(proxy: Proxy) -> dict[int, int]:
-    """The mirrored ports with their connections."""
-    return {row["port"]: row["connections"] for row in proxy.app.status()["mirrored"]}
+def alias_ports(proxy: Proxy) -> dict[int, int]:
+    """The alias ports with their connections."""
+    return {row["port"]: row["connections"] for row in proxy.app.status()["alias_ports"]}
 
 
 def problems(proxy: Proxy) -> dict[str, str]:
@@ -127,10 +127,10 @@ WAYS = [by_subscribing, by_publishing, by_lookup, by_multicall, by_update]
 async def test_whatever_way_a_uri_is_given_it_is_unchanged_and_its_port_is_open(
     proxy: Proxy, robot: FakeNode, node: FakeNode, way: Callable[..., Awaitable[Any]]
 ) -> None:
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
     assert await refuses(slave(robot), NODE)
     assert await way(proxy, robot, node) == robot.uri
-    assert slave(robot)[1] in mirrored(proxy)
+    assert slave(robot)[1] in alias_ports(proxy)
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
 
 
@@ -153,15 +153,15 @@ async def test_the_port_is_open_before_the_update_arrives(
 
 async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: FakeNode) -> None:
     assert await look_up_service(proxy) == robot.service_api
-    assert mirrored(proxy) == {robot.tcpros_port: 0}
+    assert alias_ports(proxy) == {robot.tcpros_port: 0}
     async with connect(service(robot), NODE) as wire:
         await wire.send(service_header(caller="/tool"))
         assert (await read_header(wire))["callerid"] == "/robot"
         await wire.send(b"x" * 300_000)
         assert await wire.exactly(300_000) == b"x" * 300_000
-        assert mirrored(proxy) == {robot.tcpros_port: 1}
+        assert alias_ports(proxy) == {robot.tcpros_port: 1}
     assert robot.headers == [{"callerid": "/tool", "service": "/add", "md5sum": "*"}]
-    await until(lambda: mirrored(proxy) == {robot.tcpros_port: 0}, "the relay ends")
+    await until(lambda: alias_ports(proxy) == {robot.tcpros_port: 0}, "the relay ends")
 
 
 async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
@@ -171,7 +171,7 @@ async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
     asked = await rpc(slave(robot), "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
     port = robot.tcpros_port
     assert asked == [1, f"ready on {MASTER}:{port}", ["TCPROS", MASTER, port]]
-    assert port not in mirrored(proxy)
+    assert port not in alias_ports(proxy)
     asked = await rpc(slave(robot), "requestTopic", "/n", "/no", [["TCPROS"]], source=NODE)
     assert asked == [-1, "Not a publisher of [/no]", []]
 
@@ -268,7 +268,7 @@ async def test_nothing_happens_without_need(
     proxy = await make_proxy(**behind_its_name(master, **changed))
     assert await look_up(proxy, robot) == robot.uri
     assert await look_up_service(proxy) == robot.service_api
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
     assert await refuses(slave(robot), NODE)
 
 
@@ -279,11 +279,11 @@ async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
         node = await make_node(name, MASTER, host=host)
         await node.publish(where(master.uri))
         assert await look_up(proxy, node) == node.uri
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
 
 
 async def gone(proxy: Proxy, robot: FakeNode) -> None:
-    """End a node whose ports are mirrored, and let inside find out."""
+    """End a node whose ports have aliases, and let inside find out."""
     await robot.stop()
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
     assert await knock(service(robot), service_header(), NODE) == "reset"
@@ -296,12 +296,12 @@ async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot:
     for _ in range(2):
         assert await refuses(slave(robot), NODE)
         assert await refuses(service(robot), NODE)
-        assert mirrored(proxy) == {}
+        assert alias_ports(proxy) == {}
         assert await look_up(proxy, robot) == robot.uri
         assert await look_up_service(proxy) == robot.service_api
     await robot.start()
     assert await look_up(proxy, robot) == robot.uri
-    assert mirrored(proxy) == {slave(robot)[1]: 0}
+    assert alias_ports(proxy) == {slave(robot)[1]: 0}
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == robot.pid
 
 
@@ -323,7 +323,7 @@ async def test_a_node_that_does_not_answer_is_no_node_that_is_gone(
     await look_up(proxy, robot)
     robot.answers["getPid"] = End.RESET
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
-    assert mirrored(proxy) == {slave(robot)[1]: 0}
+    assert alias_ports(proxy) == {slave(robot)[1]: 0}
 
 
 async def test_ports_that_the_proxy_needs_itself_are_a_problem(
@@ -336,7 +336,7 @@ async def test_ports_that_the_proxy_needs_itself_are_a_problem(
         await rpc(master.uri, "registerPublisher", f"/{uri[-6:-1]}", "/t", "x/Y", uri)
     seen = (await rpc(proxy.master, "registerSubscriber", "/n", "/t", "*", uris[0], source=NODE))[2]
     assert seen == uris
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
     told = problems(proxy)
     options = ("--port-range", "--master-port", "--admin-bind")
     for uri, port, option in zip(uris, own, options, strict=True):
@@ -380,13 +380,13 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
         assert problems(proxy) == {}
 
 
-async def test_the_proxys_own_ports_are_not_mirrored_where_it_shares_the_name(
+async def test_the_proxys_own_ports_are_no_aliases_where_it_shares_the_name(
     make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
 ) -> None:
     proxy = await make_proxy(**behind_its_name(master, advertise_host="robot"))
     await node.publish(proxy.master)
     assert await look_up(proxy, node) == node.uri
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
     assert problems(proxy) == {}
 
 
@@ -409,7 +409,7 @@ async def test_ports_are_bounded_and_the_least_used_goes_first(
     await look_up(proxy, second)
     await look_up(proxy, first)
     await look_up(proxy, third)
-    assert set(mirrored(proxy)) == {slave(first)[1], slave(third)[1]}
+    assert set(alias_ports(proxy)) == {slave(first)[1], slave(third)[1]}
     assert await refuses(slave(second), NODE)
 
 
@@ -424,12 +424,12 @@ async def test_ports_in_use_are_kept(
             await wire.send(service_header())
             await read_header(wire)
         assert await look_up(proxy, crowd[2]) == crowd[2].uri
-        assert set(mirrored(proxy)) == {node.tcpros_port for node in crowd[:2]}
+        assert set(alias_ports(proxy)) == {node.tcpros_port for node in crowd[:2]}
         assert "one too many" in problems(proxy)[crowd[2].uri]
-    await until(lambda: set(mirrored(proxy).values()) == {0}, "the relays end")
+    await until(lambda: set(alias_ports(proxy).values()) == {0}, "the relays end")
     await look_up(proxy, crowd[2])
     assert crowd[2].uri not in problems(proxy)
-    assert slave(crowd[2])[1] in mirrored(proxy)
+    assert slave(crowd[2])[1] in alias_ports(proxy)
 
 
 async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: FakeNode) -> None:
@@ -469,10 +469,10 @@ async def test_a_recovered_subscriber_is_given_open_ports(
     await node.subscribe(proxy.master)
     node.calls.clear()
     await proxy.restart()
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
     await until(node.updates, "a publisherUpdate by the proxy")
     assert node.updates()[0] == [robot.uri]
-    assert mirrored(proxy) == {slave(robot)[1]: 0}
+    assert alias_ports(proxy) == {slave(robot)[1]: 0}
 
 
 async def test_nodes_on_the_masters_host_are_told_at_its_address(
@@ -485,16 +485,16 @@ async def test_nodes_on_the_masters_host_are_told_at_its_address(
     await proxy.restart()
     await until(robot.updates, "a publisherUpdate by the proxy")
     assert robot.updates()[0] == [robot.uri]
-    assert mirrored(proxy) == {}
+    assert alias_ports(proxy) == {}
 
 
-async def test_mirrored_ports_are_measured(proxy: Proxy, robot: FakeNode) -> None:
-    assert (await metrics(proxy))["rosproxy_mirrored_ports"] == 0
+async def test_alias_ports_are_measured(proxy: Proxy, robot: FakeNode) -> None:
+    assert (await metrics(proxy))["rosproxy_alias_ports"] == 0
     await look_up(proxy, robot)
     await rpc(slave(robot), "getPid", "/tool", source=NODE)
     found = await metrics(proxy)
-    assert found["rosproxy_mirrored_ports"] == 1
-    label = "{api=mirror,method=getPid,outcome=answered}"
+    assert found["rosproxy_alias_ports"] == 1
+    label = "{api=alias,method=getPid,outcome=answered}"
     assert found[f"rosproxy_xmlrpc_calls_total{label}"] == 1
 
 

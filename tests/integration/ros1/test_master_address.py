@@ -153,5 +153,5 @@ async def test_the_doctors_option(master: FakeMaster) -> None:
     wrong = await run(*words, ROSPROXY_MASTER_ADDRESS="robot")
     assert (wrong.code, wrong.err) == (
         2,
-        "rosproxy: --master-address: 'robot' is not an IP address\n",
+        "rosproxy: --master-address: 'robot' is not an IP address such as 192.0.2.7\n",
     )

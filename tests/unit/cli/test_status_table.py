@@ -42,13 +42,13 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
     assert lines[4] == "outside  ROS_MASTER_URI=http://robot-host:11411"
 
 
-def test_head_names_mirrored_ports() -> None:
+def test_head_names_alias_ports() -> None:
     status = make_status()
-    status["mirrored"] = []
-    assert "mirrored" not in shown(status, 120)
-    status["mirrored"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
+    status["alias_ports"] = []
+    assert "alias" not in shown(status, 120)
+    status["alias_ports"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
     assert (
-        "mirrored 7 ports of nodes on the master's host (14 connections): "
+        "alias    7 ports of nodes on the master's host (14 connections): "
         "40001, 40002, 40003, 40004, 40005 and 2 more"
     ) in shown(status, 120).split("\n")
 

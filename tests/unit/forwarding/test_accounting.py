@@ -116,6 +116,6 @@ def test_silent_ports_are_noted_with_the_bytes() -> None:
     book.note_owners(registry)
     for size in (60, 120):
         book.count({1002: (0, size)}, float(size))
-    assert book.silent == [1002]
+    assert book.unanswered == [1002]
     book.count({1002: (40, 180)}, 200.0)
-    assert book.silent == []
+    assert book.unanswered == []

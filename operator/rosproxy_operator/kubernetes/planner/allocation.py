@@ -1,4 +1,11 @@
-"""Which range of ports each proxy gets on its node, and when it must leave it."""
+"""Which range of ports each proxy gets on its node.
+
+A proxy's range is a promise: ROS nodes have registered at the master under its ports, so a proxy
+keeps the range that it has, or had by the state or by its RosProxy's status, as long as that is
+allowed and to be had. On each node who has ports comes first, then who had some, then who wants
+some; a hostPort is taken if any pod of the node has it, whosever that is. `state` says which ports
+were refused of late, and who had to leave his.
+"""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass

@@ -62,7 +62,7 @@ class NodeSpec(ApiFields, frozen=True):
     unschedulable: bool = False
 
 
-class NodeStatus(ApiFields, frozen=True):
+class NodeObjectStatus(ApiFields, frozen=True):
     """A node's ``status``."""
 
     addresses: tuple[NodeAddress, ...] = ()
@@ -84,7 +84,7 @@ class Variable(ApiFields, frozen=True):
     value_from: Any = None
 
 
-class Container(ApiFields, frozen=True):
+class PodContainer(ApiFields, frozen=True):
     """A container or init container of a pod."""
 
     name: str = ""
@@ -99,8 +99,8 @@ class PodSpec(ApiFields, frozen=True):
 
     node_name: str = ""
     host_network: bool = False
-    init_containers: tuple[Container, ...] = ()
-    containers: tuple[Container, ...] = ()
+    init_containers: tuple[PodContainer, ...] = ()
+    containers: tuple[PodContainer, ...] = ()
 
 
 class Terminated(ApiFields, frozen=True):
@@ -161,7 +161,7 @@ class NodeObject(ObjectFields, frozen=True):
     """A node."""
 
     spec: NodeSpec = NodeSpec()
-    status: NodeStatus = NodeStatus()
+    status: NodeObjectStatus = NodeObjectStatus()
 
 
 class PodObject(ObjectFields, frozen=True):

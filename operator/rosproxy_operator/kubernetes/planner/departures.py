@@ -1,4 +1,9 @@
-"""What a proxy is to be told of the pods on its node: which addresses are nobody's any more."""
+"""What a proxy is to be told of the pods on its node: which addresses are nobody's any more.
+
+A proxy finds out by probing that a ROS node is gone, which takes long; the operator knows from the
+API server that a pod is gone. It compares the addresses at which a proxy has ROS nodes with those
+of the pods that are there, and is careful: what is unregistered by mistake is not found again.
+"""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -1,4 +1,9 @@
-"""How a pod is wired to its proxy at admission, and whether it is."""
+"""How a pod is wired to its proxy at admission, and whether it is.
+
+Wired is a pod whose containers have ROS_MASTER_URI, which leads to its RosProxy's Service and so to
+the proxy on its own node, and ROS_IP. `wire` is for the webhook, `unwired` for the planner, which
+finds pods that no webhook has seen.
+"""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

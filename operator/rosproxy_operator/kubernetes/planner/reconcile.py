@@ -1,4 +1,10 @@
-"""What is to be done for one RosProxy: its Service, and its proxy on each node."""
+"""What is to be done for one RosProxy: its Service, and its proxy on each node.
+
+Each function compares what is wanted of an object with what is there and yields the next action;
+the rest follows with the looks after it. Only the fingerprint on an object says whether it is as it
+ought to be. A pod that differs is deleted and made anew under the same name, but for its image,
+which can be exchanged. `retries` keeps actions without effect from being repeated at once.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping

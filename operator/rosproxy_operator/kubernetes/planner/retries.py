@@ -1,4 +1,9 @@
-"""When an action is asked for again that has had no effect: soon, then ever later."""
+"""When an action is asked for again that has had no effect: soon, then ever later.
+
+The planner asks (`Retries.ask`) before each action whether it is to be done now. What was asked for
+is noted, with the time and with the error if the API server refused it, and goes into the next
+state; what nobody asks for any more has had its effect and is forgotten.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace

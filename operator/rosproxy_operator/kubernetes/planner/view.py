@@ -1,4 +1,7 @@
-"""What is seen in a cluster, put in order: who is wanted where, and what is there."""
+"""What is seen in a cluster, put in order: who is wanted where, and what is there.
+
+Everything after this works by place, that is a RosProxy on a node, and not by pod.
+"""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from ipaddress import ip_address, ip_network
 
-from rosproxy.admin.status_document import NodeStatus
+from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, Reach
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules.proxy import local_master
@@ -49,7 +49,7 @@ def _inside(facts: DoctorFacts) -> Iterator[DoctorFinding]:
             yield from _inside_node(facts, node, name)
 
 
-def _inside_node(facts: DoctorFacts, node: NodeStatus, name: str) -> Iterator[DoctorFinding]:
+def _inside_node(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[DoctorFinding]:
     state, address = node.state, node.address
     after = facts.status.settings.cleanup_after if facts.status else 0
     if state in ("refused", "silent", "failing", "ok") and _only_on_loopback(node):
@@ -84,13 +84,13 @@ def _inside_node(facts: DoctorFacts, node: NodeStatus, name: str) -> Iterator[Do
         yield from _namesakes(facts, node, name)
 
 
-def _only_on_loopback(node: NodeStatus) -> bool:
+def _only_on_loopback(node: EndpointStatus) -> bool:
     """Whether a node gives a loopback address, and is somewhere else than the proxy."""
     named, placed = parse_slave_uri(node.uri), parse_host_port(node.address)
     return bool(named and placed and is_loopback(named.host) and not is_loopback(placed.host))
 
 
-def _namesakes(facts: DoctorFacts, node: NodeStatus, name: str) -> Iterator[DoctorFinding]:
+def _namesakes(facts: DoctorFacts, node: EndpointStatus, name: str) -> Iterator[DoctorFinding]:
     """Another node of the same name took over at the master."""
     known = facts.nodes.get(name)
     if known and known.uri and known.uri != node.advertised_uri:

@@ -73,15 +73,15 @@ class KernelAccounts:
     """Whose the connections through the fast ports are, and what went through them.
 
     A port that was given back stays its last holder's until somebody else holds it, or the holder
-    ends: the connections through it go on meanwhile. ``silent`` are the ports behind which nobody
+    ends: the connections through it go on meanwhile. ``unanswered`` are ports behind which nobody
     answered of late.
     """
 
     def __init__(self) -> None:
         self.owners: Mapping[int, ForwardedEndpoint] = {}
         self._accounts: dict[ForwardedEndpoint, Account] = {}
-        self._deltas, self._silence = CounterDeltas(), UnansweredPorts()
-        self.silent: list[int] = []
+        self._deltas, self._unanswered = CounterDeltas(), UnansweredPorts()
+        self.unanswered: list[int] = []
         self._counted_at = 0.0
 
     def note_owners(self, endpoints: ForwardedEndpoints) -> None:
@@ -97,7 +97,7 @@ class KernelAccounts:
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
         grown, by_port = [], self._deltas.take(counters)
-        self.silent = self._silence.look(by_port, now)
+        self.unanswered = self._unanswered.look(by_port, now)
         for port, (sent, received) in by_port.items():
             endpoint = self.owners.get(port)
             if endpoint is not None:

@@ -188,7 +188,9 @@ class KernelPlane:
             self._traffic.add("node", name, sent, received)
         self._accounts.note_peers(flows)
         unanswered = self._unanswered.look(flows, self._clock())
-        await self._syncer.take_back({*self._accounts.silent, *(flow.port for flow in unanswered)})
+        await self._syncer.take_back(
+            {*self._accounts.unanswered, *(flow.port for flow in unanswered)}
+        )
 
     def _report(self) -> None:
         plane, why = self._user_plane, self._syncer.why_not

@@ -222,9 +222,9 @@ class Alias:
         try:
             reply = await upstream.post_to_node(HostPort(name, port), call.body, path=call.path)
         except Unreachable as error:
-            self._context.metrics.count("mirror", parsed.method, "unreachable")
+            self._context.metrics.count("alias", parsed.method, "unreachable")
             if error.refused:
                 self._note_refused(port)
             raise
-        self._context.metrics.count("mirror", parsed.method, "answered")
+        self._context.metrics.count("alias", parsed.method, "answered")
         return policy.direct_reply(parsed, reply, name, upstream.master_address or name)

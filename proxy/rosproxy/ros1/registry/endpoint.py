@@ -52,6 +52,9 @@ class Endpoint:
     """An inside slave URI and the port that stands for it outside.
 
     ``callers`` are the nodes' names with the number of their registrations, which `Registry` keeps.
+    It is plain state: who learns something of the node tells it by the methods (``note_…``), and
+    `Registry` keeps what it is found by.
+
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
     ``trusted`` is False while only the master's data tell of the endpoint.
@@ -92,6 +95,52 @@ class Endpoint:
         self.health.note(ProbeResult.ANSWERED, now)
         self.health.pid, self.health.cleaned = pid, False
 
+    def hold(self) -> None:
+        """Keep the lease while a call is on its way; see `release`."""
+        self.pending += 1
+
+    def release(self) -> None:
+        """Note that a call has ended for which the lease was held."""
+        self.pending -= 1
+
+    def note_used(self) -> None:
+        """Note that somebody needs the lease."""
+        self.idle_since = None
+
+    def note_unused(self, now: float) -> float:
+        """Note that nobody needs the lease now; for how many seconds that has been so."""
+        if self.idle_since is None:
+            self.idle_since = now
+        return now - self.idle_since
+
+    def note_verified(self, pid: int | None, tcpros_port: int | None) -> None:
+        """Note that the node itself has borne out what the master says of it."""
+        self.tcpros_port, self.trusted = tcpros_port, True
+        if self.health.pid is None:
+            self.health.pid = pid
+
+    def note_named(self, named: bool) -> None:
+        """Note whether the host that the node gives leads to it."""
+        self.place = replace(self.place, named=named)
+
+    def note_former_uri(self, uri: str) -> None:
+        """Note a URI by which the master may have known the node."""
+        self.former_uris.add(uri)
+
+    def note_moved(self, before: str, now: str) -> None:
+        """Note that the advertised URI has changed, and that the master has the former one yet."""
+        self.former_uris.add(before)
+        self.former_uris.discard(now)
+        self.unsettled = True
+
+    def note_settled(self) -> None:
+        """Note that everything is registered by the URI that is advertised now."""
+        self.unsettled = False
+
+    def expect_updates(self, until: float) -> None:
+        """Take lists of publishers without this one for outdated, until a time."""
+        self.settles_at = until
+
     def confirm(self) -> None:
         """Note that the node registered from its own address: what it says is believed."""
         self.place, self.trusted = replace(self.place, confirmed=True), True
@@ -114,7 +163,7 @@ class Endpoint:
     def note_connection(self) -> None:
         """Note that somebody outside has connected through the proxy."""
         self.connections += 1
-        self.idle_since = None
+        self.note_used()
 
     def note_disconnection(self) -> None:
         """Note that such a connection has ended."""
@@ -169,6 +218,11 @@ class Endpoint:
     def label(self) -> str:
         """How messages name this endpoint: node name and own URI."""
         return f"{', '.join(self.caller_ids) or 'unnamed node'} ({self.uri})"
+
+    @property
+    def log_fields(self) -> dict[str, str | int]:
+        """What a log entry about it has as fields, to be given as ``extra``."""
+        return {"node": ", ".join(self.caller_ids), "port": self.port}
 
     def names(self, kind: Kind) -> list[str]:
         """The topics, services or parameters registered as ``kind``."""

@@ -66,6 +66,18 @@ class Health:
             return "failing"
         return "new" if self.answered is None else "ok"
 
+    def probe_soon(self) -> None:
+        """Have the node probed at once."""
+        self.checked = None
+
+    def note_cleaned(self, at: float) -> None:
+        """Note that its registrations were taken back at the master, as they were at a time."""
+        self.cleaned, self.cleaned_at = True, at
+
+    def note_back(self, pid: int | None) -> None:
+        """Note that it answers after all, as process ``pid``, and that it is registered again."""
+        self.pid, self.cleaned = pid, False
+
     def suspect(self) -> None:
         """Have the node probed at once, as if another process could be there by now."""
         self.checked, self.pid = None, -1

@@ -130,7 +130,7 @@ class Registry:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.registrations[held.key] = held
         self._by_caller[held.caller_id] = endpoint
-        endpoint.idle_since = None
+        endpoint.note_used()
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
         """Note that a registration has ended, whoever ended it."""

@@ -50,13 +50,13 @@ class NodeAdmission:
                 admission = await self._admit(call, asker) if call else None
                 admissions.append(admission)
                 if isinstance(admission, Endpoint):
-                    admission.pending += 1
+                    admission.hold()
                     await adopter.take_over(admission, call.string(0) or "" if call else "")
             yield admissions
         finally:
             for admission in admissions:
                 if isinstance(admission, Endpoint):
-                    admission.pending -= 1
+                    admission.release()
 
     def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
         """The endpoint of a node found at a place, its port open; a refusal if none is left."""

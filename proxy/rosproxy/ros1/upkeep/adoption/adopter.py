@@ -165,7 +165,7 @@ class Adopter:
                 await self._registrar.register_missing(endpoint, info)
         finally:
             for endpoint in endpoints:
-                endpoint.pending -= 1
+                endpoint.release()
         adoption.names += [name for name, (e, _) in former.items() if name in e.caller_ids]
         for name in adoption.names:
             log.info("%s adopted: %s", name, self._advertised(former[name][0]))
@@ -185,7 +185,7 @@ class Adopter:
         endpoint = self._admission.take_in(uri, own, where, asker)
         if not isinstance(endpoint, Endpoint):
             return None
-        endpoint.pending += 1
+        endpoint.hold()
         await self._leases.cleared(endpoint)
         now, known_pid = self._context.now(), endpoint.health.pid
         endpoint.mark_alive(info.pid, info.tcpros_port, now)
@@ -193,7 +193,7 @@ class Adopter:
             endpoint.health.suspect()
         self._leases.open(endpoint)
         for node in nodes:
-            endpoint.former_uris.add(node.uri)
+            endpoint.note_former_uri(node.uri)
             for held in node.registrations:
                 type_ = info.by_kind.get(held.kind, {}).get(held.name, held.type)
                 self._context.registry.register(endpoint, replace(held, type=type_, since=now))

@@ -105,7 +105,7 @@ class ContainerEvents:
             self._close(endpoint)
         alive = [endpoint for endpoint in found if endpoint not in dead]
         for endpoint in alive:
-            endpoint.health.checked = None  # another process may have the address by now
+            endpoint.health.probe_soon()  # another process may have the address by now
         silent = [e for e in alive if outcomes[e] is ProbeResult.SILENT]
         if silent:
             self.context.tasks.spawn(self._remove_later(silent), "second chance of silent nodes")
@@ -147,14 +147,14 @@ class ContainerEvents:
 
     def _settle(self, endpoint: Endpoint, before: str, info: NodeInfo) -> None:
         """Serve a node at its new address; the master has the former URI yet."""
-        endpoint.former_uris.add(before)
-        endpoint.former_uris.discard(self.context.addressing.advertised_uri(endpoint))
-        endpoint.unsettled = True
+        endpoint.note_moved(before, self.context.addressing.advertised_uri(endpoint))
         endpoint.mark_alive(info.pid, info.tcpros_port, self.context.now())
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)
-        log.info("%s is at %s now", endpoint.label, endpoint.place.address)
+        log.info(
+            "%s is at %s now", endpoint.label, endpoint.place.address, extra=endpoint.log_fields
+        )
 
     async def _adopt(self, arrived: Sequence[requests.Arrival]) -> int:
         return len((await self.adopter.adopt(arrived)).names) if arrived else 0

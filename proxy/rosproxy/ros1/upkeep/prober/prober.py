@@ -100,24 +100,24 @@ class Prober:
             await self._registrar.reconcile(endpoint)
         health.pid = pid
         if not self._leases.is_open(endpoint):
-            log.info("%s answers again", endpoint.label)
+            log.info("%s answers again", endpoint.label, extra=endpoint.log_fields)
             self._leases.open(endpoint)
             await self._resubscriber.remind(endpoint)
 
     def _report_down(self, endpoint: Endpoint, reason: str) -> None:
         if endpoint.registrations:
-            log.warning("%s does not answer: %s", endpoint.label, reason)
+            log.warning("%s does not answer: %s", endpoint.label, reason, extra=endpoint.log_fields)
             self._context.problems.add(endpoint.label, f"does not answer: {reason}", endpoint.port)
 
     def _end_if_unused(self, endpoint: Endpoint) -> None:
         """End the lease of an endpoint that nobody has needed for long enough."""
         now = self._context.now()
         if not policy.is_unused(endpoint):
-            endpoint.idle_since = None
+            endpoint.note_used()
             return
-        if endpoint.idle_since is None:
-            endpoint.idle_since = now
         lasts = policy.lease_lasts(endpoint, self._context.settings.linger)
-        if now - endpoint.idle_since >= lasts:
-            log.info("port %d is free again: %s", endpoint.port, endpoint.uri)
+        if endpoint.note_unused(now) >= lasts:
+            log.info(
+                "port %d is free again: %s", endpoint.port, endpoint.uri, extra=endpoint.log_fields
+            )
             self._leases.end(endpoint)

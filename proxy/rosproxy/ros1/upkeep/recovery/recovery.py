@@ -16,7 +16,6 @@ If ports are others after a start, look here: the log names each claim that was 
 import asyncio
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
@@ -165,12 +164,10 @@ class Recovery:
             await self._registrar.clean_up(endpoint)
             self._leases.end(endpoint)
             return
-        endpoint.tcpros_port, endpoint.trusted = info.tcpros_port, True
-        if endpoint.health.pid is None:
-            endpoint.health.pid = info.pid
+        endpoint.note_verified(info.pid, info.tcpros_port)
         self._leases.open(endpoint)
         address = endpoint.place.address
         addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
         if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
-            endpoint.place = replace(endpoint.place, named=address in addresses)
+            endpoint.note_named(address in addresses)
         await self._registrar.register_missing(endpoint, info)

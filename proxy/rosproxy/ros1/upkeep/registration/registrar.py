@@ -74,7 +74,7 @@ class Registrar:
         await asyncio.gather(*(self._updates.send_inside(e, t, []) for e, t in topics))
         await self.register([(e, held) for e in moved for held in e.registrations.values()])
         for endpoint in moved:
-            endpoint.unsettled = False
+            endpoint.note_settled()
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
         """Register what a node has and the master does not know of. Raises Unreachable."""
@@ -82,7 +82,12 @@ class Registrar:
         for held in found:
             self._context.registry.register(endpoint, held)
         if found:
-            log.info("%s: %d topics were not registered; they are now", endpoint.label, len(found))
+            log.info(
+                "%s: %d topics were not registered; they are now",
+                endpoint.label,
+                len(found),
+                extra=endpoint.log_fields,
+            )
             await self.register([(endpoint, held) for held in found])
 
     async def register_lost(self) -> None:
@@ -106,9 +111,14 @@ class Registrar:
         """Unregister a node that is gone at the master. Raises Unreachable."""
         started, held = self._context.now(), list(endpoint.registrations.values())
         await self._unregister(endpoint, held)
-        endpoint.health.cleaned, endpoint.health.cleaned_at = True, started
+        endpoint.health.note_cleaned(started)
         self._context.metrics.cleanups.inc()
-        log.info("cleaned up %s: %d registrations taken back", endpoint.label, len(held))
+        log.info(
+            "cleaned up %s: %d registrations taken back",
+            endpoint.label,
+            len(held),
+            extra=endpoint.log_fields,
+        )
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
         """Register a node again that was cleaned up and answers after all, as process ``pid``.
@@ -122,9 +132,14 @@ class Registrar:
         for held in list(endpoint.registrations.values()):
             if held not in kept and held.since < endpoint.health.cleaned_at:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
-        endpoint.health.pid, endpoint.health.cleaned = pid, False
+        endpoint.health.note_back(pid)
         await self.register([(endpoint, held) for held in kept])
-        log.info("%s is back: %d registrations made again", endpoint.label, len(kept))
+        log.info(
+            "%s is back: %d registrations made again",
+            endpoint.label,
+            len(kept),
+            extra=endpoint.log_fields,
+        )
 
     async def unregister_left_over(self, endpoint: Endpoint) -> None:
         """Take back what a former process left: topics that the node there does not have.
@@ -170,7 +185,13 @@ class Registrar:
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
         for held in ended:
-            log.info("%s of %s is no longer at %s", held.name, held.caller_id, endpoint.uri)
+            log.info(
+                "%s of %s is no longer at %s",
+                held.name,
+                held.caller_id,
+                endpoint.uri,
+                extra=endpoint.log_fields,
+            )
             self._context.registry.unregister(held.kind, held.name, held.caller_id)
 
     async def _unregister(self, endpoint: Endpoint, held: Sequence[Registration]) -> None:
@@ -188,10 +209,10 @@ class Registrar:
         registry, direct = self._context.registry, dict[str, str]()
         calls: list[policy.MethodCall] = []
         for name, (endpoint, uri) in former.items():
-            endpoint.former_uris.add(uri)
+            endpoint.note_former_uri(uri)
             if self._context.addressing.identify(uri) is None:
                 direct[name] = uri
-                endpoint.settles_at = self._context.now() + SETTLE_TIME
+                endpoint.expect_updates(self._context.now() + SETTLE_TIME)
             else:
                 service = self._context.addressing.advertised_service(endpoint)
                 held = endpoint.registrations.values()
