@@ -17,7 +17,7 @@ class Result:
     err: str
 
 
-async def run(*words: str, within: float = 30.0, **environment: str) -> Result:
+async def run(*words: str, within: float = 60.0, **environment: str) -> Result:
     """Run ``rosproxy`` with these words to its end."""
     command = [sys.executable, "-m", "rosproxy", *words]
     process = await asyncio.create_subprocess_exec(

@@ -25,8 +25,8 @@ NODE, OTHER_NODE, THIRD_NODE = "127.0.2.11", "127.0.2.12", "127.0.2.13"
 HOST = "127.0.3.1"
 """What outside knows the proxy's machine by."""
 
-PATIENCE = 5.0
-"""Seconds after which something awaited counts as missing."""
+PATIENCE = 30.0
+"""Seconds after which something awaited counts as missing, on however busy a machine."""
 
 
 async def until(condition: Callable[[], Any], what: str, within: float = PATIENCE) -> None:

@@ -61,7 +61,7 @@ class Process:
         """The log since the last start."""
         return "".join(self.log[self._before :])
 
-    def wait_for_log(self, text: str, within: float = 10.0) -> None:
+    def wait_for_log(self, text: str, within: float = 60.0) -> None:
         """Wait until a line of the log holds ``text``."""
         end = monotonic() + within
         while text not in self.text:
@@ -91,7 +91,7 @@ class Process:
         """Send a signal; the exit code and the seconds that it took."""
         started = monotonic()
         self._process.send_signal(number)
-        code = self._process.wait(10)
+        code = self._process.wait(60)
         took = monotonic() - started
         self._reader.join()
         return code, took

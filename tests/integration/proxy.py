@@ -9,7 +9,7 @@ from rosproxy.demo.fake_http import Where, free_ports, where
 from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings
-from tests.integration.net import HOST, PROXY, refuses, until
+from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until
 from tests.run_options import parse_settings
 
 PORTS = 8
@@ -72,7 +72,7 @@ class Proxy:
         """End; the second time nothing."""
         if not self._stopped:
             self._stopped = True
-            async with asyncio.timeout(5):
+            async with asyncio.timeout(PATIENCE):
                 await self.app.stop()
 
     def metric(self, name: str, /, **labels: str) -> float:

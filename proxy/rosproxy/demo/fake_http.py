@@ -23,7 +23,7 @@ Where = tuple[str, int]
 """Host and port."""
 ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
-CALL_SECONDS = 5.0
+CALL_SECONDS = 20.0
 """How long a call may take in all."""
 
 
@@ -96,10 +96,14 @@ def is_free(port: int, address: str = "") -> bool:
     return True
 
 
+PORTS = range(15000, 32000)
+"""Where `free_ports` looks: below the ephemeral range."""
+
+
 def free_ports(count: int, address: str = "") -> int:
-    """The first of `count` ports in a row that nobody uses; below the ephemeral range."""
+    """The first of `count` ports in a row among `PORTS` that nobody uses."""
     while True:
-        first = random.randrange(15000, 32000 - count)  # noqa: S311
+        first = random.randrange(PORTS.start, PORTS.stop - count)  # noqa: S311
         if all(is_free(port, address) for port in range(first, first + count)):
             return first
 

@@ -12,9 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 
-START_SECONDS = 15.0
+START_SECONDS = 60.0
 """How long it may take to start; a slow machine is no reason to fail."""
-STOP_SECONDS = 3.0
+STOP_SECONDS = 10.0
 """How long it may take to end when asked to, before it is killed."""
 
 

@@ -180,15 +180,15 @@ async def test_a_node_that_hangs_is_not_waited_for(
     monkeypatch.setattr(
         "rosproxy.ros1.upkeep.containers.events.YOUNG", -1.0
     )  # it is none that is just starting
-    proxy = await make_proxy(**PATIENT, probe_timeout=3.0)
+    proxy = await make_proxy(**PATIENT, probe_timeout=10.0)
     await node.publish(proxy.master)
     node.hang = True
     before = proxy.app.context.now()
     assert await news(proxy, gone=[NODE]) == (1, 0, 0)
-    assert proxy.app.context.now() - before < 1.5
+    assert proxy.app.context.now() - before < 9  # less than its probe may take
     assert not everything(master)
     node.hang = False  # the news was wrong
-    await until(lambda: master.holds("publishers", "/chatter"), "it is registered again", 8)
+    await until(lambda: master.holds("publishers", "/chatter"), "it is registered again")
 
 
 async def test_a_node_that_has_just_registered_may_take_its_time(
@@ -202,7 +202,7 @@ async def test_a_node_that_has_just_registered_may_take_its_time(
     assert await news(proxy, gone=[NODE]) == (0, 0, 0)
     assert not await refuses(proxy.lease(node))
     assert everything(master)
-    await until(lambda: not everything(master), "it had its chance", 5)
+    await until(lambda: not everything(master), "it had its chance")
 
 
 async def test_its_open_connections_end(make_proxy: MakeProxy, node: FakeNode) -> None:
@@ -252,7 +252,7 @@ async def test_a_master_that_is_away_hears_of_it_later(
     assert reply.body.endswith(b"try again\n")
     assert await refuses(lease)
     await master.start()
-    await until(lambda: not everything(master), "it is unregistered by itself", 8)
+    await until(lambda: not everything(master), "it is unregistered by itself")
     assert await news(proxy, gone=[NODE]) == (0, 0, 0)
 
 
@@ -364,7 +364,7 @@ async def test_a_master_that_is_away_is_told_of_the_move_later(
     reply = await post(proxy, "/containers", json.dumps({"moved": {NODE: OTHER_NODE}}))
     assert reply.status == 503
     await master.start()
-    await until(lambda: not container.endpoint.unsettled, "it is settled", 8)
+    await until(lambda: not container.endpoint.unsettled, "it is settled")
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
 
 

@@ -31,7 +31,7 @@ def failed(scenario):
 
 
 def test_the_short_demo_keeps_every_promise():
-    run = finish(60, "--json")
+    run = finish(120, "--json")
     outcome = json.loads(run.stdout)
     broken = [check for check in outcome["checks"] if not check["kept"]]
     assert (broken, outcome["log"], run.stderr) == ([], [], "")
@@ -65,11 +65,11 @@ async def test_a_proxy_that_comes_back_as_another_is_noticed(monkeypatch):
 
     async def start_elsewhere(self):
         if self.state == "killed":
+            monkeypatch.setattr("rosproxy.demo.scenario.PATIENCE", 2.0)
             self.options = ["--bind=127.0.2.1", *self.options]
         return await start(self)
 
     monkeypatch.setattr(ProxyProcess, "start", start_elsewhere)
-    monkeypatch.setattr("rosproxy.demo.scenario.PATIENCE", 2.0)
     scenario = Scenario(4)
     await scenario.play()
     assert [check.detail for check in failed(scenario)] == ["messages flow again: not within 2 s"]
@@ -102,7 +102,7 @@ def test_an_interrupted_demo_leaves_no_process(stop):
         next(line for line in lines if "service calls" in line)
         assert master in _commands()
         demo.send_signal(stop)
-        _, errors = demo.communicate(timeout=20)
+        _, errors = demo.communicate(timeout=60)
     assert (demo.returncode, errors) == (130, "interrupted; all processes ended\n")
     assert master not in _commands()
 
@@ -119,7 +119,7 @@ def _commands():
 
 
 def test_wrong_options_are_refused():
-    run = finish(20, "--seconds", "0")
+    run = finish(60, "--seconds", "0")
     assert run.returncode == 2
     assert "--seconds" in run.stderr
 
@@ -132,8 +132,8 @@ KILLED = 100.0
     [
         ({1: 98.0, 2: 99.0}, [1, 2], True, "sent 2, received 2"),
         ({1: 98.0, 2: 99.0}, [1], False, "lost 1, duplicated 0"),
-        ({1: 98.0, 2: 99.95, 3: 100.01}, [1], True, "2 on the way when the proxy was killed"),
-        ({1: 98.0, 2: 99.85}, [1], False, "lost 1"),
+        ({1: 98.0, 2: 99.95, 3: 100.1}, [1], True, "2 on the way when the proxy was killed"),
+        ({1: 98.0, 2: 99.6}, [1], False, "lost 1"),
         ({1: 98.0, 2: 101.0}, [1], False, "lost 1"),
         ({1: 98.0}, [1, 1], False, "lost 0, duplicated 1"),
         ({1: 98.0}, [1, 2], False, "sent 1, received 2"),

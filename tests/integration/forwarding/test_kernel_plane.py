@@ -17,6 +17,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.context import Context, make_context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from tests.integration.kernel_fake import FakeTools
+from tests.integration.net import PATIENCE
 from tests.run_options import parse_settings
 
 NODE = "192.0.2.5"
@@ -98,7 +99,7 @@ async def bench(sound: None) -> AsyncIterator[Bench]:
 
 
 async def until(check: Callable[[], bool]) -> None:
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(PATIENCE):
         while not check():
             await asyncio.sleep(0.01)
 

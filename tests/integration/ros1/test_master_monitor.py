@@ -35,7 +35,7 @@ async def test_odd_answers_of_the_master_to_the_proxys_own_calls_are_survived(
 
 
 async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.ros1.clients.master.MASTER_TIMEOUT", 0.4)
+    monkeypatch.setattr("rosproxy.ros1.clients.master.MASTER_TIMEOUT", 2.0)
     master.answers["getSystemState"] = End.HANG
     proxy = await make_proxy()
     started = asyncio.get_running_loop().time()
@@ -44,7 +44,7 @@ async def test_calls_that_wait_for_recovery_fail_together(master, make_proxy, no
         for wire in wires:
             await wire.send(post(xml("registerPublisher", "/talker", "/t", "*", node.uri)))
         assert [await wire.end() for wire in wires] == ["reset"] * 8
-    assert asyncio.get_running_loop().time() - started < 1.5
+    assert asyncio.get_running_loop().time() - started < 14  # one after another: 16
     del master.answers["getSystemState"]
     assert (await node.publish(proxy.master))[0] == 1
 

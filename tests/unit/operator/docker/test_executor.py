@@ -46,7 +46,7 @@ class Host:
     async def start(self, *groups: Group) -> None:
         """Begin, and wait until something is over."""
         self.begin(*groups)
-        await asyncio.wait_for(self.finished.wait(), 1)
+        await asyncio.wait_for(self.finished.wait(), 30)
 
     def begin(self, *groups: Group) -> None:
         self.finished.clear()

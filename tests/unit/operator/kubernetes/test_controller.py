@@ -59,7 +59,7 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     await asyncio.gather(one.task, return_exceptions=True)
 
 
-async def until(true: Callable[[], bool], seconds: float = 10.0) -> None:
+async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end
