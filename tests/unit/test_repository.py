@@ -76,7 +76,7 @@ def test_architecture_names_what_exists() -> None:
     named = set(re.findall(r"`([\w./]+(?:\.py|/))`", text))
     roots = [ROOT, ROOT / "proxy/rosproxy", ROOT / "operator/rosproxy_operator"]
     roots += [roots[2] / "docker/planner", roots[2] / "kubernetes", roots[2] / "docker"]
-    roots += [roots[2] / "kubernetes/planner"]
+    roots += [roots[2] / "kubernetes" / room for room in ("planner", "resources", "status")]
     assert len(named) > 60
     assert not {path for path in named if not any((root / path).exists() for root in roots)}
 
