@@ -13,6 +13,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 _USERS = Path("/run/lock/rosproxy-tests-engine")
+_DOOR = Path("/run/lock/rosproxy-tests-engine-door")
 
 
 def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
@@ -72,17 +73,21 @@ def answers() -> bool:
 def running_engine(log: Path) -> Iterator[None]:
     """Use the engine that runs; start one where none does.
 
-    Several processes may be in here at the same time. The one that has started the engine stops it
-    after waiting for the others.
+    Several processes may be in here at the same time: each holds a shared lock as long as it uses
+    the engine. The one that has started it waits for the others before it stops it; who comes
+    meanwhile waits at the door, and starts one of its own.
     """
-    with _USERS.open("w") as users:
-        fcntl.flock(users, fcntl.LOCK_EX)
+    with _DOOR.open("w") as door, _USERS.open("w") as users:
+        fcntl.flock(door, fcntl.LOCK_EX)
         own = None if answers() else _Daemon(log)
         fcntl.flock(users, fcntl.LOCK_SH)
+        fcntl.flock(door, fcntl.LOCK_UN)
         try:
             yield
         finally:
+            fcntl.flock(users, fcntl.LOCK_UN)
             if own:
+                fcntl.flock(door, fcntl.LOCK_EX)
                 fcntl.flock(users, fcntl.LOCK_EX)
                 own.stop()
 
