@@ -7,8 +7,8 @@ import pytest
 from scripts.custom_resource_docs import custom_resource
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import names
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import (
     Name,
     NodeState,
     Pod,
@@ -16,8 +16,8 @@ from rosproxy_operator.kubernetes.planner.model import (
     ProxyReport,
     ProxyService,
 )
-from rosproxy_operator.kubernetes.planner.spec import MOST_NAME, MOST_PORTS, rosproxy
-from rosproxy_operator.kubernetes.planner.status import status_of
+from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, rosproxy
+from rosproxy_operator.kubernetes.status.status import status_of
 from tests.chart.chart import Json
 
 DEFINITION = custom_resource()

@@ -11,7 +11,7 @@ import yaml  # type: ignore[import-untyped]
 from scripts import custom_resource_docs
 
 from rosproxy import __version__
-from rosproxy_operator.kubernetes.planner import names
+from rosproxy_operator.kubernetes.resources import names
 from tests.chart.chart import CHART, ROOT, Json, objects, of_kind, parse
 
 README = CHART / "README.md"

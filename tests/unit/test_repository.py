@@ -76,7 +76,7 @@ def test_architecture_names_what_exists() -> None:
     named = set(re.findall(r"`([\w./]+(?:\.py|/))`", text))
     roots = [ROOT, ROOT / "proxy/rosproxy", ROOT / "operator/rosproxy_operator"]
     roots += [roots[2] / "docker/planner", roots[2] / "kubernetes", roots[2] / "docker"]
-    roots += [roots[2] / "kubernetes/planner"]
+    roots += [roots[2] / "kubernetes" / room for room in ("planner", "resources", "status")]
     assert len(named) > 60
     assert not {path for path in named if not any((root / path).exists() for root in roots)}
 
@@ -129,7 +129,7 @@ def reference() -> str:
 def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import DockerMetrics
-    from rosproxy_operator.docker.planner.label_values import LABELS
+    from rosproxy_operator.docker.planner.labels.values import LABELS
 
     options = [opt for option in main.commands["docker"].params for opt in option.opts]
     metrics = [family.name for family in DockerMetrics().registry.collect()]
@@ -151,7 +151,7 @@ def test_reference_lists_the_engine_calls() -> None:
 def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import ClusterMetrics
-    from rosproxy_operator.kubernetes.planner import names
+    from rosproxy_operator.kubernetes.resources import names
 
     options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]
     labels = [names.INJECT, names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT]

@@ -16,7 +16,7 @@ from rosproxy_operator.docker import host
 from rosproxy_operator.docker.client import DockerClient, Json
 from rosproxy_operator.docker.engine_json import Details, endpoints, read_container, read_network
 from rosproxy_operator.docker.inspector import PATIENCE, Inspector
-from rosproxy_operator.docker.planner.labels import LabelReading, master_hosts, read_labels
+from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Container,

@@ -29,8 +29,8 @@ from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, refusal, unreachable
-from rosproxy_operator.kubernetes.planner.model import Json, Name
-from rosproxy_operator.kubernetes.planner.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
 
 Found = dict[str, Any]
 Timeout = tuple[float, float]

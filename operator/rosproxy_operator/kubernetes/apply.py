@@ -27,9 +27,9 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Failure, Json, Name
-from rosproxy_operator.kubernetes.planner.names import CONTAINER, KIND, is_own
 from rosproxy_operator.kubernetes.proxy_sync import address_of
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Json, Name
+from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, is_own
 
 log = logging.getLogger(__name__)
 

@@ -22,10 +22,10 @@ from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.events import stamp
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
 

@@ -9,12 +9,12 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Json, Name
-from rosproxy_operator.kubernetes.planner.names import is_own
-from rosproxy_operator.kubernetes.planner.objects import node as parse_node
-from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_proxy_pod
 from rosproxy_operator.kubernetes.planner.selection import chosen
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json, Name
+from rosproxy_operator.kubernetes.resources.names import is_own
+from rosproxy_operator.kubernetes.resources.objects import node as parse_node
+from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
+from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from typing import Any
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.actions import Emit
-from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.resources.model import Name
 
 COMPONENT = "rosproxy-operator"
 COUNT_EVERY = 60.0

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import kopf
 
 from rosproxy_operator.kubernetes.event_filter import EventFilter
-from rosproxy_operator.kubernetes.planner.names import GROUP, INJECT, PLURAL, VERSION
+from rosproxy_operator.kubernetes.resources.names import GROUP, INJECT, PLURAL, VERSION
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 
 WIRE = "wire"

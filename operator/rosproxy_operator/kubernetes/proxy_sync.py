@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable, Mapping
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
-from rosproxy_operator.kubernetes.planner.model import ProxyPod, ProxyReport
-from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT
-from rosproxy_operator.kubernetes.planner.proxy_status import no_answer, report
+from rosproxy_operator.kubernetes.resources.model import ProxyPod, ProxyReport
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT
+from rosproxy_operator.kubernetes.resources.proxy_status import no_answer, report
 
 log = logging.getLogger(__name__)
 

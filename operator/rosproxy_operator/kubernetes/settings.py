@@ -10,8 +10,8 @@ from typing import Any
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import SettingError
-from rosproxy_operator.kubernetes.planner.model import Name
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.resources.model import Name
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)

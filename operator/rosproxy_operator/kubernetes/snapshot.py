@@ -16,8 +16,9 @@ from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
-from rosproxy_operator.kubernetes.planner.fields import InvalidField
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.selection import label_selector
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
     Name,
@@ -26,13 +27,12 @@ from rosproxy_operator.kubernetes.planner.model import (
     ProxyService,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.planner.objects import node as parse_node
-from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.planner.objects import proxy_pod as parse_proxy_pod
-from rosproxy_operator.kubernetes.planner.objects import service as parse_service
-from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
-from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.planner.spec import invalid, rosproxy
+from rosproxy_operator.kubernetes.resources.objects import node as parse_node
+from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
+from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
+from rosproxy_operator.kubernetes.resources.objects import service as parse_service
+from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
+from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
 
 T = TypeVar("T")
 AT_ONCE = 8

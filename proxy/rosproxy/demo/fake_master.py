@@ -19,14 +19,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rosproxy.demo.fake_http import (
-    Answer,
-    FakeHttpServer,
-    FakeRequest,
-    bracketed,
-    call,
-    value,
-)
+from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, bracketed, call, value
 
 Triple = tuple[int, str, Any]
 Provider = tuple[str, str]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.masters import ALIAS
+from rosproxy_operator.docker.planner.labels.masters import ALIAS
 from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Sandbox
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 

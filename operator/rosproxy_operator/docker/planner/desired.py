@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.label_values import DATA_PLANE
-from rosproxy_operator.docker.planner.membership import BUILT_IN
+from rosproxy_operator.docker.planner.labels.networks import BUILT_IN
+from rosproxy_operator.docker.planner.labels.values import DATA_PLANE
 from rosproxy_operator.docker.planner.model import (
     Desired,
     HostState,

@@ -16,8 +16,8 @@ from rosproxy_operator.docker.planner.aliases import Aliases, assign
 from rosproxy_operator.docker.planner.allocation import GivenRanges, allocate, refused
 from rosproxy_operator.docker.planner.context import PlanContext
 from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.labels import LabelReading, find_members
-from rosproxy_operator.docker.planner.masters import unresolved
+from rosproxy_operator.docker.planner.labels.masters import unresolved
+from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import (
     Desired,
     HostState,

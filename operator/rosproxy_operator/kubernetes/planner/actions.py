@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from rosproxy_operator.kubernetes.planner.model import Json, Name
+from rosproxy_operator.kubernetes.resources.model import Json, Name
 
 
 @dataclass(frozen=True, slots=True)

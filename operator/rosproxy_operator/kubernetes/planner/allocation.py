@@ -19,11 +19,11 @@ from rosproxy_operator.common.allocation import (
     overlap,
     within,
 )
-from rosproxy_operator.kubernetes.planner.model import ProxyPlace, ProxyPod
-from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT, MASTER_PORT
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
 from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves, short
+from rosproxy_operator.kubernetes.resources.model import ProxyPlace, ProxyPod
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,14 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from ipaddress import ip_address, ip_network
 
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     ClusterSnapshot,
     Pod,
     ProxyPod,
     ProxyReport,
 )
-from rosproxy_operator.kubernetes.planner.state import ClusterState
 
 UNSEEN = 15.0
 """Seconds after which an address in a node's pod network is nobody's that no pod was seen with.

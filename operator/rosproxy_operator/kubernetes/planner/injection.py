@@ -11,7 +11,7 @@ from typing import Any
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterFinding,
     Json,
@@ -20,14 +20,14 @@ from rosproxy_operator.kubernetes.planner.model import (
     Reference,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.planner.names import (
+from rosproxy_operator.kubernetes.resources.names import (
     INJECT,
     MASTER_PORT,
     MASTER_URI,
     master_uri,
     service_id,
 )
-from rosproxy_operator.kubernetes.planner.values import part, parts, word, words
+from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 
 VARIABLE = "ROS_MASTER_URI"
 IP_VARIABLE = "ROS_IP"

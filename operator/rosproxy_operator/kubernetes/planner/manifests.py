@@ -9,8 +9,9 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.kubernetes.planner.model import ClusterNode, Json, RosProxy
-from rosproxy_operator.kubernetes.planner.names import (
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.resources.model import ClusterNode, Json, RosProxy
+from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
     ADVERTISE_HOST,
     API_VERSION,
@@ -25,7 +26,6 @@ from rosproxy_operator.kubernetes.planner.names import (
     proxy_name,
     service_name,
 )
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 
 USER = 10001
 """The image's own user."""

@@ -13,20 +13,10 @@ from dataclasses import dataclass, field, replace
 
 from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.kubernetes.planner import departures, events
-from rosproxy_operator.kubernetes.planner import status as statuses
+from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.injection import unwired
-from rosproxy_operator.kubernetes.planner.model import (
-    ClusterFinding,
-    ClusterSnapshot,
-    InvalidRosProxy,
-    Json,
-    NodeState,
-    ProxyPlace,
-    RosProxy,
-)
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
     advertise_host,
@@ -43,6 +33,17 @@ from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.view import finding, view
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
+    ClusterSnapshot,
+    InvalidRosProxy,
+    Json,
+    NodeState,
+    ProxyPlace,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.status import events
+from rosproxy_operator.kubernetes.status import status as statuses
 
 
 @dataclass(frozen=True, slots=True)

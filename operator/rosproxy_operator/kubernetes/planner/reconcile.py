@@ -30,7 +30,11 @@ from rosproxy_operator.kubernetes.planner.manifests import (
     proxy_pod,
     service,
 )
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.retries import Retries, Task
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.planner.view import View, serves
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     ClusterSnapshot,
     Name,
@@ -39,12 +43,8 @@ from rosproxy_operator.kubernetes.planner.model import (
     ProxyService,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.planner.names import proxy_id, service_id
-from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.planner.values import host_problem
-from rosproxy_operator.kubernetes.planner.view import View, serves
+from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id
+from rosproxy_operator.kubernetes.resources.values import host_problem
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""

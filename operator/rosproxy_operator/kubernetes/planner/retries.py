@@ -8,7 +8,7 @@ state; what nobody asks for any more has had its effect and is forgotten.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from rosproxy_operator.kubernetes.planner.model import Failure, Name
+from rosproxy_operator.kubernetes.resources.model import Failure, Name
 
 LAG = 3.0
 """Seconds after which something that was done must be seen in the API server's lists."""

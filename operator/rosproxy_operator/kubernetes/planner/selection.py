@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,
     Pod,
@@ -12,7 +12,7 @@ from rosproxy_operator.kubernetes.planner.model import (
     RosProxySpec,
     Selector,
 )
-from rosproxy_operator.kubernetes.planner.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
+from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
 
 OFF = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""

@@ -18,15 +18,15 @@ from rosproxy_operator.common.allocation import (
     overlap,
     within,
 )
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
+from rosproxy_operator.kubernetes.planner.view import View, finding, has_ports, place_of, serves
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,
     ProxyPlace,
     ProxyPod,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
-from rosproxy_operator.kubernetes.planner.view import View, finding, has_ports, place_of, serves
 
 TRIED_FOR = 60.0
 """Seconds for which it is told that a proxy got other ports than were tried first."""

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterSnapshot,
     Name,
@@ -19,8 +20,7 @@ from rosproxy_operator.kubernetes.planner.model import (
     RosProxy,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.names import KIND, is_own, proxy_id
-from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.resources.names import KIND, is_own, proxy_id
 
 K = TypeVar("K")
 V = TypeVar("V")

@@ -18,14 +18,14 @@ from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
-from rosproxy_operator.kubernetes.planner.fields import InvalidField
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
-from rosproxy_operator.kubernetes.planner.model import Json, Pod, RosProxy
-from rosproxy_operator.kubernetes.planner.names import master_uri, service_id
-from rosproxy_operator.kubernetes.planner.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.planner.objects import service as parse_service
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
-from rosproxy_operator.kubernetes.planner.spec import rosproxy
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources.model import Json, Pod, RosProxy
+from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
+from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
+from rosproxy_operator.kubernetes.resources.objects import service as parse_service
+from rosproxy_operator.kubernetes.resources.spec import rosproxy
 
 log = logging.getLogger(__name__)
 

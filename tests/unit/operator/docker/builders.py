@@ -7,7 +7,7 @@ from typing import Any
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
-from rosproxy_operator.docker.planner.labels import find_members, read_labels
+from rosproxy_operator.docker.planner.labels.members import find_members, read_labels
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import master_hosts, read_labels
+from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
 from tests.unit.operator.docker.builders import (
     ENABLED,

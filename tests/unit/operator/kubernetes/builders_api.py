@@ -3,7 +3,7 @@
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     MasterSpec,
     Name,
     NodeState,
@@ -15,7 +15,7 @@ from rosproxy_operator.kubernetes.planner.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.names import own_labels, proxy_name, service_name
+from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_name, service_name
 
 Obj = dict[str, Any]
 

@@ -7,8 +7,8 @@ import contextlib
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from rosproxy_operator.kubernetes.planner import names
-from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     NAMESPACE,

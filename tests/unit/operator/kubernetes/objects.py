@@ -6,10 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import manifests, names, objects
+from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,
     ClusterSnapshot,
@@ -22,9 +26,6 @@ from rosproxy_operator.kubernetes.planner.model import (
     RosProxySpec,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.planner.state import ClusterState
 
 SETTINGS = ClusterSettings(image="rosproxy:1")
 STAMP = "2026-01-01T00:00:00Z"

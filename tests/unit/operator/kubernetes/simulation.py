@@ -9,9 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from rosproxy_operator.kubernetes.planner import names
-from rosproxy_operator.kubernetes.planner import objects as parse
-from rosproxy_operator.kubernetes.planner import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -23,10 +20,13 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Failure, Name, ProxyReport
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources import objects as parse
+from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Name, ProxyReport
 
 NAMESPACE = "ros"
 BAD_IMAGE = "no-such-image"

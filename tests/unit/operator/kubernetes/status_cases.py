@@ -3,8 +3,14 @@
 from typing import Any
 
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.kubernetes.planner.model import Json, Name, NodeState, ProxyService, RosProxy
-from rosproxy_operator.kubernetes.planner.status import findings, status_of
+from rosproxy_operator.kubernetes.resources.model import (
+    Json,
+    Name,
+    NodeState,
+    ProxyService,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.status.status import findings, status_of
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, ROBOT, STAMP, rosproxy
 
 SERVICE = ProxyService(Name("robots", "arm"), "uid-arm", "uid-service", CLUSTER_IP, "f")

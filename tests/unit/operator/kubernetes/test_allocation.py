@@ -6,17 +6,17 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     MasterSpec,
     Name,
     ProxyPlace,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
-from rosproxy_operator.kubernetes.planner.state import ClusterState
 from tests.unit.operator.kubernetes.objects import (
     RANGE,
     ROBOT,

@@ -8,8 +8,8 @@ import pytest
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, missing_rule, refusal
-from rosproxy_operator.kubernetes.planner.model import Name
-from rosproxy_operator.kubernetes.planner.names import own_labels
+from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
 
 FORBIDDEN = (

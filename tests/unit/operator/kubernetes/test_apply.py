@@ -20,9 +20,9 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, Name, RosProxy
-from rosproxy_operator.kubernetes.planner.names import own_labels
-from rosproxy_operator.kubernetes.planner.spec import rosproxy
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name, RosProxy
+from rosproxy_operator.kubernetes.resources.names import own_labels
+from rosproxy_operator.kubernetes.resources.spec import rosproxy
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, proxy_obj, rosproxy_obj
 
@@ -275,7 +275,7 @@ async def test_a_retired_proxy_that_is_dead_is_deleted_all_the_same(
 
 
 async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
-    from rosproxy_operator.kubernetes.planner.objects import proxy_pod
+    from rosproxy_operator.kubernetes.resources.objects import proxy_pod
 
     obj = proxy_obj(status={"phase": "Running", "podIP": ip})
     obj["spec"]["containers"][0]["env"] = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}]

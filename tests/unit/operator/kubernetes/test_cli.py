@@ -6,7 +6,7 @@ from click.testing import CliRunner, Result
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator import cli
-from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 
 HOOK = ["--webhook-bind=0.0.0.0:9443"]

@@ -15,8 +15,8 @@ from rosproxy_operator.kubernetes import controller as module
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from tests.unit.operator.kubernetes.api_server import ApiServer

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 from rosproxy_operator.kubernetes.planner.departures import AGAIN, REMEMBERED, UNSEEN, gone, waits
-from rosproxy_operator.kubernetes.planner.model import ClusterSnapshot, ProxyReport
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyReport
 from tests.unit.operator.kubernetes.objects import look, node, observed, pod, proxy, rosproxy
 
 PROXY = "uid-proxy-robot-one"

@@ -8,8 +8,8 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.events import LONGEST, MOST, QUIET, results, warnings
-from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Name, Reference
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
+from rosproxy_operator.kubernetes.status.events import LONGEST, MOST, QUIET, results, warnings
 from tests.unit.operator.kubernetes.builders_api import proxy_obj, rosproxy
 
 ARM = Name("robots", "arm")

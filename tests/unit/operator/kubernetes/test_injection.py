@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner import objects
 from rosproxy_operator.kubernetes.planner.injection import MIRROR, Wiring, unwired, wire
-from rosproxy_operator.kubernetes.planner.model import ELSEWHERE
+from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.model import ELSEWHERE
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, NAMESPACE, URI, pod, rosproxy
 
 MASTER = {"name": "ROS_MASTER_URI", "value": URI}

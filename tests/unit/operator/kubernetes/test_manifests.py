@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import manifests, objects
+from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
-from rosproxy_operator.kubernetes.planner.model import Json, MasterSpec
+from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 

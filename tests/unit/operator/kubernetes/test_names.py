@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner import names
-from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import Name
 
 LABEL = st.from_regex(r"[a-z0-9]([-a-z0-9]{0,44}[a-z0-9])?", fullmatch=True)
 SUBDOMAIN = st.lists(LABEL, min_size=1, max_size=5).map(".".join)

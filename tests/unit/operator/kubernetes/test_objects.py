@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
-from rosproxy_operator.kubernetes.planner.model import ELSEWHERE, Name
-from rosproxy_operator.kubernetes.planner.objects import node, pod, proxy_pod, service
-from rosproxy_operator.kubernetes.planner.proxy_status import RECENT, no_answer, report
-from rosproxy_operator.kubernetes.planner.values import host_problem
+from rosproxy_operator.kubernetes.resources.model import ELSEWHERE, Name
+from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
+from rosproxy_operator.kubernetes.resources.proxy_status import RECENT, no_answer, report
+from rosproxy_operator.kubernetes.resources.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
     CLUSTER_IP,
     NAMESPACE,

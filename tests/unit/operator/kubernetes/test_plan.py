@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.actions import (
     CreateProxy,
     CreateService,
@@ -15,14 +14,15 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Emit,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     ClusterSnapshot,
     InvalidRosProxy,
     MasterSpec,
     Name,
 )
-from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.planner.api_objects import PodObject
-from rosproxy_operator.kubernetes.planner.fields import lenient
-from rosproxy_operator.kubernetes.planner.model import Stuck
-from rosproxy_operator.kubernetes.planner.pod_failures import stuck as stuck_by_status
-from rosproxy_operator.kubernetes.planner.pod_failures import stuck_by_event
+from rosproxy_operator.kubernetes.resources.api_objects import PodObject
+from rosproxy_operator.kubernetes.resources.fields import lenient
+from rosproxy_operator.kubernetes.resources.model import Stuck
+from rosproxy_operator.kubernetes.resources.pod_failures import stuck as stuck_by_status
+from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 
 NO_PORTS = (
     "0/2 nodes are available: 1 node(s) didn't have free ports for the requested pod ports, 1 "

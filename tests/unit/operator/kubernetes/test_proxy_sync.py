@@ -13,9 +13,9 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.kubernetes import proxy_sync
-from rosproxy_operator.kubernetes.planner.model import ProxyPod
-from rosproxy_operator.kubernetes.planner.objects import proxy_pod
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.resources.model import ProxyPod
+from rosproxy_operator.kubernetes.resources.objects import proxy_pod
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
 UP = {"master": {"up": True}, "nodes": []}

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from rosproxy_operator.kubernetes.planner import names
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, CreateService, PatchStatus
-from rosproxy_operator.kubernetes.planner.model import Failure, Name
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.model import Failure, Name
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     complete,

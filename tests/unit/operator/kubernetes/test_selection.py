@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner.model import ClusterNode, Name, Selector
-from rosproxy_operator.kubernetes.planner.names import own_labels
 from rosproxy_operator.kubernetes.planner.selection import (
     chosen,
     label_selector,
@@ -17,6 +15,8 @@ from rosproxy_operator.kubernetes.planner.selection import (
     nobody,
     on_node,
 )
+from rosproxy_operator.kubernetes.resources.model import ClusterNode, Name, Selector
+from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 
 INJECT = "rosproxy.io/inject"

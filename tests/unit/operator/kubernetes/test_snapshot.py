@@ -6,7 +6,7 @@ import pytest
 
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
-from rosproxy_operator.kubernetes.planner.model import Name, Stuck
+from rosproxy_operator.kubernetes.resources.model import Name, Stuck
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader, read_master
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (

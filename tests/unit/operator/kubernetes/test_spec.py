@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.fields import InvalidField
-from rosproxy_operator.kubernetes.planner.model import Advertise, MasterSpec, Name, Selector
-from rosproxy_operator.kubernetes.planner.spec import RESOURCES, invalid, rosproxy
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources.model import Advertise, MasterSpec, Name, Selector
+from rosproxy_operator.kubernetes.resources.spec import RESOURCES, invalid, rosproxy
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, rosproxy_obj
 
 

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.conditions import LONGEST
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     NodeState,
     ProxyReport,
@@ -16,7 +15,8 @@ from rosproxy_operator.kubernetes.planner.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.status import (
+from rosproxy_operator.kubernetes.status.conditions import LONGEST
+from rosproxy_operator.kubernetes.status.status import (
     MOST_NAMES,
     MOST_NODES,
     invalid_finding,

@@ -4,12 +4,12 @@ import copy
 from collections.abc import Iterator
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner import names, objects
-from rosproxy_operator.kubernetes.planner import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Name, ProxyPlace, ProxyPod
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, ProxyPlace, ProxyPod
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     SETTINGS,

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Failure,
     InvalidRosProxy,
@@ -17,7 +17,7 @@ from rosproxy_operator.kubernetes.planner.model import (
     RosProxy,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.names import ADMIN_PORT, KIND
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, KIND
 
 NOT_ADMITTED = "ProxyNotAdmitted"
 CONFLICT = "PortConflict"

@@ -18,15 +18,15 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane, SettingError, parse_range
-from rosproxy_operator.kubernetes.planner.api_objects import ObjectFields
-from rosproxy_operator.kubernetes.planner.fields import (
+from rosproxy_operator.kubernetes.resources.api_objects import ObjectFields
+from rosproxy_operator.kubernetes.resources.fields import (
     ApiFields,
     InvalidField,
     invalid_field,
     lenient,
     strict,
 )
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
     InvalidRosProxy,
     Json,
@@ -36,8 +36,8 @@ from rosproxy_operator.kubernetes.planner.model import (
     RosProxySpec,
     Selector,
 )
-from rosproxy_operator.kubernetes.planner.names import service_id
-from rosproxy_operator.kubernetes.planner.values import (
+from rosproxy_operator.kubernetes.resources.names import service_id
+from rosproxy_operator.kubernetes.resources.values import (
     is_label,
     is_label_key,
     is_label_value,

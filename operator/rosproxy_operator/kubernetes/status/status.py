@@ -5,7 +5,17 @@ from typing import TypeGuard
 
 from rosproxy.telemetry.text import clean, shorten
 from rosproxy_operator.common.problem import Problem, bounded
-from rosproxy_operator.kubernetes.planner.conditions import (
+from rosproxy_operator.kubernetes.resources.model import (
+    InvalidRosProxy,
+    Json,
+    NodeState,
+    ProxyReport,
+    ProxyService,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.resources.names import master_uri
+from rosproxy_operator.kubernetes.resources.values import number, parts, word
+from rosproxy_operator.kubernetes.status.conditions import (
     DEGRADED,
     READY,
     Condition,
@@ -14,17 +24,7 @@ from rosproxy_operator.kubernetes.planner.conditions import (
     serving,
     verdicts,
 )
-from rosproxy_operator.kubernetes.planner.findings import findings, invalid_finding, of_node
-from rosproxy_operator.kubernetes.planner.model import (
-    InvalidRosProxy,
-    Json,
-    NodeState,
-    ProxyReport,
-    ProxyService,
-    RosProxy,
-)
-from rosproxy_operator.kubernetes.planner.names import master_uri
-from rosproxy_operator.kubernetes.planner.values import number, parts, word
+from rosproxy_operator.kubernetes.status.findings import findings, invalid_finding, of_node
 
 __all__ = ["findings", "invalid_finding", "status_of", "status_of_invalid"]
 

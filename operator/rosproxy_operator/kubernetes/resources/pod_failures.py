@@ -6,14 +6,14 @@ The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes
 import re
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.planner.api_objects import (
+from rosproxy_operator.kubernetes.resources.api_objects import (
     ContainerStatus,
     ObjectCondition,
     PodStatus,
     Terminated,
 )
-from rosproxy_operator.kubernetes.planner.model import Stuck
-from rosproxy_operator.kubernetes.planner.names import CONTAINER
+from rosproxy_operator.kubernetes.resources.model import Stuck
+from rosproxy_operator.kubernetes.resources.names import CONTAINER
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the

@@ -11,9 +11,9 @@ from rosproxy_operator.kubernetes.planner.actions import (
     Emit,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.model import ClusterFinding, Json, Reference, RosProxy
-from rosproxy_operator.kubernetes.planner.names import API_VERSION, KIND, PORT_RANGE
-from rosproxy_operator.kubernetes.planner.values import part, word
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
+from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, PORT_RANGE
+from rosproxy_operator.kubernetes.resources.values import part, word
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""

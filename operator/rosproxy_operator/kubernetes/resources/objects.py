@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import SettingError, parse_range
-from rosproxy_operator.kubernetes.planner import names
-from rosproxy_operator.kubernetes.planner.api_objects import (
+from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.api_objects import (
     Metadata,
     NodeObject,
     ObjectCondition,
@@ -16,8 +16,8 @@ from rosproxy_operator.kubernetes.planner.api_objects import (
     PodSpec,
     ServiceObject,
 )
-from rosproxy_operator.kubernetes.planner.fields import lenient
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.fields import lenient
+from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterNode,
     Json,
@@ -26,7 +26,7 @@ from rosproxy_operator.kubernetes.planner.model import (
     ProxyPod,
     ProxyService,
 )
-from rosproxy_operator.kubernetes.planner.pod_failures import stuck
+from rosproxy_operator.kubernetes.resources.pod_failures import stuck
 
 VARIABLE = "ROS_MASTER_URI"
 

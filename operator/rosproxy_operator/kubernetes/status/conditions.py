@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 from rosproxy.telemetry.text import plural
 from rosproxy_operator.common.problem import Problem, bounded
-from rosproxy_operator.kubernetes.planner.findings import CONFLICT, EXHAUSTED, NO_MASTER
-from rosproxy_operator.kubernetes.planner.model import (
+from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Json,
     NodeState,
     RosProxy,
     Stuck,
 )
-from rosproxy_operator.kubernetes.planner.names import INJECT
-from rosproxy_operator.kubernetes.planner.values import parts, word
+from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.resources.values import parts, word
+from rosproxy_operator.kubernetes.status.findings import CONFLICT, EXHAUSTED, NO_MASTER
 
 READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
 LONGEST = 1024

@@ -6,8 +6,8 @@ from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.settings import SettingError, parse_host
-from rosproxy_operator.kubernetes.planner.fields import quoted
-from rosproxy_operator.kubernetes.planner.model import Json
+from rosproxy_operator.kubernetes.resources.fields import quoted
+from rosproxy_operator.kubernetes.resources.model import Json
 
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*")
 _QUALIFIED = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")

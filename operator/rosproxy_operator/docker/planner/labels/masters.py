@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.label_values import MASTER_URI, UnusableLabel, quoted
+from rosproxy_operator.docker.planner.labels.values import MASTER_URI, UnusableLabel, quoted
 from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec import field
 
-from rosproxy_operator.kubernetes.planner.fields import ApiFields
+from rosproxy_operator.kubernetes.resources.fields import ApiFields
 
 
 class OwnerReference(ApiFields, frozen=True):

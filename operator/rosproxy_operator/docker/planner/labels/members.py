@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from rosproxy.settings import DataPlane
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner import label_values
-from rosproxy_operator.docker.planner.label_values import (
+from rosproxy_operator.docker.planner.labels import values
+from rosproxy_operator.docker.planner.labels.masters import looks_for, master_uri
+from rosproxy_operator.docker.planner.labels.networks import networks
+from rosproxy_operator.docker.planner.labels.values import (
     ADVERTISE_HOST,
     ENABLE,
     LABELS,
     PORTS,
     UnusableLabel,
 )
-from rosproxy_operator.docker.planner.masters import looks_for, master_uri
-from rosproxy_operator.docker.planner.membership import networks
 from rosproxy_operator.docker.planner.model import (
     ALIVE,
     Container,
@@ -124,10 +124,10 @@ def _request(
     labels = container.labels
     return ProxyRequest(
         container=container,
-        master_uri=master_uri(container, labels.get(label_values.MASTER_URI), settings, proxies),
+        master_uri=master_uri(container, labels.get(values.MASTER_URI), settings, proxies),
         advertise_host=_advertise_host(container, settings),
-        ports=label_values.count(PORTS, labels[PORTS]) if PORTS in labels else 0,
-        networks=networks(container, observed, settings.uplink, labels.get(label_values.NETWORK)),
+        ports=values.count(PORTS, labels[PORTS]) if PORTS in labels else 0,
+        networks=networks(container, observed, settings.uplink, labels.get(values.NETWORK)),
         data_plane=_data_plane(container),
     )
 
@@ -142,14 +142,14 @@ def _unusable(container: Container, text: str) -> Problem:
 
 
 def _data_plane(container: Container) -> DataPlane | None:
-    label = container.labels.get(label_values.DATA_PLANE)
-    return None if label is None else label_values.data_plane(label_values.DATA_PLANE, label)
+    label = container.labels.get(values.DATA_PLANE)
+    return None if label is None else values.data_plane(values.DATA_PLANE, label)
 
 
 def _counts(container: Container, settings: PlanSettings) -> bool:
     """Whether a container wants a proxy. Raises UnusableLabel if its label says neither."""
     if ENABLE in container.labels:
-        return label_values.boolean(ENABLE, container.labels[ENABLE])
+        return values.boolean(ENABLE, container.labels[ENABLE])
     return settings.expose_by_default and bool(_own(container) or container.master_uri)
 
 
@@ -193,9 +193,9 @@ def _advertise_host(container: Container, settings: PlanSettings) -> str:
     """What the label says, else the option; empty without both. Raises UnusableLabel."""
     label, option = container.labels.get(ADVERTISE_HOST), settings.advertise_host
     if label is not None:
-        return label_values.host(f"label {ADVERTISE_HOST}={label_values.quoted(label)}", label)
-    source = f"the operator's --advertise-host {label_values.quoted(option)}"
-    return label_values.host(source, option) if option else ""
+        return values.host(f"label {ADVERTISE_HOST}={values.quoted(label)}", label)
+    source = f"the operator's --advertise-host {values.quoted(option)}"
+    return values.host(source, option) if option else ""
 
 
 def _advertised(container: Container, uri: str, observed: HostState) -> str:

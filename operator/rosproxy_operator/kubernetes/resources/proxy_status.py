@@ -4,7 +4,7 @@ from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_status import nodes_by_address
-from rosproxy_operator.kubernetes.planner.model import ProxyReport
+from rosproxy_operator.kubernetes.resources.model import ProxyReport
 
 LONGEST = 300
 """Characters of a problem or an error."""

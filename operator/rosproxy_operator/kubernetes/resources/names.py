@@ -4,7 +4,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 
-from rosproxy_operator.kubernetes.planner.model import Name
+from rosproxy_operator.kubernetes.resources.model import Name
 
 GROUP = "rosproxy.io"
 VERSION = "v1alpha1"

@@ -1,6 +1,6 @@
 """On which networks a container meets its proxy."""
 
-from rosproxy_operator.docker.planner.label_values import NETWORK, UnusableLabel, quoted
+from rosproxy_operator.docker.planner.labels.values import NETWORK, UnusableLabel, quoted
 from rosproxy_operator.docker.planner.model import Container, HostState
 
 BUILT_IN = frozenset({"bridge", "host", "none"})

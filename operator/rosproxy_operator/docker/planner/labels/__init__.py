@@ -1,0 +1,1 @@
+"""From the labels of containers to what they want of a proxy."""

@@ -1,0 +1,1 @@
+"""What a RosProxy's owner is told: conditions, findings, status, Events. Pure."""
