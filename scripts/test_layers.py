@@ -7,7 +7,7 @@
 How it works. A layer is a directory under tests/. There are two halves, each in lanes: what is in
 a lane runs one after another, the lanes run side by side.
 
-  1. The integration tests, two files of them at a time. Beside them
+  1. The integration tests, which mind a busy machine, have a processor for themselves. Beside them
      what other layers need is prepared: packages, programs and images, by scripts that do nothing
      where their work is done already. After that the layers of plain computing run: unit, chart.
   2. The layers with real nodes, engines and clusters, a lane for each: these mostly wait. They
@@ -119,7 +119,7 @@ def effective_capabilities() -> int:
 
 
 UNIT = Layer("unit", smoke=ALL)
-INTEGRATION = Layer("integration", smoke=ALL, workers=2)
+INTEGRATION = Layer("integration", smoke=ALL)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", True, MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
 DOCKER_ENGINE = Layer(

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from tests.docker.engine import wait_until
 
 LIBRARIES = ("rospy", "roscpp")
+UNNOTICED = 10.0
+"""Seconds without a message that a busy machine may cause by itself; see also `Log.lost`."""
 _PROGRAMS = {"rospy": ("python3", "/nodes/node.py"), "roscpp": ("/nodes/node",)}
 _GOT = re.compile(r"^(got|reply|sent) (\S+) (\d+) size \d+ crc \w+ at ([\d.]+)", re.MULTILINE)
 
@@ -38,7 +40,7 @@ class Log:
         return [got for got in found if not word or got.word == word]
 
     def wait_for(
-        self, word: str, count: int = 3, seconds: float = 30, since: float = 0, verb: str = "got"
+        self, word: str, count: int = 3, seconds: float = 60, since: float = 0, verb: str = "got"
     ) -> float:
         """Wait until it has received that many with a word; return when the first came."""
 
@@ -50,6 +52,11 @@ class Log:
             lambda: f"{count} messages {word!r} since {since} in:\n{self.read()[-3000:]}",
         )  # fmt: skip
         return fresh()[0].at
+
+    def lost(self, word: str, since: float) -> int:
+        """How many messages are missing between those received since then."""
+        numbers = {got.number for got in self.got(word) if got.at >= since}
+        return max(numbers) - min(numbers) + 1 - len(numbers)
 
     def longest_gap(self, word: str, since: float, until: float, verb: str = "got") -> float:
         """The longest time in which no message came."""

@@ -40,7 +40,7 @@ class Robot(Machine):
 
     def start_master(self, port: int = 11311) -> None:
         self.start("sh", "-c", f"ROS_MASTER_URI=http://{self.name}:{port} exec roscore -p {port}")
-        wait_until(lambda: "/rosout" in self.nodes(port), 30, "roscore is up")
+        wait_until(lambda: "/rosout" in self.nodes(port), 60, "roscore is up")
 
     def nodes(self, port: int = 11311) -> dict[str, str]:
         """Every node that the master knows, with its URI."""

@@ -99,7 +99,7 @@ def test_roscpp_node_inside_hears_and_is_heard(robot: Robot, inside: Inside) -> 
     assert robot.run("rostopic", "echo", "-n", "3", "/back").count("round trip") == 3
 
     robot.run("rosnode", "kill", "/relay")
-    wait_until(lambda: "/relay" not in nodes(robot), 10, "the killed node signs off")
+    wait_until(lambda: "/relay" not in nodes(robot), 25, "the killed node signs off")
 
 
 def test_services_are_called_both_ways(robot: Robot, inside: Inside) -> None:
@@ -127,7 +127,7 @@ def test_robot_is_heard_again_after_the_proxy_was_killed(robot: Robot, inside: I
 
 def test_stopping_the_example_leaves_no_entry_behind(robot: Robot, inside: Inside) -> None:
     inside.compose("stop", "--timeout", "10")
-    wait_until(lambda: not inside_ports(robot), 10, lambda: str(nodes(robot)))
+    wait_until(lambda: not inside_ports(robot), 25, lambda: str(nodes(robot)))
 
 
 def test_example_with_the_kernel(robot: Robot, proxy_image: str, ros_image: str) -> None:
@@ -154,5 +154,5 @@ def counted(inside: Inside) -> int:
         return sum(int(node["data_plane"]["sent"]) for node in status()["nodes"])
 
     assert status()["data_plane"]["plane"] == "kernel", status()
-    wait_until(lambda: sent() > 0, 10, lambda: str(status()))
+    wait_until(lambda: sent() > 0, 60, lambda: str(status()))
     return sent()

@@ -27,7 +27,7 @@ def test_status_shows_containers_proxies_nodes_and_problems(
     network = net.network()
     node = net.node(network, "rospy", "pub", "--topic", "/out")
     bad = net.idle(network, labels=(ENABLE, "rosproxy.ports=many"))
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
     proxy = the_proxy()
 
     text = controller.command("status")
@@ -54,7 +54,7 @@ def test_health_and_metrics(controller: Controller, net: Inside) -> None:
     the_proxy()
 
     assert get("/healthz")[0] == 200
-    wait_until(lambda: get("/readyz")[0] == 200, 10, lambda: get("/readyz")[1])
+    wait_until(lambda: get("/readyz")[0] == 200, 60, lambda: get("/readyz")[1])
     code, text = get("/metrics")
     assert code == 200
     for name in ("rosproxy_operator_", "process_cpu_seconds_total"):
@@ -86,7 +86,7 @@ def test_controller_stops_at_once(controller_image: str, container_name: str) ->
            "--volume", "/var/run/docker.sock:/var/run/docker.sock", "--user", "0:0",
            controller_image, "docker", "--admin-bind", "127.0.0.1:21314",
 )  # fmt: skip
-    wait_until(lambda: "21314" in docker("logs", container_name), 10, "it logs where its health is")
+    wait_until(lambda: "21314" in docker("logs", container_name), 60, "it logs where its health is")
 
     docker("stop", "--time", "10", container_name)
 

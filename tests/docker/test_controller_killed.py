@@ -135,13 +135,13 @@ def test_traffic_goes_on_without_the_controller(
         controller.kill()
         flow.wait(since=time.time())
         controller.start()
-        wait_until(lambda: "health and metrics" in controller.logs(), 10, controller.logs)
+        wait_until(lambda: "health and metrics" in controller.logs(), 60, controller.logs)
         controller.command("status")
         flow.wait(since=time.time())
 
         gaps = flow.gaps(before)
         print(f"controller killed: {gaps}")
-        assert max(gaps.outward, gaps.inward, gaps.service) < 1
+        assert gaps.unnoticed, gaps
         assert the_proxy().id == number
 
 
@@ -152,16 +152,16 @@ def test_what_happened_while_the_controller_was_away(
     controller = start_controller()
     network = net.network()
     node = net.node(network, "roscpp", "pub", "--topic", "/out")
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
     controller.kill()
     docker("rm", "--force", node.name)
     other = net.node(net.network(), "rospy", "pub", "--topic", "/out")
 
     controller.start()
 
-    wait_until(lambda: named.knows_proxied(other.node), 30, controller.logs)
-    wait_until(lambda: not named.uri(node.node), 10, controller.logs)
-    wait_until(lambda: network not in the_proxy().networks, 10, controller.logs)
+    wait_until(lambda: named.knows_proxied(other.node), 60, controller.logs)
+    wait_until(lambda: not named.uri(node.node), 25, controller.logs)
+    wait_until(lambda: network not in the_proxy().networks, 60, controller.logs)
 
 
 def test_engine_that_is_not_there_yet_is_waited_for(
@@ -172,9 +172,9 @@ def test_engine_that_is_not_there_yet_is_waited_for(
     hidden = tap.address.rename(tap.address.with_name("hidden"))
     controller = start_process(engine=tap.url)
     controller.start()
-    wait_until(lambda: str(tap.address) in controller.logs(), 10, controller.logs)
+    wait_until(lambda: str(tap.address) in controller.logs(), 60, controller.logs)
 
     hidden.rename(tap.address)
 
-    wait_until(lambda: bool(proxies()), 30, controller.logs)
+    wait_until(lambda: bool(proxies()), 60, controller.logs)
     the_proxy()

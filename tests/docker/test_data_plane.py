@@ -42,7 +42,7 @@ def wait_forwarded(flow: Traffic) -> dict[str, Any]:
     )  # fmt: skip
     before = plane_of(talker)
     assert before["port"] in the_proxy().ports
-    wait_until(lambda: plane_of(talker)["sent"] > before["sent"], 20, "its bytes are counted")
+    wait_until(lambda: plane_of(talker)["sent"] > before["sent"], 60, "its bytes are counted")
     return before
 
 

@@ -12,7 +12,7 @@ import pytest
 from tests.docker.controller import Process, the_proxy
 from tests.docker.engine import wait_until
 from tests.docker.inside import Inside
-from tests.docker.nodes import LIBRARIES, Log
+from tests.docker.nodes import LIBRARIES, UNNOTICED, Log
 from tests.docker.private_engine import PrivateEngine, private_engine
 from tests.docker.robot import Robot, named_robot
 
@@ -106,7 +106,8 @@ def test_nobody_notices_an_engine_with_live_restore(
 
     for ear in ears.values():
         ear.wait_for("inside", since=time.time())
-        assert ear.longest_gap("inside", began, time.time()) < 1
+        assert ear.lost("inside", began) == 0
+        assert ear.longest_gap("inside", began, time.time()) < UNNOTICED
     print(f"{how.name}: {time.time() - time_without:.1f} s without the engine")
     assert the_proxy().id == number
 
@@ -118,4 +119,4 @@ def test_controller_works_on_after_all_that(
 
     node = inside.node(inside.network(), "roscpp", "pub", "--topic", "/late")
 
-    wait_until(lambda: robot.knows_proxied(node.node), 30, controller.logs)
+    wait_until(lambda: robot.knows_proxied(node.node), 60, controller.logs)

@@ -62,7 +62,7 @@ def test_only_published_ports_are_known_outside(
 ) -> None:
     node = net.node(net.network(), "rospy", "pub", "--topic", "/out")
     proxy = the_proxy()
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
 
     address = named.uri(node.node).split("/")[2]
 
@@ -75,7 +75,7 @@ def test_proxy_carries_both_names(controller: Controller, net: Inside, named: Ro
     node = net.idle(network)
     proxy = the_proxy()
 
-    wait_until(lambda: network in proxy.networks, 10, "the proxy has joined the network")
+    wait_until(lambda: network in proxy.networks, 60, "the proxy has joined the network")
 
     address = proxy.address(network)
     assert node.resolve(named.name) == node.resolve("rosproxy") == {address}
@@ -127,7 +127,7 @@ def test_bad_labels_leave_out_their_container_alone(
     bad = {net.idle(network, labels=(ENABLE, label)).name: word for label, word in BAD.items()}
     good = net.node(network, "roscpp", "pub", "--topic", "/out")
 
-    wait_until(lambda: named.knows_proxied(good.node), 30, good.log.read)
+    wait_until(lambda: named.knows_proxied(good.node), 60, good.log.read)
 
     status = controller.status()
     proxy_of = {one["name"]: one["proxy"] for one in status["containers"]}
@@ -141,7 +141,7 @@ def test_bad_labels_leave_out_their_container_alone(
 def test_misspelt_label_is_named_with_the_right_one(controller: Controller, net: Inside) -> None:
     node = net.idle(net.network(), labels=(ENABLE, "rosproxy.port=20"))
 
-    wait_until(lambda: "rosproxy.ports" in controller.logs(), 10, controller.logs)
+    wait_until(lambda: "rosproxy.ports" in controller.logs(), 60, controller.logs)
 
     problems = [one for one in controller.status()["problems"] if node.name in one["subject"]]
     assert [one["fatal"] for one in problems] == [False]
@@ -156,7 +156,7 @@ def test_no_label_no_proxy(controller: Controller, net: Inside) -> None:
     on = net.idle(net.network())
 
     proxy = the_proxy()
-    wait_until(lambda: bool(proxy.networks), 10, "the proxy has joined a network")
+    wait_until(lambda: bool(proxy.networks), 60, "the proxy has joined a network")
 
     assert network not in proxy.networks
     listed = {one["name"] for one in controller.status()["containers"]}
@@ -178,7 +178,7 @@ def test_labels_name_master_ports_host_and_network(
     docker("network", "connect", wanted, node.name)
     docker("start", node.name)
 
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
 
     proxy = the_proxy()
     assert proxy.networks == {wanted}
@@ -190,7 +190,7 @@ def test_default_bridge_is_told_to_be_of_no_use(
 ) -> None:
     node = net.idle("bridge")
 
-    wait_until(lambda: node.name in controller.logs(), 10, controller.logs)
+    wait_until(lambda: node.name in controller.logs(), 60, controller.logs)
 
     texts = [one["text"] for one in controller.status()["problems"] if node.name in one["subject"]]
     assert any("network" in text for text in texts), texts
@@ -202,7 +202,7 @@ def test_container_in_anothers_network(controller: Controller, net: Inside, name
     owner = net.idle(network, labels=())
     node = net.node(f"container:{owner.name}", "rospy", "pub", "--topic", "/out")
 
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
 
 
 def test_name_that_a_neighbour_holds_is_not_taken(
@@ -213,7 +213,7 @@ def test_name_that_a_neighbour_holds_is_not_taken(
     squatter = net.idle(network, labels=(), options=("--network-alias", named.name))
     node = net.idle(network)
     proxy = the_proxy()
-    wait_until(lambda: network in proxy.networks, 10, "the proxy has joined the network")
+    wait_until(lambda: network in proxy.networks, 60, "the proxy has joined the network")
 
     assert node.resolve("rosproxy") == {proxy.address(network)}
     assert node.resolve(named.name) == {squatter.address(network)}

@@ -34,7 +34,7 @@ def test_twenty_containers_at_once(
         assert all(named.knows_proxied(node.node) for node in nodes)
         assert len(the_proxy().ports) == COUNT + 4
         docker("kill", *(node.name for node in nodes))
-        gone = wait_until(lambda: not any(named.uri(node.node) for node in nodes), 20, "all gone")
+        gone = wait_until(lambda: not any(named.uri(node.node) for node in nodes), 25, "all gone")
         print(f"{COUNT} containers killed: unregistered after {gone:.1f} s")
     finally:
         named.end("ear")

@@ -62,7 +62,7 @@ def test_two_masters_of_one_host(
     }  # fmt: skip
 
     for port, node in nodes.items():
-        wait_until(lambda: named.knows_proxied(node.node, port), 30, node.log.read)  # noqa: B023
+        wait_until(lambda: named.knows_proxied(node.node, port), 60, node.log.read)  # noqa: B023
 
     assert len(proxies()) == 2
     assert not named.uri(nodes[11311].node, 11312)
@@ -76,7 +76,7 @@ def test_label_wins_over_the_environment(
     node = net.node(net.network(), "roscpp", "pub", "--topic", "/out", labels=labels,
                     uri="http://rosproxy:11311")  # fmt: skip
 
-    wait_until(lambda: rover.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: rover.knows_proxied(node.node), 60, node.log.read)
     assert not named.uri(node.node)
 
 
@@ -93,7 +93,7 @@ def test_masters_host_gets_another_address(
         try:
             node = net.node(net.network(), "rospy", "pub", "--topic", "/out", "--word", "inside",
                             uri=robot.master_uri)  # fmt: skip
-            wait_until(lambda: robot.knows_proxied(node.node), 30, controller.logs)
+            wait_until(lambda: robot.knows_proxied(node.node), 60, controller.logs)
             number = the_proxy().id
 
             address = move(robot)

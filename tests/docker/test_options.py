@@ -22,7 +22,7 @@ def test_expose_by_default(start_controller: Callable[..., Controller], net: Ins
 
     proxy = the_proxy()
 
-    wait_until(lambda: proxy.networks == {network}, 10, lambda: str(proxy.networks))
+    wait_until(lambda: proxy.networks == {network}, 60, lambda: str(proxy.networks))
 
 
 def test_master_of_the_controller_serves_those_who_name_none(
@@ -31,7 +31,7 @@ def test_master_of_the_controller_serves_those_who_name_none(
     start_controller("--master-uri", named.master_uri, "--advertise-host", named.host_address)
     node = net.node(net.network(), "rospy", "pub", "--topic", "/out", uri="http://rosproxy:11311")
 
-    wait_until(lambda: named.knows_proxied(node.node), 30, node.log.read)
+    wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_updated_image_replaces_the_proxy(
 
         update(moving_image)
 
-        wait_until(lambda: the_proxy().id != number, 30, "another container")
+        wait_until(lambda: the_proxy().id != number, 60, "another container")
         flow.wait(since=time.time())
         print(f"image updated: {flow.gaps(changed)}")
         after = the_proxy()
@@ -83,7 +83,7 @@ def test_missing_image_is_told_with_what_to_do(
     controller = start_controller("--proxy-image", "rosproxy:nosuch")
     net.idle(net.network())
 
-    wait_until(lambda: "rosproxy:nosuch" in controller.problems(), 10, controller.logs)
+    wait_until(lambda: "rosproxy:nosuch" in controller.problems(), 60, controller.logs)
 
     assert "docker build" in controller.problems() or "docker pull" in controller.problems()
     assert not managed("proxy")
@@ -102,7 +102,7 @@ def test_data_plane_of_the_controller_is_for_those_who_ask_for_none(
         net.idle(network, labels=(ENABLE, "rosproxy.data-plane=copy"))
 
         copying = "ROSPROXY_DATA_PLANE=copy"
-        wait_until(lambda: copying in variables(the_proxy()), 30, lambda: docker("ps", "--all"))
+        wait_until(lambda: copying in variables(the_proxy()), 60, lambda: docker("ps", "--all"))
         flow.wait(since=time.time())
         print(f"from kernel to copy: {flow.gaps(changed)}")
         assert not inspect(the_proxy().name)["HostConfig"]["CapAdd"]

@@ -70,7 +70,7 @@ def test_exhausted_window_is_told_with_numbers(
     controller = start_controller("--port-window", f"{FIRST}-{FIRST + 7}")
     node = net.idle(net.network(), labels=(ENABLE, "rosproxy.ports=9"))
 
-    wait_until(lambda: f"{FIRST}-{FIRST + 7}" in controller.logs(), 10, controller.logs)
+    wait_until(lambda: f"{FIRST}-{FIRST + 7}" in controller.logs(), 60, controller.logs)
 
     text = controller.problems()
     assert "9" in text
@@ -89,7 +89,7 @@ def test_range_grows_in_place(
         net.idle(network, labels=(ENABLE, "rosproxy.ports=12"))
         changed = time.time()
 
-        wait_until(lambda: len(the_proxy().ports) == 12, 30, "the range has grown")
+        wait_until(lambda: len(the_proxy().ports) == 12, 60, "the range has grown")
 
         flow.wait(since=time.time())
         print(f"range extended: {flow.gaps(changed)}")
@@ -106,7 +106,7 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     """There is a way on, and somebody has to be told: nodes don't register again by themselves."""
     controller = start_controller("--ports", "4")
     node = net.node(net.network(), "roscpp", "pub", "--topic", "/out", "--word", "inside")
-    wait_until(lambda: named.knows_proxied(node.node), 30, controller.logs)
+    wait_until(lambda: named.knows_proxied(node.node), 60, controller.logs)
     proxy = the_proxy()
     before = proxy.ports
     controller.kill()

@@ -85,12 +85,12 @@ def test_lost_proxy_comes_back_on_its_ports(how: str, flow: Traffic) -> None:
     print(f"{how}: {gaps}")
     assert the_proxy().ports == ports
     assert the_proxy().networks == networks
-    assert max(gaps.outward, gaps.inward) < 20
+    assert max(gaps.outward, gaps.inward) < 40
 
 
 def recovered(lost: float) -> float:
     """A moment at which the proxy runs again."""
-    wait_until(lambda: any(started(proxy) > lost for proxy in proxies()), 30, "a proxy runs")
+    wait_until(lambda: any(started(proxy) > lost for proxy in proxies()), 60, "a proxy runs")
     return time.time()
 
 
@@ -109,5 +109,5 @@ def test_paused_proxy_is_resumed(flow: Traffic) -> None:
 
     docker("pause", proxy.name)
 
-    wait_until(lambda: proxy.running, 10, "it is resumed")
+    wait_until(lambda: proxy.running, 60, "it is resumed")
     flow.wait(since=time.time())

@@ -39,11 +39,11 @@ def test_nodes_that_were_there_first_are_adopted(
     server = net.node(network, library, "serve", "--service", "/ask", options=known)
     listener = net.node(network, library, "sub", "--topic", "/in", options=known)
     for one in (node, server, listener):
-        wait_until(lambda: is_stray(named, one), 30, one.log.read)  # noqa: B023
+        wait_until(lambda: is_stray(named, one), 60, one.log.read)  # noqa: B023
     ear = named.node("ear", library, "sub", "--topic", "/out")
     named.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
     try:
-        wait_until(lambda: "ready" in ear.read(), 10, ear.read)
+        wait_until(lambda: "ready" in ear.read(), 60, ear.read)
         assert not ear.got()
         began = time.time()
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from tests.docker.engine import docker
 from tests.docker.inside import ENABLE, Container, Inside, unique
-from tests.docker.nodes import Log
+from tests.docker.nodes import UNNOTICED, Log
 from tests.docker.robot import Robot
 
 
@@ -29,7 +29,7 @@ class Traffic:
     service: Log
     words: tuple[str, str]
 
-    def wait(self, since: float = 0, seconds: float = 30) -> None:
+    def wait(self, since: float = 0, seconds: float = 60) -> None:
         """Wait until all of it flows."""
         self.outward.wait_for(self.words[0], since=since, seconds=seconds)
         self.inward.wait_for(self.words[1], since=since, seconds=seconds)
@@ -42,20 +42,28 @@ class Traffic:
             self.outward.longest_gap(self.words[0], since, now),
             self.inward.longest_gap(self.words[1], since, now),
             self.service.longest_gap("ask", since, now, verb="reply"),
+            self.outward.lost(self.words[0], since) + self.inward.lost(self.words[1], since),
         )
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """Seconds without anything heard outside, heard inside, answered from inside."""
+    """Seconds without anything heard outside, heard inside, answered from inside; messages lost."""
 
     outward: float
     inward: float
     service: float
+    lost: int
+
+    @property
+    def unnoticed(self) -> bool:
+        """Whether connections have lasted: nothing was lost, nor was there a long pause."""
+        return not self.lost and max(self.outward, self.inward, self.service) < UNNOTICED
 
     def __str__(self) -> str:
         return (f"seconds without messages outward {self.outward:.1f}, "
-                f"inward {self.inward:.1f}, without service {self.service:.1f}")  # fmt: skip
+                f"inward {self.inward:.1f}, without service {self.service:.1f}; "
+                f"messages lost {self.lost}")  # fmt: skip
 
 
 @contextmanager

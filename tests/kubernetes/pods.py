@@ -148,7 +148,7 @@ def namespace(name: str = "", labels: Mapping[str, str] | None = None) -> Iterat
     name = name or unique("test")
     api.create({"apiVersion": "v1", "kind": "Namespace",
                 "metadata": {"name": name, "labels": dict(labels or {})}})  # fmt: skip
-    wait_until(lambda: bool(api.get("serviceaccounts", name, "default")), 20, "a service account")
+    wait_until(lambda: bool(api.get("serviceaccounts", name, "default")), 60, "a service account")
     try:
         yield Namespace(name)
     finally:

@@ -24,7 +24,7 @@ def test_another_master(net: Namespace, robot: Robot) -> None:
         made.change(master={"uri": other.master_uri})
         made.wait_status(lambda s: other.master_uri in s.get("master", ""), "the new master")
         wait_until(lambda: made.the_proxy().uid_then != before.uid_then, 40, made.tell)
-        wait_until(lambda: not robot.uri(old), 20, lambda: str(robot.nodes()))
+        wait_until(lambda: not robot.uri(old), 25, lambda: str(robot.nodes()))
         name = talker(net, topic, "roscpp")
         ear = other.node("ear_after", "roscpp", "sub", "--topic", topic)
         ear.wait_for("inside", seconds=60)
@@ -36,11 +36,11 @@ def test_another_selector(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4, graceSeconds=2)
     net.idle(on="node1")
     net.idle(on="node2", labels={INJECT: "true", "app": "x"})
-    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 30, made.tell)
+    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 60, made.tell)
     made.change(podSelector={"matchLabels": {"app": "x"}})
-    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 30, made.tell)
+    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 60, made.tell)
     made.change(podSelector=None)
-    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 30, made.tell)
+    wait_until(lambda: {p.on for p in made.proxies} == {"node1", "node2"}, 60, made.tell)
 
 
 def test_node_selector(net: Namespace) -> None:
@@ -48,7 +48,7 @@ def test_node_selector(net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4, nodeSelector=labels)
     net.idle(on="node1")
     net.idle(on="node2")
-    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 30, made.tell)
+    wait_until(lambda: {p.on for p in made.proxies} == {"node2"}, 60, made.tell)
 
 
 def test_advertised_host_of_a_node(net: Namespace, robot: Robot) -> None:
@@ -76,20 +76,20 @@ def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robo
 
     made.remove()
 
-    wait_until(lambda: not made.body, 10, "it is gone: nothing holds it")
+    wait_until(lambda: not made.body, 60, "it is gone: nothing holds it")
     wait_until(lambda: not made.proxies and not made.service, 40, made.tell)
     assert {body["metadata"]["uid"] for body in net.pods(INJECT)} == pods
-    wait_until(lambda: not robot.uri(name), 20, lambda: f"unregistered: {robot.nodes()}")
+    wait_until(lambda: not robot.uri(name), 25, lambda: f"unregistered: {robot.nodes()}")
 
 
 def test_deleted_service_comes_back_at_its_address(net: Namespace) -> None:
     """Running pods know it by nothing else."""
     made = rosproxy(net.name, master=NOWHERE, ports=4)
-    wait_until(lambda: bool(made.service), 20, made.tell)
+    wait_until(lambda: bool(made.service), 60, made.tell)
     before = made.service
     made.wait_status(lambda s: bool(s.get("masterURI")), "the address is kept")
     api.delete("services", net.name, before["metadata"]["name"])
-    wait_until(lambda: _uid(made) not in ("", before["metadata"]["uid"]), 20, made.tell)
+    wait_until(lambda: _uid(made) not in ("", before["metadata"]["uid"]), 60, made.tell)
     assert made.service["spec"]["clusterIP"] == before["spec"]["clusterIP"]
 
 

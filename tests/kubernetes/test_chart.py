@@ -168,7 +168,7 @@ def rosproxy_of(spec: Json) -> Json:
 
 
 def test_upgrade_keeps_the_certificate(restored: None) -> None:
-    wait_until(lambda: certificate() != (None, None), 30, "a certificate")
+    wait_until(lambda: certificate() != (None, None), 60, "a certificate")
     before = certificate()
     assert all(before)
     release.upgrade(webhook={"timeoutSeconds": 7}, commonLabels={"changed": "yes"})
@@ -186,14 +186,14 @@ def certificate() -> tuple[Any, Any]:
 
 def test_deleted_certificate_is_made_anew(net: Namespace, restored: None) -> None:
     """Helm restores the empty Secret, and the operator fills it in."""
-    wait_until(lambda: certificate() != (None, None), 30, "a certificate")
+    wait_until(lambda: certificate() != (None, None), 60, "a certificate")
     before = certificate()
     api.delete("secrets", release.NAMESPACE, SECRET)
     release.upgrade(commonLabels={"changed": "again"})
     wait_until(lambda: all(certificate()), 60, "a certificate")
     assert certificate() != before
     rosproxy(net.name, master=NOWHERE)
-    wait_until(lambda: bool(net.idle().environment.get("ROS_MASTER_URI")), 30, "a wired pod")
+    wait_until(lambda: bool(net.idle().environment.get("ROS_MASTER_URI")), 60, "a wired pod")
 
 
 def test_rights_in_named_namespaces(net: Namespace, restored: None) -> None:
@@ -202,11 +202,11 @@ def test_rights_in_named_namespaces(net: Namespace, restored: None) -> None:
         release.upgrade(namespaces=[net.name])
         rosproxy(other.name, master=NOWHERE)
         made = rosproxy(net.name, master=NOWHERE, ports=4)
-        wait_until(lambda: bool(made.service), 30, made.tell)
+        wait_until(lambda: bool(made.service), 60, made.tell)
         net.idle()
         other.idle()
         made.wait_event("ProxyCreated")
-        wait_until(lambda: bool(made.proxies), 30, made.tell)
+        wait_until(lambda: bool(made.proxies), 60, made.tell)
         started = time.monotonic()
         wait_until(lambda: time.monotonic() > started + 2, 5, "a few more looks")
         assert api.get("services", other.name, "rosproxy-robot") == {}

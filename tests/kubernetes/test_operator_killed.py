@@ -41,14 +41,14 @@ def test_traffic_does_not_notice(net: Namespace, robot: Robot) -> None:
         traffic.wait(since=time.time())
         gaps = traffic.gaps(killed)
         note(f"operator killed: ready again after {back:.1f} s; {gaps}")
-        assert max(gaps.outward, gaps.inward, gaps.service) < 1
+        assert gaps.unnoticed, gaps
         assert made.the_proxy().uid_then == before.uid_then
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.15, 0.4, 0.8])
 def test_killed_in_the_middle_of_making_a_proxy(delay: float, net: Namespace) -> None:
     made = rosproxy(net.name, master=NOWHERE, ports=4)
-    wait_until(lambda: bool(made.service), 20, made.tell)
+    wait_until(lambda: bool(made.service), 60, made.tell)
     net.idle(on="node1")
     net.idle(on="node2")
     time.sleep(delay)
@@ -70,7 +70,7 @@ def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
             pod = net.idle(on="node1")
             assert pod.environment == {}
             doomed.remove()
-            wait_until(lambda: not doomed.body, 10, "no finalizer holds it")
+            wait_until(lambda: not doomed.body, 60, "no finalizer holds it")
             made.the_proxy().remove(wait=False)
             uri = robot.uri(traffic.talker.node)
             traffic.listener.remove(grace=0)
@@ -79,4 +79,4 @@ def test_what_happens_while_it_is_away(net: Namespace, robot: Robot) -> None:
         traffic.outward.wait_for("inside", since=time.time(), seconds=60)
         assert robot.uri(traffic.talker.node) == uri
         wait_until(lambda: not robot.uri(traffic.listener.node), 60, lambda: str(robot.nodes()))
-    wait_until(lambda: not doomed.service, 20, doomed.tell)
+    wait_until(lambda: not doomed.service, 60, doomed.tell)

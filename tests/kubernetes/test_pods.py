@@ -59,7 +59,7 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
     uri = robot.uri(pod.node)
 
     pod.remove(grace=0)
-    gone = wait_until(lambda: not robot.uri(pod.node), 15, lambda: str(robot.nodes()))
+    gone = wait_until(lambda: not robot.uri(pod.node), 25, lambda: str(robot.nodes()))
     note(f"pod deleted, {library}: unregistered {gone:.1f} s after it is gone")
 
     again = time.time()
@@ -74,8 +74,8 @@ def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -
     made.change(graceSeconds=1)
     pod = net.pod("sh", "-c", "sleep 5", on="node1", restartPolicy="Never")
     made.the_proxy()
-    wait_until(lambda: pod.body["status"].get("phase") == "Succeeded", 30, lambda: str(pod.body))
-    wait_until(lambda: not made.proxies, 30, made.tell)
+    wait_until(lambda: pod.body["status"].get("phase") == "Succeeded", 60, lambda: str(pod.body))
+    wait_until(lambda: not made.proxies, 60, made.tell)
 
 
 def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robot: Robot) -> None:
@@ -102,7 +102,7 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
         assert made.the_proxy("node2").ready
         kubectl("drain", "node2", "--force", "--ignore-daemonsets", "--delete-emptydir-data",
                 "--timeout=60s", seconds=90)  # fmt: skip
-        wait_until(lambda: not robot.uri(pod.node), 15, lambda: str(robot.nodes()))
+        wait_until(lambda: not robot.uri(pod.node), 25, lambda: str(robot.nodes()))
         wait_until(lambda: not made.proxies, 40, made.tell)
     finally:
         kubectl("uncordon", "node2")

@@ -84,7 +84,7 @@ def test_ports_that_the_scheduler_gives_to_another(net: Namespace) -> None:
     with paused(SCHEDULER):
         other = net.idle(on="node1", labels={}, ports=(12302,))
         net.pod("sleep", "infinity", nodeName="node1")
-        wait_until(lambda: bool(made.proxies), 20, made.tell)
+        wait_until(lambda: bool(made.proxies), 60, made.tell)
         assert made.proxies[0].ports == "12300-12303"
     assert ports_on(made, "node1") == "12304-12307"
     other.wait_ready()
@@ -98,7 +98,7 @@ def test_ports_taken_while_the_proxy_is_made_anew(net: Namespace) -> None:
     assert ports_on(made, "node1") == "12500-12503"
     with paused(SCHEDULER):
         made.proxies[0].remove()
-        wait_until(lambda: bool(made.proxies), 20, made.tell)
+        wait_until(lambda: bool(made.proxies), 60, made.tell)
         assert made.proxies[0].ports == "12500-12503"
         other = net.pod("sleep", "infinity", labels={}, ports=(12502,), nodeName="node1")
         other.wait_ready()

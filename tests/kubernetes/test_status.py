@@ -74,7 +74,7 @@ def test_host_network_is_told_on_the_pod(net: Namespace) -> None:
             e["reason"] == "HostNetwork" and e["involvedObject"]["name"] == pod.name for e in every
         )
 
-    wait_until(told, 30, lambda: str(api.objects("events", net.name)))
+    wait_until(told, 60, lambda: str(api.objects("events", net.name)))
     assert made.proxies == []
 
 

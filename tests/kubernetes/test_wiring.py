@@ -28,7 +28,7 @@ def uri(shared: Namespace) -> str:
     made = rosproxy(
         shared.name, master=NOWHERE, hostAliases=[{"ip": "192.0.2.9", "hostnames": ["robot"]}]
     )
-    wait_until(lambda: bool(made.service), 20, made.tell)
+    wait_until(lambda: bool(made.service), 60, made.tell)
     return f"http://{made.service['spec']['clusterIP']}:11311"
 
 
@@ -86,7 +86,7 @@ def test_no_rosproxy_is_warned_of(net: Namespace) -> None:
 def test_two_rosproxies_are_warned_of(net: Namespace) -> None:
     first = rosproxy(net.name, master=NOWHERE)
     second = rosproxy(net.name, "second", master=NOWHERE)
-    wait_until(lambda: bool(first.service and second.service), 20, second.tell)
+    wait_until(lambda: bool(first.service and second.service), 60, second.tell)
     uri = f"http://{second.service['spec']['clusterIP']}:11311"
     made, warnings = api.dry_run(net.pod_body("pod", "true"))
     assert variables(made) == {}
@@ -119,7 +119,7 @@ def test_pod_made_before_its_rosproxy_is_told_so(net: Namespace) -> None:
 
 def test_no_pod_gets_a_finalizer(shared: Namespace, uri: str) -> None:
     pod = shared.idle(on="node1")
-    wait_until(lambda: pod.body["spec"].get("nodeName", "") != "", 20, "it is scheduled")
+    wait_until(lambda: pod.body["spec"].get("nodeName", "") != "", 60, "it is scheduled")
     assert "finalizers" not in pod.body["metadata"]
     assert not [a for a in pod.body["metadata"].get("annotations", {}) if "kopf" in a]
 
@@ -133,7 +133,7 @@ def test_pods_of_a_deployment_are_wired(shared: Namespace, uri: str) -> None:
         "spec": {"replicas": 2, "selector": {"matchLabels": {"app": "many"}},
                  "template": {"metadata": {"labels": labels}, "spec": template["spec"]}},
     })  # fmt: skip
-    wait_until(lambda: len(shared.pods("app=many")) == 2, 20, "two pods")
+    wait_until(lambda: len(shared.pods("app=many")) == 2, 60, "two pods")
     for body in shared.pods("app=many"):
         assert variables(body)["ROS_MASTER_URI"] == uri
 

@@ -40,7 +40,7 @@ class Flow:
     def inward(self) -> Log:
         return self.listener.log
 
-    def wait(self, since: float = 0, seconds: float = 40) -> None:
+    def wait(self, since: float = 0, seconds: float = 60) -> None:
         """Wait until all of it flows."""
         self.outward.wait_for("inside", since=since, seconds=seconds)
         self.inward.wait_for("outside", since=since, seconds=seconds)
@@ -53,6 +53,7 @@ class Flow:
             self.outward.longest_gap("inside", since, now),
             self.inward.longest_gap("outside", since, now),
             self.replies.longest_gap("ask", since, now, verb="reply"),
+            self.outward.lost("inside", since) + self.inward.lost("outside", since),
         )
 
 

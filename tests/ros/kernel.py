@@ -15,7 +15,7 @@ from tests.ros.topology import OUT_HOST
 
 TABLE = "rosproxy-11311"
 MARKS = f"{11311 << 16}/0xffff0000"
-LIMIT = 15.0
+LIMIT = 60.0
 """Seconds."""
 
 

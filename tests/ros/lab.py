@@ -73,9 +73,9 @@ class Lab:
         env = self.environment(place.role) | {"ROS_MASTER_URI": uri}
         argv = ["/usr/bin/roscore", "-p", str(MASTER_PORT)]
         self.master = self._spawn("roscore", place, argv, env)
-        wait_until("the master answers", self._master_answers, timeout=30)
+        wait_until("the master answers", self._master_answers)
         self.master_answered = time.time()
-        self.master.wait_for(r"started core service \[/rosout\]", timeout=30)
+        self.master.wait_for(r"started core service \[/rosout\]")
 
     def _master_answers(self) -> bool:
         try:
@@ -94,7 +94,7 @@ class Lab:
         if ports.published != ports.bound:
             argv += ["--advertise-port-range", ports.published]
         self.proxy = self._spawn_proxy([*argv, *self.proxy_options])
-        self.proxy.wait_for(r"ready: ", timeout=15)
+        self.proxy.wait_for(r"ready: ")
 
     def _upstream(self) -> str:
         """The real master, as the proxy reaches it."""
@@ -241,10 +241,10 @@ class Lab:
         publishers, subscribers, _ = self.ask_master("getSystemState")
         return dict(publishers).get(topic, []), dict(subscribers).get(topic, [])
 
-    def wait_registered(self, name: str, timeout: float = 10) -> None:
+    def wait_registered(self, name: str, timeout: float = 60) -> None:
         wait_until(f"{name} is registered", lambda: self.registered(name), timeout)
 
-    def wait_unregistered(self, name: str, timeout: float = 15) -> None:
+    def wait_unregistered(self, name: str, timeout: float = 60) -> None:
         wait_until(f"{name} is unregistered", lambda: not self.registered(name), timeout)
 
 

@@ -54,12 +54,12 @@ class Process:
         """The present end of the output, as a `since` for later."""
         return len(self.output())
 
-    def wait_for(self, pattern: str, timeout: float = 15.0, since: int = 0) -> re.Match[str]:
+    def wait_for(self, pattern: str, timeout: float = 60.0, since: int = 0) -> re.Match[str]:
         """Waits until a line matches. Raises AssertionError with the output otherwise."""
         return self.wait_for_count(pattern, 1, timeout, since)[0]
 
     def wait_for_count(
-        self, pattern: str, count: int, timeout: float = 15.0, since: int = 0
+        self, pattern: str, count: int, timeout: float = 60.0, since: int = 0
     ) -> list[re.Match[str]]:
         """Waits until `count` matches are there; returns all of them."""
         compiled = re.compile(pattern, re.MULTILINE)
@@ -80,7 +80,7 @@ class Process:
             f"its output:\n{self.output()[-3000:]}"
         )
 
-    def wait(self, timeout: float = 15.0) -> int:
+    def wait(self, timeout: float = 60.0) -> int:
         """Waits until it ends by itself; returns its exit code."""
         try:
             return self._popen.wait(timeout)
@@ -150,7 +150,7 @@ def stop_all(processes: Sequence[Process], patience: float = STOP_PATIENCE) -> N
         process.reap(patience)
 
 
-def wait_until(condition: str, check: object, timeout: float = 15.0) -> None:
+def wait_until(condition: str, check: object, timeout: float = 60.0) -> None:
     """Polls the callable `check` until it gives something true."""
     assert callable(check)
     deadline = time.monotonic() + timeout

@@ -143,7 +143,7 @@ def test_nodes_of_a_container_that_is_gone(lab: Lab, library: str, measure: Meas
         assert not any(lab.node_uri(name) for name in names.values())
         took = time.time() - started
         measure("gone: 3 nodes unregistered", took)
-        assert took < 1.5
+        assert took < 15  # each node's own time-out: 15 s
         assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 0
 
 
@@ -238,8 +238,8 @@ def test_rosnode_kill_ends_an_adopted_node(lab: Lab, library: str) -> None:
     assert arrived(lab)["adopted"] == 1
     assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
     lab.run("out", "rosnode", "kill", name)
-    node.wait(timeout=5)
-    lab.wait_unregistered(name, timeout=6)
+    node.wait(timeout=60)
+    lab.wait_unregistered(name)
 
 
 @pytest.mark.parametrize("way", [signal.SIGINT, signal.SIGKILL], ids=["sigint", "sigkill"])
@@ -258,7 +258,7 @@ def test_an_adopted_node_that_ends_leaves_nothing(
         node.send(way)
     ended = time.time()
     for name in started.values():
-        lab.wait_unregistered(name, timeout=6)
+        lab.wait_unregistered(name)
     measure("adopted, then ended: unregistered", time.time() - ended)
 
 
@@ -278,7 +278,7 @@ def test_strays_that_the_master_reaches_are_not_shut_down(
         node.wait_for("^more")
         for topic in ("a", "b"):
             lab.node(library, "out", "sub", topic=f"/{name}/{topic}").wait_for_count("^got ", 3)
-        wait_until("it is behind the proxy again", lambda: is_leased(lab, name), timeout=5)
+        wait_until("it is behind the proxy again", lambda: is_leased(lab, name))
         assert node.returncode is None
 
 
@@ -290,7 +290,7 @@ def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> N
         for name in names:
             options = {"env": {"ROS_IP": lab.place("c1").address}, "topic": f"/{name}/t"}
             nodes.append(lab.node(library, "c1", "pub", name=name, **options))
-        end = time.time() + 20
+        end = time.time() + 60
         while not all(is_leased(lab, name) for name in names):
             arrived(lab)
             assert time.time() < end
@@ -298,7 +298,7 @@ def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> N
             lab.node(library, "out", "sub", topic=f"/{name}/t").wait_for_count("^got ", 3)
         for service in (f"/{name}/get_loggers" for name in names):
             found = f"the service {service} is behind the proxy"
-            wait_until(found, lambda s=service: ":115" in lab.ask_master("lookupService", s), 8)
+            wait_until(found, lambda s=service: ":115" in lab.ask_master("lookupService", s))
         assert [node.returncode for node in nodes] == [None] * 4
         assert all(is_leased(lab, name) for name in names)
 
@@ -315,7 +315,7 @@ def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
     more.touch()
     node.wait_for("^more")
     lab.node(library, "out", "sub", topic=f"/{name}/b").wait_for_count("^got ", 3)
-    wait_until("the topic is gone", lambda: not lab.users(f"/{name}/a")[0], timeout=6)
+    wait_until("the topic is gone", lambda: not lab.users(f"/{name}/a")[0])
 
 
 @each_library
@@ -402,7 +402,7 @@ def test_a_container_that_has_moved(
         assert lab.node_uri(name) == after
         assert tell(lab, "/containers", moved={old: place.address})["moved"] == 0
         assert node.stop() == 0
-        lab.wait_unregistered(name, timeout=2)
+        lab.wait_unregistered(name, timeout=2)  # by itself, before --cleanup-after 3
 
 
 def test_a_retired_proxy_leaves_nothing_at_the_master(lab: Lab) -> None:

@@ -52,4 +52,4 @@ def test_parameters_and_tools_through_the_published_master(lab: Lab) -> None:
     node.wait_for("^sent ")
     assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
     lab.run("out", "rosnode", "kill", name)
-    node.wait(timeout=5)
+    node.wait(timeout=60)

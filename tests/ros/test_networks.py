@@ -40,7 +40,7 @@ def test_the_same_name_in_use_on_both_networks(lab: Lab, library: str) -> None:
     receiver = lab.node(library, "c2", "sub", topic=topic)
     receiver.wait_for("^got older ")
     lab.node(library, "c2", "pub", name=name, topic=topic, word="newer")
-    older.wait(timeout=10)
+    older.wait(timeout=60)
     receiver.wait_for("^got newer ")
 
 
@@ -52,7 +52,7 @@ def test_tools_on_the_other_network(lab: Lab, library: str) -> None:
     assert f"Pid: {node.pid}" in lab.run("c2", "rosnode", "info", name).output
     lab.run("c2", "rostopic", "echo", "-n", "1", f"/{name}/topic")
     lab.run("c2", "rosnode", "kill", name)
-    node.wait(timeout=5)
+    node.wait(timeout=60)
 
 
 @pytest.mark.boundary

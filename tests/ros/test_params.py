@@ -147,7 +147,7 @@ def test_a_subscribed_parameter_is_updated(lab: Lab, side: str, setter: str) -> 
     watcher.wait_for("^param before$")
     for value in ("after", "later & <later>"):
         lab.ask_master("setParam", key, value, role=setter)
-        watcher.wait_for(f"^param {value}$", timeout=5)
+        watcher.wait_for(f"^param {value}$")
     assert watcher.returncode is None
 
 

@@ -14,7 +14,7 @@ from tests.ros.processes import Process
 
 pytestmark = pytest.mark.boundary
 
-HARD_LIMIT = 10.0
+HARD_LIMIT = 24.0
 """Seconds; what was measured is in the report, far below."""
 
 SIDES = {"c1": "inside", "c2": "inside", "out": "outside"}
@@ -123,11 +123,11 @@ def test_nodes_keep_their_ports_and_can_be_ended_after_a_restart(lab: Lab, libra
         assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
     lab.run("out", "rosnode", "kill", *names[:2])
     for node in nodes[:2]:
-        node.wait(timeout=5)
+        node.wait(timeout=60)
     for node in nodes[2:]:
         assert node.stop() == 0
     for name in names:
-        lab.wait_unregistered(name, timeout=5)
+        lab.wait_unregistered(name)
 
 
 def test_a_new_node_after_a_restart_gets_a_port_of_its_own(lab: Lab) -> None:
@@ -168,7 +168,7 @@ def test_nodes_that_start_while_the_proxy_is_away_are_there_when_it_is_back(
     sender = lab.node(library, "out", "pub", topic=topic)
     sender.wait_for("^sent ")
     lab.start_proxy()
-    receiver.wait_for_count("^got ", 3, timeout=20)
+    receiver.wait_for_count("^got ", 3)
 
 
 @each_library
@@ -266,4 +266,4 @@ def test_everything_started_before_roscore(lab: Lab, library: str) -> None:
     lab.node(library, "c1", "pub", topic=topic)
     receiver = lab.node(library, "out", "sub", topic=topic)
     lab.start_master()
-    receiver.wait_for_count("^got ", 3, timeout=20)
+    receiver.wait_for_count("^got ", 3)

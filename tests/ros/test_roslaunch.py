@@ -44,7 +44,7 @@ def test_roslaunch(lab: Lab, side: str, tmp_path: Path) -> None:
     path = {"ROS_PACKAGE_PATH": f"{tmp_path}:/usr/share"}
     launched = lab.start(side, "roslaunch", str(file), env=path)
     receiver = lab.node("roscpp", OTHER[side], "sub", topic=f"/{space}/again")
-    receiver.wait_for_count("^got hello ", 5, timeout=30)
+    receiver.wait_for_count("^got hello ", 5)
     assert lab.ask_master("getParam", f"/{space}/greeting") == "from launch"
     assert lab.ask_master("getParam", f"/{space}/limits") == {"low": 1, "high": 2.5}
     listed = lab.run(OTHER[side], "rosnode", "list").output.split()
@@ -67,5 +67,5 @@ def test_roslaunch_sees_that_a_required_node_died(lab: Lab, side: str, tmp_path:
     launched = lab.start(side, "roslaunch", str(file), env=path)
     lab.wait_registered(f"/{space}/talker", timeout=30)
     lab.run(OTHER[side], "rosnode", "kill", f"/{space}/talker")
-    launched.wait(timeout=20)
+    launched.wait(timeout=60)
     lab.wait_unregistered(f"/{space}/relay")

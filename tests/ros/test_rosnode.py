@@ -73,8 +73,8 @@ def test_kill_ends_the_node(lab: Lab, library: str, side: str, where: str) -> No
     output = lab.run(side, "rosnode", "kill", name).output
     assert f"killing {name}" in output
     assert "killed" in output
-    node.wait(timeout=5)
-    lab.wait_unregistered(name, timeout=5)
+    node.wait(timeout=60)
+    lab.wait_unregistered(name)
 
 
 @each_side

@@ -95,4 +95,4 @@ def test_delay_reads_the_stamps(lab: Lab, source: str, sink: str) -> None:
     lab.start(source, "rostopic", "pub", "-s", "-r", "20", topic, *STAMPED)
     tool = lab.start(sink, "rostopic", "delay", topic)
     delay = float(tool.wait_for(r"average delay: (-?[\d.]+)")[1])
-    assert 0 <= delay < 1
+    assert 0 <= delay < 10

@@ -49,7 +49,7 @@ def test_messages_of_10_mb_arrive_unharmed(
     receiver = lab.node(subscriber, sink, "sub", topic=topic)
     receiver.wait_for("^ready")
     sender = lab.node(publisher, source, "pub", topic=topic, size=BIG, rate=4)
-    lines = receiver.wait_for_count(rf"^got (hello \d+ size {BIG} crc \w+)", 3, timeout=30)
+    lines = receiver.wait_for_count(rf"^got (hello \d+ size {BIG} crc \w+)", 3)
     for line in lines:
         sender.wait_for(f"^sent {re.escape(line[1])}")
 

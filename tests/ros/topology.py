@@ -268,7 +268,7 @@ def _remove_namespace(namespace: str) -> None:
 
 
 def _kill_all(namespace: str) -> None:
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 30
     while pids := run_command("ip", "netns", "pids", namespace).split():
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):

@@ -28,9 +28,9 @@ from tests.integration.net import (
 )
 from tests.integration.proxy import Proxy
 
-LOOKS = (0.8, 1.6)
+LOOKS = (3.0, 3.8)
 """Seconds after which the proxy of these tests looks; long enough to connect before."""
-AFTERWARDS = 11
+AFTERWARDS = 22
 """Looks of the proxy at its master, five a second, after which both are over."""
 
 

@@ -41,7 +41,7 @@ def up() -> None:
             wait_until_ready(node)
         images.result()
     start_robot()
-    wait_until(_takes_pods, 30, "namespace default has a service account")
+    wait_until(_takes_pods, 60, "namespace default has a service account")
 
 
 def down() -> None:

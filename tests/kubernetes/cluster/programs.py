@@ -61,7 +61,7 @@ class Program:
             )  # fmt: skip
         self._pid_file.write_text(str(process.pid))
         # For a moment a process that has just become a program has no command line.
-        wait_until(lambda: self.pid is not None or process.poll() is not None, 10, self.name)
+        wait_until(lambda: self.pid is not None or process.poll() is not None, 60, self.name)
 
     def kill(self) -> None:
         """Kill it, as power loss would."""
