@@ -36,6 +36,9 @@ ARG EXTRAS=""
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
       ".${EXTRAS:+[$EXTRAS]}" \
     && rm /opt/rosproxy/bin/rosproxy-operator
+# rich needs these to colour source code and to show Markdown, and we show neither: 11 MB.
+RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python uninstall --yes \
+      pygments markdown-it-py mdurl
 
 
 FROM base AS proxy

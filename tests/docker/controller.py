@@ -52,7 +52,8 @@ class Proxy:
 
     @property
     def networks(self) -> set[str]:
-        return set(inspect(self.sandbox)["NetworkSettings"]["Networks"]) - {UPLINK}
+        found = inspect(self.sandbox, check=False)
+        return set(found["NetworkSettings"]["Networks"]) - {UPLINK} if found else set()
 
     def aliases(self, network: str) -> set[str]:
         found = inspect(self.sandbox)

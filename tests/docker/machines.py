@@ -41,6 +41,8 @@ class Machine:
     def node(self, name: str, library: str, role: str, *options: str) -> Log:
         """Start a test node; what it prints goes to a file."""
         file = f"/tmp/{name}.log"
+        # What a node of that name in another test has printed must not be taken for this one's.
+        (self.root / file.lstrip("/")).unlink(missing_ok=True)
         command = node_command(library, role, *options, f"__name:={name}")
         self.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {' '.join(command)} >{file} 2>&1")
         return Log(lambda: self._read(file))

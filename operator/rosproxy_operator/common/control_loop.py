@@ -145,9 +145,9 @@ class ControlLoop:
             took = f"the {self._pace.engine} took more than {self._pace.longest:.0f} s"
             self._failed(LookFailed(took, away=True))
         except LookFailed as error:
-            self._failed(error)
             if error.away and not patient:
-                raise
+                raise  # whoever asked tells it
+            self._failed(error)
         else:
             self._succeeded()
         finally:

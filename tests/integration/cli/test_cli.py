@@ -44,7 +44,7 @@ async def test_status_as_a_table(proxy: Proxy, node: FakeNode) -> None:
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header())
         await read_header(wire)
-        result = await run("status", "--admin", admin_url(proxy), COLUMNS="200")
+        result = await run("status", "--admin", admin_url(proxy))
     assert (result.code, result.err) == (0, "")
     row = next(line for line in result.out.splitlines() if line.startswith("/talker"))
     port = proxy.settings.ports.listen.first
