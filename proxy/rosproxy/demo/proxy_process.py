@@ -23,8 +23,9 @@ class DemoError(Exception):
 
 
 def clean_environment(**more: str) -> dict[str, str]:
-    """The environment, without anything that is meant for a proxy or for ROS."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "ROSPROXY_"))}
+    """The environment, without what is meant for ROS, for a proxy or for another terminal."""
+    foreign = ("ROS_", "ROSPROXY_", "COLUMNS", "LINES")
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(foreign)}
     return kept | more
 
 
