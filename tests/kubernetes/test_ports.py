@@ -15,15 +15,21 @@ def window(first: int, last: int) -> dict[str, int]:
 
 def ports_on(made: RosProxy, node: str) -> str:
     """The range on a node once a proxy is there that nothing keeps from running."""
-    wait_until(lambda: _runs(made, node), 60, lambda: f"a proxy on {node}: {made.tell()}")
-    found = made.proxy_on(node)
-    assert found is not None
-    return found.ports
+    seen: list[str] = []
+
+    def runs() -> bool:
+        seen.append(_range(made, node))  # kept: a proxy that is made anew may be gone by then
+        return bool(seen[-1])
+
+    wait_until(runs, 60, lambda: f"a proxy on {node}: {made.tell()}")
+    return seen[-1]
 
 
-def _runs(made: RosProxy, node: str) -> bool:
+def _range(made: RosProxy, node: str) -> str:
+    """The range of the proxy that runs on a node; empty if none does."""
     found = made.proxy_on(node)
-    return found is not None and found.body.get("status", {}).get("phase") == "Running"
+    running = found is not None and found.body.get("status", {}).get("phase") == "Running"
+    return found.ports if found and running else ""
 
 
 def test_ports_of_another_pod_are_left_alone(net: Namespace) -> None:
@@ -112,6 +118,4 @@ def test_number_of_ports_is_changed(net: Namespace) -> None:
     net.idle(on="node1")
     assert ports_on(made, "node1") == "12400-12403"
     made.change(ports=6)
-    wait_until(
-        lambda: _runs(made, "node1") and ports_on(made, "node1") == "12400-12405", 60, made.tell
-    )
+    wait_until(lambda: _range(made, "node1") == "12400-12405", 60, made.tell)
