@@ -40,6 +40,13 @@ def node_status(lab: Lab, name: str) -> dict[str, Any]:
     return next(found, {"data_plane": {}, "connections": []})
 
 
+def in_table(lab: Lab, name: str) -> bool:
+    """Whether ``rosproxy status`` tells as many connections through the kernel as its JSON does."""
+    plane, text = plane_of(lab, name), lab.rosproxy("status").output
+    counted = text.replace("1 connection ", "1 connections ")
+    return f"{plane['connections']} connections through port {plane['port']}" in counted
+
+
 def plane_of(lab: Lab, name: str) -> dict[str, Any]:
     """What the status says of how a node's topics are forwarded."""
     return node_status(lab, name)["data_plane"]
