@@ -62,7 +62,12 @@ class Recovery:
         self._announcing = asyncio.Lock()
 
     async def ensure(self) -> None:
-        """Have the registry rebuilt from the master, once. Raises Unreachable.
+        """Have the registry rebuilt from the master, once. Raises Unreachable."""
+        if not self._done:
+            await self._recover_once()
+
+    async def _recover_once(self) -> None:
+        """Recover, unless another caller does so meanwhile.
 
         All who wait for the same attempt share its failure: a master that hangs would keep the
         last of them waiting for as many attempts as there are callers.
