@@ -200,7 +200,8 @@ async def serving(directory: Path, port: int = 0) -> AsyncIterator[ApiServer]:
 async def listening(server: ApiServer, port: int = 0) -> AsyncIterator[None]:
     application = web.Application()
     application.router.add_route("*", "/{path:.*}", server.serve)
-    runner = web.AppRunner(application, shutdown_timeout=0.1)
+    # A watch ends with its client, as the real server's do; it would be counted for ever otherwise.
+    runner = web.AppRunner(application, shutdown_timeout=0.1, handler_cancellation=True)
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", port).start()
     server.url = f"http://127.0.0.1:{runner.addresses[0][1]}"
