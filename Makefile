@@ -58,7 +58,7 @@ check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pytest -q -n 2 tests/unit
+	$(BIN)/pytest -q -n 2 --hypothesis-profile=brief tests/unit
 
 .PHONY: format
 format: $(VENV)/.dev ## rewrite the sources in the house format

@@ -77,6 +77,14 @@ def proxies(*, check: bool = True) -> list[Proxy]:
     return [Proxy(name) for name in sorted(names)]
 
 
+def published_ranges() -> list[range]:
+    """The ranges of all proxies in one look: one that is being replaced can't be inspected."""
+    found = docker("ps", "--all", "--filter", MANAGED, "--filter", "label=io.rosproxy.role=ports",
+                   "--format", '{{.Label "io.rosproxy.range"}}').splitlines()  # fmt: skip
+    ends = [tuple(map(int, text.split("-"))) for text in found]
+    return [range(first, last + 1) for first, last in ends]
+
+
 def the_proxy(seconds: float = 30) -> Proxy:
     """Wait for a single proxy that runs, and return it."""
     wait_until(

@@ -7,7 +7,7 @@ from contextlib import closing
 
 import pytest
 
-from tests.docker.controller import WINDOW, Controller, the_proxy
+from tests.docker.controller import WINDOW, Controller, published_ranges, the_proxy
 from tests.docker.engine import docker, wait_until
 from tests.docker.inside import ENABLE, Inside
 from tests.docker.robot import Robot
@@ -89,7 +89,9 @@ def test_range_grows_in_place(
         net.idle(network, labels=(ENABLE, "rosproxy.ports=12"))
         changed = time.time()
 
-        wait_until(lambda: len(the_proxy().ports) == 12, 60, "the range has grown")
+        wait_until(
+            lambda: [len(one) for one in published_ranges()] == [12], 60, "the range has grown"
+        )
 
         flow.wait(since=time.time())
         print(f"range extended: {flow.gaps(changed)}")
@@ -115,7 +117,10 @@ def test_range_taken_by_another_while_the_proxy_was_down(
 
     controller.start()
 
-    wait_until(lambda: before[1] not in the_proxy(40).ports, 40, controller.logs)
+    wait_until(
+        lambda: [before[1] in one for one in published_ranges()] == [False], 40, controller.logs
+    )
+    the_proxy(40)
     assert "HAS LEFT ITS PORTS" in controller.logs()
     docker("restart", "--time", "0", node.name)
     ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
