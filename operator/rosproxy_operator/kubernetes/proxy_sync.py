@@ -11,12 +11,15 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.kubernetes.resources.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT
-from rosproxy_operator.kubernetes.resources.proxy_status import no_answer, report
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +33,10 @@ SILENT = 2
 """Unanswered questions in a row before a proxy counts as silent."""
 AT_ONCE = 32
 """Proxies that are asked at the same time."""
+RECENT = 300.0
+"""Seconds that a problem counts: a proxy tells the last ones, however old they are."""
+_LONGEST = 300
+"""Characters of a problem or an error, which may be of any size there."""
 
 
 class ProxyPoller:
@@ -154,3 +161,32 @@ class ClusterProxySync:
 def address_of(proxy: ProxyPod) -> HostPort:
     """Where a proxy answers the operator."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)
+
+
+def report(status: ProxyStatus) -> ProxyReport:
+    """What a proxy says. Nodes that it has given up already are not among its nodes."""
+    master, nodes = status.master, nodes_by_address(status)
+    every = [node for there in nodes.values() for node in there]
+    return ProxyReport(
+        answered=True,
+        master_up=master.up,
+        error="" if master.up else _short(master.error or "not asked yet"),
+        nodes={
+            address: tuple(sorted({name for node in there for name in node.nodes}))
+            for address, there in nodes.items()
+        },
+        topics=frozenset(topic for node in every for topic in node.publishes + node.subscribes),
+        used=status.ports.used,
+        problems=tuple(
+            _short(f"{one.subject}: {one.text}") for one in status.problems if one.age <= RECENT
+        ),
+    )
+
+
+def no_answer(error: str) -> ProxyReport:
+    """What is known of a proxy that does not answer."""
+    return ProxyReport(answered=False, error=_short(error))
+
+
+def _short(text: str) -> str:
+    return bounded(clean(text), _LONGEST)

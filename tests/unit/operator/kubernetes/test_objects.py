@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
+from rosproxy_operator.kubernetes.proxy_sync import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.model import ELSEWHERE, Name
 from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
-from rosproxy_operator.kubernetes.resources.proxy_status import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
     CLUSTER_IP,
@@ -74,9 +74,9 @@ def test_a_pod():
 
 
 def test_a_pod_at_admission_has_neither_name_nor_node():
-    obj = {"metadata": {"generateName": "talker-"}, "spec": {"containers": [{"name": "ros"}]}}
+    meta = {"generateName": "talker-", "namespace": "robots"}
 
-    found = pod(obj, "robots")
+    found = pod({"metadata": meta, "spec": {"containers": [{"name": "ros"}]}})
 
     assert found.id == Name("robots", "")
     assert (found.uid, found.node, found.ip, found.phase) == ("", "", "", "Pending")

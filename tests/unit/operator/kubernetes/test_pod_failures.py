@@ -4,8 +4,6 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.resources.api_objects import PodObject
-from rosproxy_operator.kubernetes.resources.fields import lenient
 from rosproxy_operator.kubernetes.resources.model import Stuck
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck as stuck_by_status
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
@@ -18,7 +16,7 @@ NO_PORTS = (
 
 
 def stuck(obj: dict[str, Any]) -> tuple[Stuck | None, str]:
-    return stuck_by_status(lenient(obj, PodObject).status)
+    return stuck_by_status(obj["status"])
 
 
 def scheduled(reason: str, message: str) -> dict[str, Any]:
