@@ -11,16 +11,16 @@ import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jsonpatch
+import kopf
 import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes import kopf_log, watch
+from rosproxy_operator.kubernetes import watch
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
@@ -68,8 +68,9 @@ class Running:
         rotation.pair = PAIR
         settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
         serving = WebhookServer(HostPort("127.0.0.1", self.webhook), rotation)
-        self.injector = Injector(api, self.metrics, self.controller.wake)
-        self.watch = ClusterWatch(settings, self.controller, self.injector, serving, self.metrics)
+        injector = Injector(api, self.metrics, self.controller.wake)
+        controller: Any = self.controller
+        self.watch = ClusterWatch(settings, controller, (injector, serving), self.metrics)
 
     async def health(self) -> tuple[int, str]:
         return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
@@ -101,7 +102,7 @@ async def running(
 ) -> AsyncIterator[Running]:
     monkeypatch.setattr(watch, "BACK_OFF", (0.05,))
     monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.05,))
-    kopf_log.quieten()
+    watch.quieten()
     one = Running(server, api)
     one.watch.start()
     await until(lambda: watched(server))
@@ -207,7 +208,7 @@ async def test_a_missing_rule_is_told_once(
     server: ApiServer, api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.02,))
-    kopf_log.quieten()
+    watch.quieten()
     text = 'User "x" cannot list resource "nodes" in API group "" at the cluster scope'
     server.refuse("GET", "nodes", 403, text)
     one = Running(server, api)
@@ -343,12 +344,10 @@ async def test_nonsense_is_refused(running: Running) -> None:
         caught.value.close()
 
 
-def test_everything_that_would_surprise_is_off(tmp_path: Path) -> None:
-    import kopf
-
-    settings = kopf.OperatorSettings()
-    one = ClusterWatch(KubernetesSettings(), Woken(), None, None, ClusterMetrics())
-    one.configure(settings)
+async def test_everything_that_would_surprise_is_off() -> None:
+    settings, controller = kopf.OperatorSettings(), cast(Any, Woken())
+    one = ClusterWatch(KubernetesSettings(), controller, None, ClusterMetrics())
+    await one.configure(settings)
     assert not settings.posting.enabled
     assert settings.scanning.disabled
     assert settings.peering.standalone
