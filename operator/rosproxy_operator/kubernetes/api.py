@@ -38,9 +38,12 @@ WITHIN: Timeout = (3.0, 15.0)
 """Seconds to connect and to wait for an answer."""
 SOON: Timeout = (1.0, 2.0)
 """The same while somebody waits for a pod to be admitted."""
-_CORE = "/api/v1"
-_CUSTOM = f"/apis/{GROUP}/{VERSION}"
-_WEBHOOKS = "/apis/admissionregistration.k8s.io/v1/mutatingwebhookconfigurations"
+WEBHOOKS = "mutatingwebhookconfigurations"
+_ROOTS = {
+    PLURAL: f"/apis/{GROUP}/{VERSION}",
+    WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
+}
+"""Where kinds are found that are not of the core group."""
 _CONNECTIONS = 16
 
 
@@ -66,11 +69,8 @@ class Api:
     def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[Found]:
         """All RosProxies, or those of a namespace, as they are at this moment."""
         places = (namespace,) if namespace else self._places
-        return [
-            found
-            for place in places
-            for found in self._items(self._ask("GET", _path(_CUSTOM, place, PLURAL), within=within))
-        ]
+        lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
+        return [found for each in lists for found in self._items(each)]
 
     def nodes(self) -> list[Found]:
         """All nodes."""
@@ -92,38 +92,24 @@ class Api:
     def events_of(self, pod: Name, uid: str, reason: str) -> list[Found]:
         """The Events with a reason about a pod."""
         query = {"fieldSelector": f"involvedObject.uid={uid},reason={reason}"}
-        return self._items(self._ask("GET", _path(_CORE, pod.namespace, "events"), query))
+        return self._items(self._ask("GET", _path("events", pod.namespace), query))
 
     def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> Found:
-        """One object of the core group, for example of the kind ``services``."""
-        return self._ask("GET", _path(_CORE, id.namespace, kind, id.name), within=within)
+        """One object, for example of the kind ``services``."""
+        return self._ask("GET", _path(kind, id.namespace, id.name), within=within)
 
-    def create(self, kind: str, body: Json) -> Found:
-        """Create an object of the core group in the namespace that it names."""
-        path = _path(_CORE, body["metadata"]["namespace"], kind)
-        return self._ask("POST", path, body=body)
+    def create(self, kind: str, body: Json) -> None:
+        """Create an object in the namespace that it names."""
+        self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body)
 
     def delete(self, kind: str, id: Name, uid: str) -> None:
-        """Delete an object of the core group if it still has this uid."""
+        """Delete an object if it still has this uid."""
         options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": {"uid": uid}}
-        self._ask("DELETE", _path(_CORE, id.namespace, kind, id.name), body=options)
+        self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
 
-    def patch(self, kind: str, id: Name, operations: list[Json]) -> Found:
-        """Change an object of the core group by a JSON patch."""
-        return self._ask("PATCH", _path(_CORE, id.namespace, kind, id.name), body=operations)
-
-    def patch_status(self, id: Name, operations: list[Json]) -> None:
-        """Change the status of a RosProxy by a JSON patch."""
-        path = _path(_CUSTOM, id.namespace, PLURAL, id.name)
-        self._ask("PATCH", f"{path}/status", body=operations)
-
-    def webhook_configuration(self, name: str) -> Found:
-        """A MutatingWebhookConfiguration."""
-        return self._ask("GET", f"{_WEBHOOKS}/{quote(name, safe='')}")
-
-    def patch_webhook_configuration(self, name: str, operations: list[Json]) -> None:
-        """Change a MutatingWebhookConfiguration by a JSON patch."""
-        self._ask("PATCH", f"{_WEBHOOKS}/{quote(name, safe='')}", body=operations)
+    def patch(self, kind: str, id: Name, operations: list[Json]) -> None:
+        """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
+        self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations)
 
     @property
     def _places(self) -> tuple[str, ...]:
@@ -136,7 +122,7 @@ class Api:
         It may lag behind a little, but never behind a list before: another API server, which lags
         more, would otherwise make pods seem gone that are not.
         """
-        path = _path(_CORE, namespace, kind)
+        path = _path(kind, namespace)
         version = {"resourceVersion": self._versions.get(kind, "0")}
         if kind in self._versions:
             version["resourceVersionMatch"] = "NotOlderThan"
@@ -233,6 +219,8 @@ def _configuration() -> Any:
     return configuration
 
 
-def _path(root: str, namespace: str, kind: str, name: str = "") -> str:
-    parts = ["namespaces", namespace, kind] if namespace else [kind]
-    return "/".join([root, *(quote(part, safe="") for part in [*parts, name] if part)])
+def _path(kind: str, namespace: str, name: str = "") -> str:
+    """Where objects of a kind, or one of them or a part of it as ``kind/part``, are found."""
+    kind, _, part = kind.partition("/")
+    where = ["namespaces", namespace, kind, name, part] if namespace else [kind, name, part]
+    return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(one, safe="") for one in where if one)])

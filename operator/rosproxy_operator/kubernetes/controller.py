@@ -21,13 +21,13 @@ from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
-from rosproxy_operator.kubernetes.events import stamp
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
+from rosproxy_operator.kubernetes.status.events import stamp
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from typing import Protocol
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, Found
+from rosproxy_operator.kubernetes.api import WEBHOOKS, Api, Found
 from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.settings import WebhookSettings
@@ -202,10 +202,10 @@ class SelfSigned:
         if not self._configuration:
             return True
         try:
-            there = self._api.webhook_configuration(self._configuration)
-            operations = trust_patch(there, authorities)
+            name = Name("", self._configuration)
+            operations = trust_patch(self._api.get(WEBHOOKS, name), authorities)
             if operations:
-                self._api.patch_webhook_configuration(self._configuration, operations)
+                self._api.patch(WEBHOOKS, name, operations)
                 log.info("webhook: its CA is now in %s", self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
