@@ -8,7 +8,7 @@ import ssl
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -297,12 +297,12 @@ async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> 
 
 async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
     class Broken:
-        every = 1.0
+        every, problems = 1.0, ()
 
         def refresh(self) -> KeyPair:
             raise RuntimeError("oops")
 
-    one = CertificateRotation(Broken(), ClusterMetrics())
+    one = CertificateRotation(cast(Any, Broken()), ClusterMetrics())
     await one.refresh()
     assert one.pair is None
     assert "the operator failed: RuntimeError('oops')" in caplog.text
