@@ -65,7 +65,7 @@ class Field:
         kind = type(default)
         fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
         if not fits or not least <= self.value <= most:
-            word = "an integer" if kind is int else "a number"
+            word = {int: "an integer", float: "a number"}[kind]
             raise self.refused("does not fit", f"write {word} from {least} to {most}")
         return kind(self.value)
 

@@ -57,11 +57,15 @@ def verdicts(
     ``nodes`` is how many ROS nodes there are; ``former`` is the status as it was.
     """
     wanted = [state for state in states if state.pods]
+    degraded = Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
+    if problems:
+        lines = "; ".join(map(one_line, problems))
+        degraded = Condition(DEGRADED, "True", reason_of(problems[0]), lines)
     return (
         _ready(rosproxy, wanted, problems, nodes),
         _ports(wanted, problems),
         _master(states, problems, former),
-        _degraded(problems),
+        degraded,
     )
 
 
@@ -70,11 +74,8 @@ def conditions(
 ) -> list[dict[str, object]]:
     """Conditions as the API server takes them.
 
-    Args:
-        judged: What they say.
-        former: The status as it was: a condition whose status is still the same keeps its time.
-        generation: That of the object.
-        stamp: The time for the others, as RFC 3339 has it.
+    One whose status is the same as in the ``former`` status keeps its time; the time of the others
+    is ``stamp``, in RFC 3339.
     """
     return [
         {
@@ -93,6 +94,11 @@ def condition(status: Json, type: str) -> Json:
     """A condition in a status, empty if it is not there."""
     found = (one for one in parts(status, "conditions") if one.get("type") == type)
     return next(found, {})
+
+
+def read(was: Json) -> Condition:
+    """A condition out of a status."""
+    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
 
 
 def one_line(problem: Problem) -> str:
@@ -114,37 +120,28 @@ def _ready(
     rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[Problem], nodes: int
 ) -> Condition:
     if not wanted:
-        return Condition(READY, "True", _NO_PODS, _no_pods(rosproxy))
+        fix = "give pods the labels that spec.podSelector asks for"
+        if rosproxy.spec.pod_selector is None:
+            fix = f"label pods with {INJECT}=true"
+        return Condition(READY, "True", _NO_PODS, f"no pod is selected: {fix}")
     waiting = [state for state in wanted if not serving(state)]
     if not waiting:
-        proxies = f"{len(wanted)} of {len(wanted)} proxies"
-        text = f"{proxies} serve {plural(nodes, 'ROS node')}"
+        text = f"{len(wanted)} of {len(wanted)} proxies serve {plural(nodes, 'ROS node')}"
         return Condition(READY, "True", "Serving", text)
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:
         return Condition(READY, "False", reason_of(blocking[0]), one_line(blocking[0]))
-    return Condition(READY, "False", "ProxiesStarting", _starting(waiting[0]))
-
-
-def _no_pods(rosproxy: RosProxy) -> str:
-    if rosproxy.spec.pod_selector is None:
-        return f"no pod is selected: label pods with {INJECT}=true"
-    return "no pod is selected: give pods the labels that spec.podSelector asks for"
+    name, proxy = waiting[0].name, waiting[0].proxy
+    doing = "its proxy is being created"
+    if proxy is not None and not proxy.pod.deleting:
+        doing = f"its proxy {proxy.pod.id.name} is starting"
+    return Condition(READY, "False", "ProxiesStarting", f"node {name}: {doing}")
 
 
 def _of_pod(problem: Problem) -> bool:
     """Whether it concerns one of the users' pods, without which the others are served."""
-    return (
-        isinstance(problem, ClusterFinding)
-        and problem.about is not None
-        and problem.about.kind == "Pod"
-    )
-
-
-def _starting(state: NodeState) -> str:
-    if state.proxy is None or state.proxy.pod.deleting:
-        return f"node {state.name}: its proxy is being created"
-    return f"node {state.name}: its proxy {state.proxy.pod.id.name} is starting"
+    about = problem.about if isinstance(problem, ClusterFinding) else None
+    return about is not None and about.kind == "Pod"
 
 
 def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Condition:
@@ -163,23 +160,13 @@ def _ports(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Conditio
 def _master(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Condition:
     """Of proxies that are not asked yet nothing is known: what was so far holds on."""
     proxies = [state for state in states if state.proxy is not None]
-    answers = [state.answer for state in proxies]
-    answered_reports = [answer for answer in answers if answer is not None and answer.answered]
-    if any(not answer.master_up for answer in answered_reports):
+    answers = [one.answer for one in proxies if one.answer is not None and one.answer.answered]
+    if not all(answer.master_up for answer in answers):
         lines = [one_line(one) for one in problems if reason_of(one) == NO_MASTER]
         return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
-    was = condition(former, MASTER)
-    if len(answered_reports) == len(proxies) and proxies:
+    if not proxies:
+        return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
+    if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
-    if proxies and was:
-        return Condition(MASTER, word(was, "status"), word(was, "reason"), word(was, "message"))
-    if proxies:
-        return Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
-    return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
-
-
-def _degraded(problems: Sequence[Problem]) -> Condition:
-    if not problems:
-        return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
-    lines = "; ".join(map(one_line, problems))
-    return Condition(DEGRADED, "True", reason_of(problems[0]), lines)
+    was = condition(former, MASTER)
+    return read(was) if was else Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")

@@ -21,6 +21,7 @@ from rosproxy_operator.kubernetes.status.conditions import (
     Condition,
     conditions,
     one_line,
+    read,
     serving,
     verdicts,
 )
@@ -52,14 +53,10 @@ def status_of(
     What only proxies can tell stays as it was until they have been asked, so that an operator that
     is started changes nothing.
 
-    Args:
-        rosproxy: It, with the status that it has.
-        states: Its nodes.
-        problems: All that is wrong with it: `findings`, those of its pods, and others. Those that
-            are no Finding count as such with the reason Problem.
-        service: Its Service, None if it is yet to be made.
-        master: The URI of the real master as the proxies use it, empty if it is not known.
-        stamp: The time for conditions that change, as RFC 3339 has it.
+    ``problems`` are all that is wrong with it: `findings`, those of its pods, and others.
+    ``service`` is None if it is yet to be made. ``master`` is the URI of the real master as the
+    proxies use it, empty if it is not known; ``stamp`` the time for conditions that change, in
+    RFC 3339.
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
@@ -68,10 +65,14 @@ def status_of(
     nodes = sum(number(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
     judged = verdicts(rosproxy, states, problems, nodes, former)
+    # The former one as long as there is no Service: it is to be had again.
+    uri = word(former, "masterURI")
+    if service is not None and service.cluster_ip:
+        uri = master_uri(service.cluster_ip)
     return {
         "observedGeneration": rosproxy.generation,
         "master": master,
-        "masterURI": _master_uri(service, former),
+        "masterURI": uri,
         "nodes": len(wanted),
         "proxies": f"{sum(map(serving, wanted))}/{len(wanted)}",
         "rosNodes": nodes,
@@ -90,7 +91,7 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     former, text = rosproxy.status, rosproxy.text
     judged = [
         Condition(READY, "False", _INVALID, text),
-        *(_same(one) for one in parts(former, "conditions") if one.get("type") not in _OVERRULED),
+        *(one for one in map(read, parts(former, "conditions")) if one.type not in _OVERRULED),
         Condition(DEGRADED, "True", _INVALID, text),
     ]
     return {
@@ -103,10 +104,6 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
 _OVERRULED = (READY, DEGRADED)
 
 
-def _same(was: Json) -> Condition:
-    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
-
-
 def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
     """The nodes to be told, by name; those without pods are the first to be left out."""
     first = sorted(states, key=lambda one: (not one.pods, one.proxy is None, one.name))
@@ -114,7 +111,7 @@ def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
 
 
 def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]:
-    proxy = state.proxy
+    proxy, wrong = state.proxy, next(of_node(rosproxy, state), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
@@ -123,7 +120,7 @@ def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]
         "ready": serving(state),
         "pods": len(state.pods),
         **_ros(state, names, rosproxy.status),
-        "message": _message(rosproxy, state),
+        "message": bounded(one_line(wrong), _MESSAGE) if wrong else "",
     }
     return {key: value for key, value in line.items() if value != ""}
 
@@ -147,11 +144,6 @@ def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
     return answer is not None and answer.answered
 
 
-def _message(rosproxy: RosProxy, state: NodeState) -> str:
-    found = next(of_node(rosproxy, state), None)
-    return bounded(one_line(found), _MESSAGE) if found else ""
-
-
 def _topics(states: Sequence[NodeState], former: Json) -> int:
     answers = [state.answer for state in states if state.proxy is not None]
     known = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
@@ -164,12 +156,3 @@ def _ports(states: Sequence[NodeState]) -> str:
     if len(set(given.values())) <= 1:
         return next(iter(given.values()), "")
     return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(given.items())), _PORTS)
-
-
-def _master_uri(service: ProxyService | None, former: Json) -> str:
-    """The former one as long as there is no Service: it is to be had again."""
-    return (
-        master_uri(service.cluster_ip)
-        if service and service.cluster_ip
-        else word(former, "masterURI")
-    )
