@@ -16,9 +16,12 @@ for single objects, by name::
 Objects go in and out as JSON: the client's models would drop fields that are newer than they are.
 """
 
+import contextlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any
 from urllib.parse import quote
 
@@ -28,9 +31,9 @@ from kubernetes.config import ConfigException, load_incluster_config, load_kube_
 from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, refusal, unreachable
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
+from rosproxy_operator.kubernetes.resources.values import part, word
 
 Found = dict[str, Any]
 Timeout = tuple[float, float]
@@ -45,6 +48,45 @@ _ROOTS = {
 }
 """Where kinds are found that are not of the core group."""
 _CONNECTIONS = 16
+
+
+_RBAC = re.compile(
+    r'cannot (?P<verb>\w+) resource "(?P<resource>[^"]*)" in API group "(?P<group>[^"]*)"'
+    r'(?: in the namespace "(?P<namespace>[^"]*)")?'
+)
+_TERMINATING = "because it is being terminated"
+"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted."""
+_TEST_FAILED = "the server rejected our request due to an error in our request"
+"""All that the API server says when a ``test`` of a JSON patch fails."""
+_LONGEST = 500
+
+
+class ErrorKind(Enum):
+    """Why the API server did not do what it was asked, as far as that makes a difference."""
+
+    AWAY = "away"  # it can't be reached, or is not ready to answer
+    GONE = "gone"
+    CONFLICT = "conflict"  # the name is taken, or the object is another one by now
+    INVALID = "invalid"  # the object is not one that the API server takes
+    OTHER = "other"
+
+
+_KINDS = {
+    400: ErrorKind.INVALID,
+    401: ErrorKind.AWAY,  # the token has just been replaced, or the server does not know it yet
+    404: ErrorKind.GONE,
+    409: ErrorKind.CONFLICT,
+    422: ErrorKind.INVALID,
+    429: ErrorKind.AWAY,
+}
+
+
+class ApiError(Exception):
+    """The API server did not do what it was asked; the message is one line."""
+
+    def __init__(self, kind: ErrorKind, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class Api:
@@ -135,15 +177,11 @@ class Api:
             self._versions.pop(kind, None)
             found = self._ask("GET", path, query)
         items = self._items(found)
-        metadata = found.get("metadata")
-        self._note(kind, metadata if isinstance(metadata, dict) else {})
+        newest = word(part(found, "metadata"), "resourceVersion")
+        # Lists of a kind are asked for side by side.
+        if newest.isdecimal() and int(newest) > int(self._versions.get(kind, "0")):
+            self._versions[kind] = newest
         return items
-
-    def _note(self, kind: str, metadata: Found) -> None:
-        """Remember how new a list was. Lists of a kind are asked for side by side."""
-        version = str(metadata.get("resourceVersion") or "")
-        if version.isdecimal() and int(version) > int(self._versions.get(kind, "0")):
-            self._versions[kind] = version
 
     def _items(self, found: Found) -> list[Found]:
         items = found.get("items")
@@ -159,12 +197,28 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> Found:
+        patch = isinstance(body, list)
+        headers = {
+            "Accept": "application/json",
+            "Content-Type": "application/json-patch+json" if patch else "application/json",
+        }
         try:
-            status, reason, data = self._call(method, path, query or {}, body, within)
+            request = self._client.param_serialize(
+                method,
+                path,
+                query_params=[*(query or {}).items()],
+                header_params=headers,
+                body=body,
+                auth_settings=["BearerToken"],
+            )
+            answer: Any = self._client.call_api(*request, _request_timeout=within)
+            status, reason, data = int(answer.status), answer.reason, bytes(answer.read())
         except (HTTPError, ApiException, ConfigException, OSError) as error:
-            raise unreachable(self.server, error) from error
+            text = " ".join(str(error).split())[:200] or type(error).__name__
+            text = f"the API server at {self.server} can't be reached: {text}"
+            raise ApiError(ErrorKind.AWAY, text) from error
         if not 200 <= status <= 299:
-            raise refusal(status, reason, data)
+            raise refusal(status, str(reason or ""), data)
         try:
             found = json.loads(data)
         except ValueError:
@@ -172,31 +226,6 @@ class Api:
         if not isinstance(found, dict):
             raise ApiError(ErrorKind.AWAY, f"what answers at {self.server}{path} is no API server")
         return found
-
-    def _call(
-        self,
-        method: str,
-        path: str,
-        query: Mapping[str, str],
-        body: Json | list[Json] | None,
-        within: Timeout,
-    ) -> tuple[int, str, bytes]:
-        """HTTP status, reason phrase and body of what is answered."""
-        patch = isinstance(body, list)
-        headers = {
-            "Accept": "application/json",
-            "Content-Type": "application/json-patch+json" if patch else "application/json",
-        }
-        request = self._client.param_serialize(
-            method,
-            path,
-            query_params=list(query.items()),
-            header_params=headers,
-            body=body,
-            auth_settings=["BearerToken"],
-        )
-        answer: Any = self._client.call_api(*request, _request_timeout=within)
-        return int(answer.status), str(answer.reason or ""), bytes(answer.read())
 
 
 def _configuration() -> Any:
@@ -224,3 +253,49 @@ def _path(kind: str, namespace: str, name: str = "") -> str:
     kind, _, part = kind.partition("/")
     where = ["namespaces", namespace, kind, name, part] if namespace else [kind, name, part]
     return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(one, safe="") for one in where if one)])
+
+
+def refusal(status: int, reason: str, body: bytes) -> ApiError:
+    """The error for what the API server answered: HTTP status, reason phrase, body."""
+    message = _message(body) or reason
+    kind = _KINDS.get(status, ErrorKind.AWAY if status >= 500 else ErrorKind.OTHER)
+    if status == 403:
+        return _forbidden(message)
+    if status == 422 and message == _TEST_FAILED:
+        return ApiError(ErrorKind.CONFLICT, "the object has changed meanwhile")
+    if status == 401:
+        message = f"the API server does not know the operator's token or certificate ({message})"
+    elif kind is ErrorKind.AWAY:
+        message = f"the API server answers HTTP {status}: {message}"
+    return ApiError(kind, message)
+
+
+def missing_rule(message: str) -> str:
+    """The rule that the operator's role lacks, by the API server's words; empty if it is none."""
+    found = _RBAC.search(message)
+    if found is None:
+        return ""
+    where = f" in the namespace {found['namespace']}" if found["namespace"] else ""
+    return (
+        f"the operator's role lacks a rule{where}: "
+        f'apiGroups ["{found["group"]}"], resources ["{found["resource"]}"], '
+        f'verbs ["{found["verb"]}"]'
+    )
+
+
+def _forbidden(message: str) -> ApiError:
+    """Why it is forbidden: by a role, or by an admission plug-in that has looked at the object."""
+    if _TERMINATING in message:
+        return ApiError(ErrorKind.GONE, message)
+    rule = missing_rule(message)
+    if rule:
+        return ApiError(ErrorKind.OTHER, f"{rule} ({message})")
+    return ApiError(ErrorKind.INVALID, message)
+
+
+def _message(body: bytes) -> str:
+    """The message of the ``Status`` object with which the API server refuses."""
+    text = body.decode(errors="replace")
+    with contextlib.suppress(ValueError, KeyError, TypeError):  # something else has answered
+        text = str(json.loads(text)["message"])
+    return " ".join(text.split())[:_LONGEST]

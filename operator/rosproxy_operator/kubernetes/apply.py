@@ -14,8 +14,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -248,12 +247,10 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
 
 def _patch_status(api: Api, action: PatchStatus, observed: ClusterSnapshot) -> None:
     """Replace the whole status, of the RosProxy with this uid only."""
-    found = next((each for each in observed.rosproxies if each.id == action.of), None)
-    there = found or observed.unusable.get(action.of)
-    if there is None or there.status == action.status:
-        return
+    every = (*observed.rosproxies, *observed.unusable.values())
+    uid = next(one.uid for one in every if one.id == action.of)
     operations: list[Json] = [
-        {"op": "test", "path": "/metadata/uid", "value": there.uid},
+        {"op": "test", "path": "/metadata/uid", "value": uid},
         {"op": "add", "path": "/status", "value": action.status},
     ]
     api.patch(f"{PLURAL}/status", action.of, operations)

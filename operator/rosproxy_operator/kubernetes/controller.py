@@ -17,9 +17,8 @@ from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.apply import ClusterApplier
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState

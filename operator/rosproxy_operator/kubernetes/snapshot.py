@@ -13,8 +13,7 @@ from typing import TypeVar
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.selection import label_selector
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import (

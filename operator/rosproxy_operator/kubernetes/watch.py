@@ -18,8 +18,8 @@ from typing import Any, cast
 import kopf
 
 from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.kubernetes.api import missing_rule
 from rosproxy_operator.kubernetes.controller import KubernetesController
-from rosproxy_operator.kubernetes.errors import missing_rule
 from rosproxy_operator.kubernetes.resources.names import GROUP, INJECT, PLURAL, VERSION
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector

@@ -16,8 +16,7 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import SOON, Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind, Found
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
 from rosproxy_operator.kubernetes.resources.fields import InvalidField

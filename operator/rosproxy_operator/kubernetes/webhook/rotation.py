@@ -10,8 +10,7 @@ from pathlib import Path
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import WEBHOOKS, Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import WEBHOOKS, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 from rosproxy_operator.kubernetes.settings import WebhookSettings

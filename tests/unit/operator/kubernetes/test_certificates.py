@@ -15,8 +15,7 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError
+from rosproxy_operator.kubernetes.api import Api, ApiError
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.webhook import certificates, rotation
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair

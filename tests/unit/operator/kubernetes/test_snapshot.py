@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.resources.model import Name, Stuck
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader, read_master
 from tests.unit.operator.kubernetes.api_server import ApiServer

@@ -15,8 +15,8 @@ from rosproxy_operator.kubernetes.resources.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.status.conditions import LONGEST
 from rosproxy_operator.kubernetes.status.status import (
+    LONGEST,
     MOST_NAMES,
     MOST_NODES,
     invalid_finding,
