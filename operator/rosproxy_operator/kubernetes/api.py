@@ -97,7 +97,7 @@ class Api:
     """
 
     def __init__(self, namespaces: Sequence[str] = ()) -> None:
-        self._namespaces = tuple(namespaces)
+        self._places = tuple(namespaces) or ("",)
         configuration = _configuration()
         self.server = str(configuration.host)
         self._client = ApiClient(configuration)
@@ -152,11 +152,6 @@ class Api:
     def patch(self, kind: str, id: Name, operations: list[Json]) -> None:
         """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
         self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations)
-
-    @property
-    def _places(self) -> tuple[str, ...]:
-        """The namespaces to list; an empty name means all at once."""
-        return self._namespaces or ("",)
 
     def _cached(self, namespace: str, kind: str, query: Mapping[str, str]) -> list[Found]:
         """List from what the API server has in memory, which costs etcd nothing.

@@ -8,7 +8,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
@@ -27,7 +27,14 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
 from rosproxy_operator.kubernetes.proxy_sync import address_of
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Json, Name
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterSnapshot,
+    Failure,
+    InvalidRosProxy,
+    Json,
+    Name,
+    RosProxy,
+)
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
@@ -54,7 +61,7 @@ class ClusterApplier:
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
-        self.failures: dict[Name, tuple[Failure, ...]] = {}
+        self.failures: Mapping[Name, tuple[Failure, ...]] = {}
         self.problems: dict[Name, Problem] = {}
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
@@ -73,7 +80,7 @@ class ClusterApplier:
             doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
             failures = [failure for a in doing if (failure := await self._one(a, observed))]
             if doing:
-                self.failures[of] = tuple(failures)
+                self.failures = {**self.failures, of: tuple(failures)}
             for action in actions:
                 if isinstance(action, PatchStatus):
                     await self._status(action, observed)
@@ -247,7 +254,8 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
 
 def _patch_status(api: Api, action: PatchStatus, observed: ClusterSnapshot) -> None:
     """Replace the whole status, of the RosProxy with this uid only."""
-    every = (*observed.rosproxies, *observed.unusable.values())
+    every: tuple[RosProxy | InvalidRosProxy, ...] = observed.rosproxies
+    every += tuple(observed.unusable.values())
     uid = next(one.uid for one in every if one.id == action.of)
     operations: list[Json] = [
         {"op": "test", "path": "/metadata/uid", "value": uid},

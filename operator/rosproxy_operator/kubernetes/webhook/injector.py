@@ -16,11 +16,11 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind, Found
+from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
-from rosproxy_operator.kubernetes.resources.model import Json, Pod, RosProxy
+from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
 from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.resources.objects import service as parse_service
@@ -104,12 +104,10 @@ class Injector:
         if choice.rosproxy is not None:
             address, hold = self._address(choice.rosproxy, dry_run)
             return wire(body, master_uri(address), choice.rosproxy.spec.host_aliases), hold
-        text = choice.finding.text if choice.finding else self._nobody(pod, rosproxies, unusable)
-        return Wiring(warnings=(NOT_WIRED + text,) if text else ()), 0.0
-
-    def _nobody(self, pod: Pod, rosproxies: list[RosProxy], unusable: list[str]) -> str:
+        if choice.finding is not None:
+            return Wiring(warnings=(NOT_WIRED + choice.finding.text,)), 0.0
         text = nobody(pod, rosproxies)
-        return "; ".join([text, *unusable]) if text else ""
+        return Wiring(warnings=("; ".join([NOT_WIRED + text, *unusable]),) if text else ()), 0.0
 
     def _rosproxies(self, namespace: str) -> tuple[list[RosProxy], list[str]]:
         """Those of a namespace, and what is wrong with those that can't be read."""
@@ -144,13 +142,7 @@ class Injector:
             raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
         if found.owner != of.uid or found.deleting or not found.cluster_ip:
             raise missing
-        return found.cluster_ip, 0.0 if dry_run else _until_known(there, time.time())
-
-
-def _until_known(service: Found, now: float) -> float:
-    """Seconds until all nodes know a Service. ``now`` is in seconds of Unix time."""
-    try:
-        made = datetime.fromisoformat(str(service["metadata"]["creationTimestamp"])).timestamp()
-    except (KeyError, ValueError):
-        return 0.0
-    return min(max(made + YOUNG - now, 0.0), YOUNG)
+        if dry_run:
+            return found.cluster_ip, 0.0
+        made = datetime.fromisoformat(there["metadata"]["creationTimestamp"]).timestamp()
+        return found.cluster_ip, min(max(made + YOUNG - time.time(), 0.0), YOUNG)

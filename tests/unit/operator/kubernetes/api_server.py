@@ -51,6 +51,7 @@ class ApiServer:
         if kind not in ("nodes", "mutatingwebhookconfigurations"):
             meta.setdefault("namespace", namespace)
         meta.setdefault("uid", f"uid-{next(self._numbers)}")
+        meta.setdefault("creationTimestamp", "2026-01-01T00:00:00Z")
         key = kind, meta.get("namespace", ""), meta["name"]
         event = "MODIFIED" if key in self.objects else "ADDED"
         return self._hold(event, key, {"apiVersion": "v1", "kind": PLURALS[kind], **obj})
