@@ -254,8 +254,11 @@ def refusal(status: int, reason: str, body: bytes) -> ApiError:
     """The error for what the API server answered: HTTP status, reason phrase, body."""
     message = _message(body) or reason
     kind = _KINDS.get(status, ErrorKind.AWAY if status >= 500 else ErrorKind.OTHER)
-    if status == 403:
-        return _forbidden(message)
+    if status == 403:  # by a role, or by an admission plug-in that has looked at the object
+        rule, gone = missing_rule(message), _TERMINATING in message
+        if rule:
+            return ApiError(ErrorKind.OTHER, f"{rule} ({message})")
+        return ApiError(ErrorKind.GONE if gone else ErrorKind.INVALID, message)
     if status == 422 and message == _TEST_FAILED:
         return ApiError(ErrorKind.CONFLICT, "the object has changed meanwhile")
     if status == 401:
@@ -276,16 +279,6 @@ def missing_rule(message: str) -> str:
         f'apiGroups ["{found["group"]}"], resources ["{found["resource"]}"], '
         f'verbs ["{found["verb"]}"]'
     )
-
-
-def _forbidden(message: str) -> ApiError:
-    """Why it is forbidden: by a role, or by an admission plug-in that has looked at the object."""
-    if _TERMINATING in message:
-        return ApiError(ErrorKind.GONE, message)
-    rule = missing_rule(message)
-    if rule:
-        return ApiError(ErrorKind.OTHER, f"{rule} ({message})")
-    return ApiError(ErrorKind.INVALID, message)
 
 
 def _message(body: bytes) -> str:

@@ -83,7 +83,11 @@ class ClusterApplier:
                 self.failures = {**self.failures, of: tuple(failures)}
             for action in actions:
                 if isinstance(action, PatchStatus):
-                    await self._status(action, observed)
+                    failure = await self._one(action, observed)
+                    self.problems.pop(of, None)
+                    if failure:
+                        text = f"its status can't be written: {failure.text}"
+                        self.problems[of] = Problem(f"rosproxy {of}", text)
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [each for each in emits if not (failures and each.type == "Normal")]
         await asyncio.gather(*(self._event(each, observed) for each in wanted))
@@ -91,13 +95,6 @@ class ClusterApplier:
     async def _event(self, event: Emit, observed: ClusterSnapshot) -> None:
         async with self._room:
             await self._one(event, observed)
-
-    async def _status(self, action: PatchStatus, observed: ClusterSnapshot) -> None:
-        failure = await self._one(action, observed)
-        self.problems.pop(action.of, None)
-        if failure:
-            text = f"its status can't be written: {failure.text}"
-            self.problems[action.of] = Problem(f"rosproxy {action.of}", text)
 
     async def _one(self, action: Action, observed: ClusterSnapshot) -> Failure | None:
         """Carry out one action; what went wrong."""

@@ -45,10 +45,15 @@ class EventFilter:
         return self._new(type, body, parse_node)
 
     def pod(self, type: str | None, body: Json) -> bool:
-        """Whether an event of a pod matters: of a proxy's, or one that a RosProxy selects."""
+        """Whether an event of a pod matters: of a proxy, or one that a RosProxy selects or has."""
         if is_own(words(body, "metadata", "labels")):
             return self._new(type, body, lambda body: (parse_proxy_pod(body), parse_pod(body)))
-        return self._selected(body) and self._new(type, body, parse_pod)
+        last, pod = self._last, parse_pod(body)
+        if last is not None and pod.uid not in last.selected:
+            choice = chosen(pod, last.rosproxies)
+            if not choice.rosproxy and not choice.finding:
+                return False
+        return self._new(type, body, parse_pod)
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the operator's own, or a master's."""
@@ -56,14 +61,6 @@ class EventFilter:
         meta = part(body, "metadata")
         matters = is_own(words(meta, "labels")) or name_of(meta) in masters
         return matters and self._new(type, body, lambda body: body.get("spec"))
-
-    def _selected(self, body: Json) -> bool:
-        """Whether a RosProxy selects a pod now, or did at the last look."""
-        last, pod = self._last, parse_pod(body)
-        if last is None:
-            return True
-        choice = chosen(pod, last.rosproxies)
-        return bool(choice.rosproxy or choice.finding) or pod.uid in last.selected
 
     def _new(self, type: str | None, body: Json, read: Callable[[Json], Any]) -> bool:
         uid = word(part(body, "metadata"), "uid")

@@ -7,6 +7,7 @@ with each look; a report that is another one than before wakes the operator.
 """
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -77,15 +78,9 @@ class ProxyPoller:
                 self._recheck = told
             answers = self.report is not None and self.report.answered
             pause = EVERY if answers or self._waited(EVERY * 20) else EVERY_STARTING
-            await self._pause(pause)
-
-    async def _pause(self, seconds: float) -> None:
-        """Wait, but not if there is something to tell by now."""
-        try:
-            async with asyncio.timeout(seconds):
-                await self._pending.wait()
-        except TimeoutError:
-            pass
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._pending.wait()  # there is something to tell by now
 
     async def _ask(self) -> None:
         try:
@@ -176,7 +171,6 @@ def report(status: ProxyStatus) -> ProxyReport:
             for address, there in nodes.items()
         },
         topics=frozenset(topic for node in every for topic in node.publishes + node.subscribes),
-        used=status.ports.used,
         problems=tuple(
             _short(f"{one.subject}: {one.text}") for one in status.problems if one.age <= RECENT
         ),

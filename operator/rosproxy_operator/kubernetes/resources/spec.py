@@ -63,7 +63,7 @@ _DAY = 86400
 def rosproxy(obj: Json) -> RosProxy:
     """A RosProxy. Raises InvalidField."""
     meta, status = part(obj, "metadata"), part(obj, "status")
-    id = name_of(meta)
+    id, where = name_of(meta), parse_slave_uri(word(status, "masterURI"))
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).refused("does not fit", fix)
@@ -73,7 +73,7 @@ def rosproxy(obj: Json) -> RosProxy:
         generation=number(meta, "generation"),
         spec=_spec(Field("spec", bare(obj.get("spec"))), id),
         former=_former(status),
-        cluster_ip=_cluster_ip(status),
+        cluster_ip=where.host if where and is_address(where.host) else "",
         status=status,
         deleting=is_deleted(meta),
     )
@@ -257,8 +257,3 @@ def _former(status: Json) -> dict[str, PortRange]:
         except SettingError:
             continue
     return found
-
-
-def _cluster_ip(status: Json) -> str:
-    where = parse_slave_uri(word(status, "masterURI"))
-    return where.host if where and is_address(where.host) else ""

@@ -195,22 +195,21 @@ def _conditions(
     One whose status is the same as in the ``former`` status keeps its time; the time of the others
     is ``stamp``, in RFC 3339.
     """
+    since = {
+        (word(was, "type"), word(was, "status")): word(was, "lastTransitionTime")
+        for was in parts(former, "conditions")
+    }
     return [
         {
             "type": one.type,
             "status": one.status,
             "observedGeneration": generation,
-            "lastTransitionTime": _since(former, one, stamp),
+            "lastTransitionTime": since.get((one.type, one.status)) or stamp,
             "reason": one.reason if _REASON.fullmatch(one.reason) else "Problem",
             "message": bounded(one.message, LONGEST),
         }
         for one in judged
     ]
-
-
-def _condition(status: Json, type: str) -> Json:
-    found = (one for one in parts(status, "conditions") if one.get("type") == type)
-    return next(found, {})
 
 
 def _read(was: Json) -> Condition:
@@ -223,11 +222,6 @@ def _one_line(problem: Problem) -> str:
 
 def _reason_of(problem: Problem) -> str:
     return problem.reason if isinstance(problem, ClusterFinding) else "Problem"
-
-
-def _since(former: Json, verdict: Condition, stamp: str) -> str:
-    was = _condition(former, verdict.type)
-    return (word(was, "lastTransitionTime") if was.get("status") == verdict.status else "") or stamp
 
 
 def _ready(
@@ -282,8 +276,9 @@ def _reached(states: Sequence[NodeState], problems: Sequence[Problem], former: J
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
     if len(answers) == len(proxies):
         return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
-    was = _condition(former, MASTER)
-    return _read(was) if was else Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    was = (one for one in parts(former, "conditions") if one.get("type") == MASTER)
+    unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    return next(map(_read, was), unknown)
 
 
 def _degraded(problems: Sequence[Problem]) -> Condition:

@@ -83,30 +83,21 @@ def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
     authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
     # A name of its own: of two CAs that are called the same, some clients try only the first.
     authority = _name(f"rosproxy webhook {secrets.token_hex(8)}")
-    ca = (
-        _builder(authority, authority_key, now)
-        .subject_name(authority)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs=True), critical=True)
-        .sign(authority_key, hashes.SHA256())
-    )
+    ca = _builder(authority, authority, authority_key, now, signs=True)
     certificate = (
-        _builder(authority, key, now)
-        .subject_name(_name("rosproxy webhook"))
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs=False), critical=True)
+        _builder(_name("rosproxy webhook"), authority, key, now, signs=False)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .add_extension(
             x509.SubjectAlternativeName([x509.DNSName(name) for name in names]), critical=False
         )
-        .sign(authority_key, hashes.SHA256())
     )
     private = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    return KeyPair(_pem(certificate), private, _pem(ca) + _still_valid(before, now))
+    signed, trusted = (one.sign(authority_key, hashes.SHA256()) for one in (certificate, ca))
+    return KeyPair(_pem(signed), private, _pem(trusted) + _still_valid(before, now))
 
 
 def read(data: Mapping[str, str]) -> KeyPair:
@@ -164,20 +155,14 @@ def _name(text: str) -> x509.Name:
 
 
 def _builder(
-    issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    now: datetime,
+    signs: bool,
 ) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACKDATED)
-        .not_valid_after(now + LIFE)
-    )
-
-
-def _usage(signs: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+    """A certificate to be signed; one that ``signs`` is a CA's."""
+    usage = x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,
         content_commitment=False,
@@ -187,6 +172,18 @@ def _usage(signs: bool) -> x509.KeyUsage:
         crl_sign=False,
         encipher_only=False,
         decipher_only=False,
+    )
+    constraints = x509.BasicConstraints(ca=signs, path_length=0 if signs else None)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BACKDATED)
+        .not_valid_after(now + LIFE)
+        .add_extension(constraints, critical=True)
+        .add_extension(usage, critical=True)
     )
 
 
