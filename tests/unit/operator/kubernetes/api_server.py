@@ -7,7 +7,8 @@ import asyncio
 import copy
 import itertools
 import json
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,14 @@ class ApiServer:
         """Tell all who watch the same, for example an error."""
         for _, _, queue in self._watches:
             queue.put_nowait(event)
+
+
+async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait for something to be true."""
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.01)
 
 
 @asynccontextmanager

@@ -88,7 +88,8 @@ def call(port: int, authorities: bytes, host: str = HOST) -> bytes:
         socket.create_connection(("127.0.0.1", port), 5) as plain,
         context.wrap_socket(plain, server_hostname=host) as secure,
     ):
-        return secure.recv(10)
+        secure.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        return secure.recv(100)
 
 
 @pytest.mark.parametrize("host", NAMES)
@@ -327,22 +328,12 @@ async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPa
     held.pair = old
     await started
     keeping = asyncio.ensure_future(anext(serving))
-    assert b"HTTP" in await in_thread(ask, port, old.ca)
+    assert b"HTTP" in await in_thread(call, port, old.ca)
     held.pair = new
     await asyncio.sleep(0.1)
-    assert b"HTTP" in await in_thread(ask, port, new.ca)
+    assert b"HTTP" in await in_thread(call, port, new.ca)
     with pytest.raises(ssl.SSLCertVerificationError):
-        await in_thread(ask, port, old.ca)
+        await in_thread(call, port, old.ca)
     keeping.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await keeping
-
-
-def ask(port: int, authorities: bytes) -> bytes:
-    context = ssl.create_default_context(cadata=authorities.decode())
-    with (
-        socket.create_connection(("127.0.0.1", port), 5) as plain,
-        context.wrap_socket(plain, server_hostname=HOST) as secure,
-    ):
-        secure.sendall(b"GET / HTTP/1.0\r\n\r\n")
-        return secure.recv(100)

@@ -16,8 +16,16 @@ from rosproxy_operator.kubernetes.resources.model import (
     Stuck,
 )
 from rosproxy_operator.kubernetes.status.status import findings
-from tests.unit.operator.kubernetes.builders_api import answer, proxy, rosproxy, state, stuck_proxy
-from tests.unit.operator.kubernetes.status_cases import judged, message, status
+from tests.unit.operator.kubernetes.builders_api import (
+    answer,
+    judged,
+    message,
+    proxy,
+    rosproxy,
+    state,
+    status,
+    stuck_proxy,
+)
 
 NAME = "rosproxy-arm-node1-"
 

@@ -28,12 +28,15 @@ from tests.unit.operator.kubernetes.builders_api import (
     STAMP,
     URI,
     answer,
+    condition,
+    judged,
+    message,
     pod,
     proxy,
     rosproxy,
     state,
+    status,
 )
-from tests.unit.operator.kubernetes.status_cases import condition, judged, message, status
 
 
 def test_all_is_well():

@@ -29,8 +29,9 @@ from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import (
+    INJECT,
     NAMESPACE,
     pod_obj,
     rosproxy_obj,
@@ -38,7 +39,6 @@ from tests.unit.operator.kubernetes.builders_api import (
 )
 
 PAIR = certificates.make(["localhost"], certificates.now())
-INJECT = {"rosproxy.io/inject": "true"}
 
 
 class Woken:
@@ -114,13 +114,6 @@ async def running(
 def watched(server: ApiServer) -> bool:
     kinds = ("rosproxies", "pods", "nodes", "services")
     return all(server.watches(kind) == 1 for kind in kinds)
-
-
-async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.02)
 
 
 def free_port() -> int:
