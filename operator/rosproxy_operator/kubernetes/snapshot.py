@@ -15,7 +15,6 @@ from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
@@ -30,7 +29,7 @@ from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
 from rosproxy_operator.kubernetes.resources.objects import service as parse_service
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
-from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
+from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.resources.values import part, parts, word
 
 K = TypeVar("K")
@@ -95,7 +94,7 @@ class SnapshotReader:
 
     def _rosproxies(self) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
         try:
-            listed = self._api.rosproxies()
+            return rosproxies(self._api.rosproxies())
         except ApiError as error:
             if error.kind is not ErrorKind.GONE:
                 raise
@@ -104,16 +103,6 @@ class SnapshotReader:
                 "the cluster has no RosProxies: install the CustomResourceDefinition "
                 "rosproxies.rosproxy.io (it comes with the chart and with manifests/)",
             ) from None
-        usable: dict[Name, RosProxy] = {}
-        unusable: dict[Name, InvalidRosProxy] = {}
-        for found in listed:
-            try:
-                one = rosproxy(found)
-                usable[one.id] = one
-            except InvalidField as error:
-                bad = invalid(found, error)
-                unusable[bad.id] = bad
-        return usable, unusable
 
     def _selected(self, of: RosProxy) -> list[Pod] | InvalidRosProxy:
         """The pods that a RosProxy's selector fits, or why the API server refuses that."""

@@ -6,6 +6,7 @@ pod is admitted) is checked here again. Names, types, bounds and defaults are th
 """
 
 import re
+from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from rosproxy.leases.ports import PortRange
@@ -58,6 +59,21 @@ _EXAMPLE = "http://robot.example:11311"
 _HIGH = (1024, 65535)
 """Ports that a proxy may listen on."""
 _DAY = 86400
+
+
+def rosproxies(
+    objs: Iterable[Json],
+) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
+    """RosProxies, and those that can't be read."""
+    usable: dict[Name, RosProxy] = {}
+    unusable: dict[Name, InvalidRosProxy] = {}
+    for obj in objs:
+        id = name_of(part(obj, "metadata"))
+        try:
+            usable[id] = rosproxy(obj)
+        except InvalidField as error:
+            unusable[id] = invalid(obj, error)
+    return usable, unusable
 
 
 def rosproxy(obj: Json) -> RosProxy:

@@ -1,6 +1,6 @@
 """Wires a pod, as the API server is about to create it, to the proxy of its node.
 
-A pod with the label rosproxy.io/inject comes here from kopf (`handlers`). The RosProxies of its
+A pod with the label rosproxy.io/inject comes here from kopf (`watch`). The RosProxies of its
 namespace and their Service are read as they are at this moment; the planner says which RosProxy
 takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
 which knows its address, its owner and what to do when it is refused. Where it is not there yet,
@@ -19,12 +19,11 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
-from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
 from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
 from rosproxy_operator.kubernetes.resources.objects import service as parse_service
-from rosproxy_operator.kubernetes.resources.spec import rosproxy
+from rosproxy_operator.kubernetes.resources.spec import rosproxies
 
 log = logging.getLogger(__name__)
 
@@ -99,25 +98,17 @@ class Injector:
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
         pod = parse_pod(body)
-        rosproxies, unusable = self._rosproxies(pod.id.namespace)
-        choice = chosen(pod, rosproxies)
+        found, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
+        usable = [each for each in found.values() if not each.deleting]
+        choice = chosen(pod, usable)
         if choice.rosproxy is not None:
             address, hold = self._address(choice.rosproxy, dry_run)
             return wire(body, master_uri(address), choice.rosproxy.spec.host_aliases), hold
         if choice.finding is not None:
             return Wiring(warnings=(NOT_WIRED + choice.finding.text,)), 0.0
-        text = nobody(pod, rosproxies)
-        return Wiring(warnings=("; ".join([NOT_WIRED + text, *unusable]),) if text else ()), 0.0
-
-    def _rosproxies(self, namespace: str) -> tuple[list[RosProxy], list[str]]:
-        """Those of a namespace, and what is wrong with those that can't be read."""
-        usable, unusable = [], []
-        for found in self._api.rosproxies(namespace, SOON):
-            try:
-                usable.append(rosproxy(found))
-            except InvalidField as error:
-                unusable.append(f"RosProxy {found['metadata']['name']}: {error}")
-        return [each for each in usable if not each.deleting], unusable
+        text = nobody(pod, usable)
+        why = [f"RosProxy {one.id.name}: {one.text}" for one in unusable.values()]
+        return Wiring(warnings=("; ".join([NOT_WIRED + text, *why]),) if text else ()), 0.0
 
     def _address(self, of: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
