@@ -144,7 +144,7 @@ class ClusterWatch:
             failures = 0 if time.monotonic() - started > WELL else failures + 1
             if not self._ending.is_set():
                 self._metrics.watch_restarts.inc()
-                self._controller.wake()
+                self._controller.wake()  # what is missed meanwhile is found by looking
                 self._ending.wait(BACK_OFF[min(failures, len(BACK_OFF)) - 1])
 
     def _once(self) -> None:
@@ -190,10 +190,6 @@ class ClusterWatch:
             if reason := controller.dead():
                 raise NotAlive(reason)
             return "ok"
-
-        @kopf.on.cleanup(registry=handlers, id="cleanup")
-        async def cleanup(**_: Any) -> None:
-            controller.wake()  # what is missed while nobody watches is found by looking
 
         def on(matters: Callable[[str | None, Any], bool], *resource: str) -> None:
             @kopf.on.event(*resource, registry=handlers, id=resource[-1])

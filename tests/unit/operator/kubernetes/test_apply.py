@@ -213,8 +213,10 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
     server: ApiServer, carry: Carried
 ) -> None:
     server.refuse("POST", "pods", 422, "no")
+    before = carry.applier.failures
     await carry.out(create_pod())
     assert carry.applier.failures
+    assert not before  # whoever has it compares
     await carry.out(rosproxies=())
     assert not carry.applier.failures
 

@@ -200,9 +200,12 @@ def test_a_pod_that_lacks_something_is_no_proxy(path):
     assert proxy_pod(obj) is None
 
 
-def test_somebody_elses_pod_with_the_same_labels_is_no_proxy():
+@pytest.mark.parametrize(
+    "owner", [{"apiVersion": "apps/v1"}, {"kind": "ReplicaSet"}, {"controller": False}]
+)
+def test_somebody_elses_pod_with_the_same_labels_is_no_proxy(owner):
     obj = proxy_obj()
-    obj["metadata"]["ownerReferences"][0].update(apiVersion="apps/v1", kind="ReplicaSet")
+    obj["metadata"]["ownerReferences"][0].update(owner)
 
     assert proxy_pod(obj) is None
     assert proxy_pod(pod_obj()) is None

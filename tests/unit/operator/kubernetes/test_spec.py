@@ -167,6 +167,7 @@ def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> d
         (_selector(key="/x"), "spec.podSelector.matchExpressions[0].key"),
         (_selector(key="A.b/x/y"), "spec.podSelector.matchExpressions[0].key"),
         (_selector(values=["a)"]), "spec.podSelector.matchExpressions[0].values[0]"),
+        (_selector(values=[None]), "spec.podSelector.matchExpressions[0].values[0]"),
         (_selector(values=[]), "spec.podSelector.matchExpressions[0].values"),
         (_selector(operator="Exists"), "spec.podSelector.matchExpressions[0].values"),
         ({"nodeSelector": {"a": 1}}, "spec.nodeSelector.a"),

@@ -39,6 +39,7 @@ from tests.unit.operator.kubernetes.builders_api import (
 )
 
 PAIR = certificates.make(["localhost"], certificates.now())
+OTHER = {**service_obj()["metadata"]["ownerReferences"][0], "uid": "another"}
 
 
 class Woken:
@@ -252,6 +253,19 @@ async def test_a_pod_whose_service_does_not_come_is_admitted(
     found = await running.admit(pod_obj("talker", INJECT))
     assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in found["warnings"][0]
     assert running.controller.times > 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"ownerReferences": [OTHER]}, {"deletionTimestamp": "2026-01-01T00:00:00Z"}]
+)
+async def test_a_service_that_is_about_to_go_is_waited_for(
+    running: Running, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    running.server.put("services", service_obj(**change), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "has no cluster IP yet" in found["warnings"][0]
 
 
 async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> None:
