@@ -9,12 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from rosproxy_operator.kubernetes.planner.selection import chosen
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json
 from rosproxy_operator.kubernetes.resources.names import is_own
-from rosproxy_operator.kubernetes.resources.objects import name_of
-from rosproxy_operator.kubernetes.resources.objects import node as parse_node
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
 from rosproxy_operator.kubernetes.resources.values import part, word, words
 
 MOST = 20_000
@@ -42,24 +39,24 @@ class EventFilter:
 
     def node(self, type: str | None, body: Json) -> bool:
         """Whether an event of a node matters."""
-        return self._new(type, body, parse_node)
+        return self._new(type, body, objects.node)
 
     def pod(self, type: str | None, body: Json) -> bool:
         """Whether an event of a pod matters: of a proxy, or one that a RosProxy selects or has."""
         if is_own(words(body, "metadata", "labels")):
-            return self._new(type, body, lambda body: (parse_proxy_pod(body), parse_pod(body)))
-        last, pod = self._last, parse_pod(body)
+            return self._new(type, body, lambda body: (objects.proxy_pod(body), objects.pod(body)))
+        last, pod = self._last, objects.pod(body)
         if last is not None and pod.uid not in last.selected:
             choice = chosen(pod, last.rosproxies)
             if not choice.rosproxy and not choice.finding:
                 return False
-        return self._new(type, body, parse_pod)
+        return self._new(type, body, objects.pod)
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the operator's own, or a master's."""
         masters = self._last.masters if self._last else {}
         meta = part(body, "metadata")
-        matters = is_own(words(meta, "labels")) or name_of(meta) in masters
+        matters = is_own(words(meta, "labels")) or objects.name_of(meta) in masters
         return matters and self._new(type, body, lambda body: body.get("spec"))
 
     def _new(self, type: str | None, body: Json, read: Callable[[Json], Any]) -> bool:

@@ -53,14 +53,12 @@ class ProxyPoller:
         room: asyncio.Semaphore,
         changed: Callable[[], None],
     ) -> None:
-        self.where = address_of(proxy)
+        self.where, self._token = address_of(proxy), proxy.token
         self.report: ProxyReport | None = None
-        self._token = proxy.token
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
         self._pending = asyncio.Event()
-        self._recheck = False
-        self._failures = 0
+        self._recheck, self._failures = False, 0
         self._since = time.monotonic()
 
     def report_gone(self, gone: Iterable[str]) -> None:

@@ -15,6 +15,7 @@ from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.selection import label_selector
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
@@ -24,10 +25,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPod,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.objects import node as parse_node
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
-from rosproxy_operator.kubernetes.resources.objects import service as parse_service
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.resources.values import part, parts, word
@@ -58,16 +55,16 @@ class SnapshotReader:
         usable, unusable = await self._ask(self._rosproxies)
         api, ports = self._api, _master_ports(usable.values())
         nodes, proxies, services, masters, selected = await asyncio.gather(
-            self._ask(lambda: [*map(parse_node, api.nodes())]),
-            self._ask(lambda: [*filter(None, map(parse_proxy_pod, api.own("pods")))]),
-            self._ask(lambda: [*filter(None, map(parse_service, api.own("services")))]),
+            self._ask(lambda: [*map(objects.node, api.nodes())]),
+            self._ask(lambda: [*filter(None, map(objects.proxy_pod, api.own("pods")))]),
+            self._ask(lambda: [*filter(None, map(objects.service, api.own("services")))]),
             self._each(ports, lambda id: master_service(api, id, ports[id])),
             self._each(usable, lambda id: self._selected(usable[id])),
         )
         refused = {id: each for id, each in selected.items() if isinstance(each, InvalidRosProxy)}
         found = [pod for each in selected.values() if isinstance(each, list) for pod in each]
         on = sorted({*(pod.node for pod in found), *(proxy.on for proxy in proxies)} - {""})
-        others = await self._each(on, lambda name: [*map(parse_pod, api.pods_on(name))])
+        others = await self._each(on, lambda name: [*map(objects.pod, api.pods_on(name))])
         # Every pod once; of those that were listed more than once, what was listed last.
         listed = (found, *others.values(), (proxy.pod for proxy in proxies))
         pods = {pod.uid: pod for some in listed for pod in some}
@@ -113,7 +110,7 @@ class SnapshotReader:
                 raise
             text = f"spec.podSelector: {error}"
             return InvalidRosProxy(of.id, of.uid, of.generation, text, of.status)
-        return [parse_pod(each) for each in found]
+        return [objects.pod(each) for each in found]
 
     async def _with_event(self, proxy: ProxyPod) -> ProxyPod:
         """A proxy, also one that the kubelet can't set up, of which only an Event tells."""

@@ -19,10 +19,9 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import service as parse_service
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 
 log = logging.getLogger(__name__)
@@ -97,7 +96,7 @@ class Injector:
             await asyncio.sleep(AGAIN)
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
-        pod = parse_pod(body)
+        pod = objects.pod(body)
         found, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
         usable = [each for each in found.values() if not each.deleting]
         choice = chosen(pod, usable)
@@ -128,7 +127,7 @@ class Injector:
             if dry_run and of.cluster_ip:
                 return of.cluster_ip, 0.0
             raise missing from None
-        found = parse_service(there)
+        found = objects.service(there)
         if found is None:
             raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
         if found.owner != of.uid or found.deleting or not found.cluster_ip:

@@ -333,7 +333,7 @@ async def test_a_mistake_of_ours_admits_the_pod(
     def broken(*_: Any) -> Any:
         raise RuntimeError("oops")
 
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.parse_pod", broken)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.objects.pod", broken)
     found = await running.admit(pod_obj("talker", INJECT))
     assert "the operator failed: RuntimeError('oops')" in found["warnings"][0]
 
