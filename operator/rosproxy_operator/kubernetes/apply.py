@@ -128,7 +128,7 @@ class ClusterApplier:
         api = self._api
         match action:
             case CreateService():
-                _create_service(api, action.body)
+                _create(api, "services", action.body)
             case CreateProxy():
                 _create(api, "pods", with_token(action.body, secrets.token_hex(16)))
             case DeleteService():
@@ -205,27 +205,21 @@ def _nothing_left(action: Action) -> tuple[ErrorKind, ...]:
     return (ErrorKind.GONE,)
 
 
-def _create_service(api: Api, body: Json) -> None:
-    """Create a RosProxy's Service, if need be under another address than before.
+def _create(api: Api, kind: str, body: Json) -> None:
+    """Create an object if it is not there; a Service if need be under another address than before.
 
     Raises ApiError.
     """
     try:
-        _create(api, "services", body)
-    except ApiError as error:
-        if error.kind is not ErrorKind.INVALID or "clusterIP" not in body["spec"]:
-            raise
-        log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
-        _create(api, "services", without_cluster_ip(body))
-
-
-def _create(api: Api, kind: str, body: Json) -> None:
-    try:
         api.create(kind, body)
     except ApiError as error:
-        if error.kind is not ErrorKind.CONFLICT:
+        if error.kind is ErrorKind.CONFLICT:
+            _check_ours(api, kind, body)
+        elif error.kind is ErrorKind.INVALID and "clusterIP" in body["spec"]:
+            log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
+            _create(api, kind, without_cluster_ip(body))
+        else:
             raise
-        _check_ours(api, kind, body)
 
 
 def _check_ours(api: Api, kind: str, body: Json) -> None:
