@@ -326,9 +326,9 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     from rosproxy.telemetry import logs
-    from rosproxy_operator.kubernetes.errors import ApiError
-    from rosproxy_operator.kubernetes.kopf_log import quieten
+    from rosproxy_operator.kubernetes.api import ApiError
     from rosproxy_operator.kubernetes.run import run
+    from rosproxy_operator.kubernetes.watch import quieten
 
     logs.set_up(log_format, log_level)
     quieten()

@@ -16,9 +16,12 @@ for single objects, by name::
 Objects go in and out as JSON: the client's models would drop fields that are newer than they are.
 """
 
+import contextlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any
 from urllib.parse import quote
 
@@ -28,9 +31,9 @@ from kubernetes.config import ConfigException, load_incluster_config, load_kube_
 from urllib3.exceptions import HTTPError
 
 from rosproxy import __version__
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, refusal, unreachable
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
+from rosproxy_operator.kubernetes.resources.values import part, word
 
 Found = dict[str, Any]
 Timeout = tuple[float, float]
@@ -38,10 +41,52 @@ WITHIN: Timeout = (3.0, 15.0)
 """Seconds to connect and to wait for an answer."""
 SOON: Timeout = (1.0, 2.0)
 """The same while somebody waits for a pod to be admitted."""
-_CORE = "/api/v1"
-_CUSTOM = f"/apis/{GROUP}/{VERSION}"
-_WEBHOOKS = "/apis/admissionregistration.k8s.io/v1/mutatingwebhookconfigurations"
+WEBHOOKS = "mutatingwebhookconfigurations"
+_ROOTS = {
+    PLURAL: f"/apis/{GROUP}/{VERSION}",
+    WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
+}
+"""Where kinds are found that are not of the core group."""
 _CONNECTIONS = 16
+
+
+_RBAC = re.compile(
+    r'cannot (?P<verb>\w+) resource "(?P<resource>[^"]*)" in API group "(?P<group>[^"]*)"'
+    r'(?: in the namespace "(?P<namespace>[^"]*)")?'
+)
+_TERMINATING = "because it is being terminated"
+"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted."""
+_TEST_FAILED = "the server rejected our request due to an error in our request"
+"""All that the API server says when a ``test`` of a JSON patch fails."""
+_LONGEST = 500
+
+
+class ErrorKind(Enum):
+    """Why the API server did not do what it was asked, as far as that makes a difference."""
+
+    AWAY = "away"  # it can't be reached, or is not ready to answer
+    GONE = "gone"
+    CONFLICT = "conflict"  # the name is taken, or the object is another one by now
+    INVALID = "invalid"  # the object is not one that the API server takes
+    OTHER = "other"
+
+
+_KINDS = {
+    400: ErrorKind.INVALID,
+    401: ErrorKind.AWAY,  # the token has just been replaced, or the server does not know it yet
+    404: ErrorKind.GONE,
+    409: ErrorKind.CONFLICT,
+    422: ErrorKind.INVALID,
+    429: ErrorKind.AWAY,
+}
+
+
+class ApiError(Exception):
+    """The API server did not do what it was asked; the message is one line."""
+
+    def __init__(self, kind: ErrorKind, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class Api:
@@ -52,7 +97,7 @@ class Api:
     """
 
     def __init__(self, namespaces: Sequence[str] = ()) -> None:
-        self._namespaces = tuple(namespaces)
+        self._places = tuple(namespaces) or ("",)
         configuration = _configuration()
         self.server = str(configuration.host)
         self._client = ApiClient(configuration)
@@ -66,11 +111,8 @@ class Api:
     def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[Found]:
         """All RosProxies, or those of a namespace, as they are at this moment."""
         places = (namespace,) if namespace else self._places
-        return [
-            found
-            for place in places
-            for found in self._items(self._ask("GET", _path(_CUSTOM, place, PLURAL), within=within))
-        ]
+        lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
+        return [found for each in lists for found in self._items(each)]
 
     def nodes(self) -> list[Found]:
         """All nodes."""
@@ -92,43 +134,24 @@ class Api:
     def events_of(self, pod: Name, uid: str, reason: str) -> list[Found]:
         """The Events with a reason about a pod."""
         query = {"fieldSelector": f"involvedObject.uid={uid},reason={reason}"}
-        return self._items(self._ask("GET", _path(_CORE, pod.namespace, "events"), query))
+        return self._items(self._ask("GET", _path("events", pod.namespace), query))
 
     def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> Found:
-        """One object of the core group, for example of the kind ``services``."""
-        return self._ask("GET", _path(_CORE, id.namespace, kind, id.name), within=within)
+        """One object, for example of the kind ``services``."""
+        return self._ask("GET", _path(kind, id.namespace, id.name), within=within)
 
-    def create(self, kind: str, body: Json) -> Found:
-        """Create an object of the core group in the namespace that it names."""
-        path = _path(_CORE, body["metadata"]["namespace"], kind)
-        return self._ask("POST", path, body=body)
+    def create(self, kind: str, body: Json) -> None:
+        """Create an object in the namespace that it names."""
+        self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body)
 
     def delete(self, kind: str, id: Name, uid: str) -> None:
-        """Delete an object of the core group if it still has this uid."""
+        """Delete an object if it still has this uid."""
         options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": {"uid": uid}}
-        self._ask("DELETE", _path(_CORE, id.namespace, kind, id.name), body=options)
+        self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
 
-    def patch(self, kind: str, id: Name, operations: list[Json]) -> Found:
-        """Change an object of the core group by a JSON patch."""
-        return self._ask("PATCH", _path(_CORE, id.namespace, kind, id.name), body=operations)
-
-    def patch_status(self, id: Name, operations: list[Json]) -> None:
-        """Change the status of a RosProxy by a JSON patch."""
-        path = _path(_CUSTOM, id.namespace, PLURAL, id.name)
-        self._ask("PATCH", f"{path}/status", body=operations)
-
-    def webhook_configuration(self, name: str) -> Found:
-        """A MutatingWebhookConfiguration."""
-        return self._ask("GET", f"{_WEBHOOKS}/{quote(name, safe='')}")
-
-    def patch_webhook_configuration(self, name: str, operations: list[Json]) -> None:
-        """Change a MutatingWebhookConfiguration by a JSON patch."""
-        self._ask("PATCH", f"{_WEBHOOKS}/{quote(name, safe='')}", body=operations)
-
-    @property
-    def _places(self) -> tuple[str, ...]:
-        """The namespaces to list; an empty name means all at once."""
-        return self._namespaces or ("",)
+    def patch(self, kind: str, id: Name, operations: list[Json]) -> None:
+        """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
+        self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations)
 
     def _cached(self, namespace: str, kind: str, query: Mapping[str, str]) -> list[Found]:
         """List from what the API server has in memory, which costs etcd nothing.
@@ -136,7 +159,7 @@ class Api:
         It may lag behind a little, but never behind a list before: another API server, which lags
         more, would otherwise make pods seem gone that are not.
         """
-        path = _path(_CORE, namespace, kind)
+        path = _path(kind, namespace)
         version = {"resourceVersion": self._versions.get(kind, "0")}
         if kind in self._versions:
             version["resourceVersionMatch"] = "NotOlderThan"
@@ -149,15 +172,11 @@ class Api:
             self._versions.pop(kind, None)
             found = self._ask("GET", path, query)
         items = self._items(found)
-        metadata = found.get("metadata")
-        self._note(kind, metadata if isinstance(metadata, dict) else {})
+        newest = word(part(found, "metadata"), "resourceVersion")
+        # Lists of a kind are asked for side by side.
+        if newest.isdecimal() and int(newest) > int(self._versions.get(kind, "0")):
+            self._versions[kind] = newest
         return items
-
-    def _note(self, kind: str, metadata: Found) -> None:
-        """Remember how new a list was. Lists of a kind are asked for side by side."""
-        version = str(metadata.get("resourceVersion") or "")
-        if version.isdecimal() and int(version) > int(self._versions.get(kind, "0")):
-            self._versions[kind] = version
 
     def _items(self, found: Found) -> list[Found]:
         items = found.get("items")
@@ -173,12 +192,28 @@ class Api:
         body: Json | list[Json] | None = None,
         within: Timeout = WITHIN,
     ) -> Found:
+        patch = isinstance(body, list)
+        headers = {
+            "Accept": "application/json",
+            "Content-Type": "application/json-patch+json" if patch else "application/json",
+        }
         try:
-            status, reason, data = self._call(method, path, query or {}, body, within)
+            request = self._client.param_serialize(
+                method,
+                path,
+                query_params=[*(query or {}).items()],
+                header_params=headers,
+                body=body,
+                auth_settings=["BearerToken"],
+            )
+            answer: Any = self._client.call_api(*request, _request_timeout=within)
+            status, reason, data = int(answer.status), answer.reason, bytes(answer.read())
         except (HTTPError, ApiException, ConfigException, OSError) as error:
-            raise unreachable(self.server, error) from error
+            text = " ".join(str(error).split())[:200] or type(error).__name__
+            text = f"the API server at {self.server} can't be reached: {text}"
+            raise ApiError(ErrorKind.AWAY, text) from error
         if not 200 <= status <= 299:
-            raise refusal(status, reason, data)
+            raise refusal(status, str(reason or ""), data)
         try:
             found = json.loads(data)
         except ValueError:
@@ -186,31 +221,6 @@ class Api:
         if not isinstance(found, dict):
             raise ApiError(ErrorKind.AWAY, f"what answers at {self.server}{path} is no API server")
         return found
-
-    def _call(
-        self,
-        method: str,
-        path: str,
-        query: Mapping[str, str],
-        body: Json | list[Json] | None,
-        within: Timeout,
-    ) -> tuple[int, str, bytes]:
-        """HTTP status, reason phrase and body of what is answered."""
-        patch = isinstance(body, list)
-        headers = {
-            "Accept": "application/json",
-            "Content-Type": "application/json-patch+json" if patch else "application/json",
-        }
-        request = self._client.param_serialize(
-            method,
-            path,
-            query_params=list(query.items()),
-            header_params=headers,
-            body=body,
-            auth_settings=["BearerToken"],
-        )
-        answer: Any = self._client.call_api(*request, _request_timeout=within)
-        return int(answer.status), str(answer.reason or ""), bytes(answer.read())
 
 
 def _configuration() -> Any:
@@ -233,6 +243,47 @@ def _configuration() -> Any:
     return configuration
 
 
-def _path(root: str, namespace: str, kind: str, name: str = "") -> str:
-    parts = ["namespaces", namespace, kind] if namespace else [kind]
-    return "/".join([root, *(quote(part, safe="") for part in [*parts, name] if part)])
+def _path(kind: str, namespace: str, name: str = "") -> str:
+    """Where objects of a kind, or one of them or a part of it as ``kind/part``, are found."""
+    kind, _, part = kind.partition("/")
+    where = ["namespaces", namespace, kind, name, part] if namespace else [kind, name, part]
+    return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(one, safe="") for one in where if one)])
+
+
+def refusal(status: int, reason: str, body: bytes) -> ApiError:
+    """The error for what the API server answered: HTTP status, reason phrase, body."""
+    message = _message(body) or reason
+    kind = _KINDS.get(status, ErrorKind.AWAY if status >= 500 else ErrorKind.OTHER)
+    if status == 403:  # by a role, or by an admission plug-in that has looked at the object
+        rule, gone = missing_rule(message), _TERMINATING in message
+        if rule:
+            return ApiError(ErrorKind.OTHER, f"{rule} ({message})")
+        return ApiError(ErrorKind.GONE if gone else ErrorKind.INVALID, message)
+    if status == 422 and message == _TEST_FAILED:
+        return ApiError(ErrorKind.CONFLICT, "the object has changed meanwhile")
+    if status == 401:
+        message = f"the API server does not know the operator's token or certificate ({message})"
+    elif kind is ErrorKind.AWAY:
+        message = f"the API server answers HTTP {status}: {message}"
+    return ApiError(kind, message)
+
+
+def missing_rule(message: str) -> str:
+    """The rule that the operator's role lacks, by the API server's words; empty if it is none."""
+    found = _RBAC.search(message)
+    if found is None:
+        return ""
+    where = f" in the namespace {found['namespace']}" if found["namespace"] else ""
+    return (
+        f"the operator's role lacks a rule{where}: "
+        f'apiGroups ["{found["group"]}"], resources ["{found["resource"]}"], '
+        f'verbs ["{found["verb"]}"]'
+    )
+
+
+def _message(body: bytes) -> str:
+    """The message of the ``Status`` object with which the API server refuses."""
+    text = body.decode(errors="replace")
+    with contextlib.suppress(ValueError, KeyError, TypeError):  # something else has answered
+        text = str(json.loads(text)["message"])
+    return " ".join(text.split())[:_LONGEST]

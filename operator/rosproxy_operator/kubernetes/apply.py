@@ -7,15 +7,14 @@ vanished meanwhile: that is no error, the next look sees what is left to do.
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Iterable
+import time
+from collections.abc import Callable, Iterable, Mapping
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
-from rosproxy_operator.kubernetes.events import emit
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -28,8 +27,18 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
 from rosproxy_operator.kubernetes.proxy_sync import address_of
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Json, Name
-from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, is_own
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterSnapshot,
+    Failure,
+    InvalidRosProxy,
+    Json,
+    Name,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
+from rosproxy_operator.kubernetes.resources.objects import name_of
+from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
+from rosproxy_operator.kubernetes.status.events import counted, event_body
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +61,7 @@ class ClusterApplier:
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
-        self.failures: dict[Name, tuple[Failure, ...]] = {}
+        self.failures: Mapping[Name, tuple[Failure, ...]] = {}
         self.problems: dict[Name, Problem] = {}
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
@@ -71,53 +80,47 @@ class ClusterApplier:
             doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
             failures = [failure for a in doing if (failure := await self._one(a, observed))]
             if doing:
-                self.failures[of] = tuple(failures)
+                self.failures = {**self.failures, of: tuple(failures)}
             for action in actions:
                 if isinstance(action, PatchStatus):
-                    await self._status(action, observed)
+                    failure = await self._one(action, observed)
+                    self.problems.pop(of, None)
+                    if failure:
+                        text = f"its status can't be written: {failure.text}"
+                        self.problems[of] = Problem(f"rosproxy {of}", text)
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [each for each in emits if not (failures and each.type == "Normal")]
-        await asyncio.gather(*(self._emit(each, observed) for each in wanted))
+        await asyncio.gather(*(self._event(each, observed) for each in wanted))
 
-    async def _emit(self, event: Emit, observed: ClusterSnapshot) -> None:
+    async def _event(self, event: Emit, observed: ClusterSnapshot) -> None:
         async with self._room:
             await self._one(event, observed)
-
-    async def _status(self, action: PatchStatus, observed: ClusterSnapshot) -> None:
-        failure = await self._one(action, observed)
-        self.problems.pop(action.of, None)
-        if failure:
-            text = f"its status can't be written: {failure.text}"
-            self.problems[action.of] = Problem(f"rosproxy {action.of}", text)
 
     async def _one(self, action: Action, observed: ClusterSnapshot) -> Failure | None:
         """Carry out one action; what went wrong."""
         if isinstance(action, DeleteProxy) and action.retire and action.uid not in self._retired:
-            self._retire(action, observed)
+            if action.uid not in self._retiring:
+                self._retiring.add(action.uid)
+                self._tasks.spawn(self._retire(action, observed), f"retiring {action.id}")
             return None
+        quiet = isinstance(action, PatchStatus | Emit)
         try:
             await in_thread(self._do, action, observed)
         except ApiError as error:
             if error.kind in _nothing_left(action):
                 log.debug("%s: nothing to do: %s", line(action), error)
                 return None
-            return self._failed(action, str(error))
+            text = str(error)
         except Exception as error:  # a mistake of ours must not stop the others
             log.exception("%s failed", line(action))
-            return self._failed(action, f"the operator failed: {error!r}")
-        self._done(action)
-        return None
-
-    def _done(self, action: Action) -> None:
-        quiet = isinstance(action, PatchStatus | Emit)
-        log.log(logging.DEBUG if quiet else logging.INFO, "%s", line(action))
-        self._counted(action, "ok")
-
-    def _failed(self, action: Action, text: str) -> Failure:
+            text = f"the operator failed: {error!r}"
+        else:
+            log.log(logging.DEBUG if quiet else logging.INFO, "%s", line(action))
+            self._counted(action, "ok")
+            return None
         failure = Failure(str(_subject(action)), text)
-        known = failure in self.failures.get(action.of, ())
-        quiet = known or isinstance(action, PatchStatus)  # that one is told as a problem
-        log.log(logging.DEBUG if quiet else logging.WARNING, "%s: %s", line(action), text)
+        told = failure in self.failures.get(action.of, ()) or isinstance(action, PatchStatus)
+        log.log(logging.DEBUG if told else logging.WARNING, "%s: %s", line(action), text)
         self._counted(action, "failed")
         return failure
 
@@ -125,7 +128,7 @@ class ClusterApplier:
         api = self._api
         match action:
             case CreateService():
-                _create_service(api, action.body)
+                _create(api, "services", action.body)
             case CreateProxy():
                 _create(api, "pods", with_token(action.body, secrets.token_hex(16)))
             case DeleteService():
@@ -133,26 +136,23 @@ class ClusterApplier:
             case DeleteProxy():
                 api.delete("pods", action.id, action.uid)
             case SetImage():
-                api.patch("pods", action.id, _image_patch(action))
+                container = "/spec/containers/0"
+                api.patch(
+                    "pods",
+                    action.id,
+                    [
+                        {"op": "test", "path": "/metadata/uid", "value": action.uid},
+                        {"op": "test", "path": f"{container}/name", "value": CONTAINER},
+                        {"op": "replace", "path": f"{container}/image", "value": action.image},
+                    ],
+                )
             case PatchStatus():
-                self._patch_status(action, observed)
+                _patch_status(api, action, observed)
             case Emit():
-                emit(api, action)
+                _emit(api, action)
 
-    def _patch_status(self, action: PatchStatus, observed: ClusterSnapshot) -> None:
-        found = next((each for each in observed.rosproxies if each.id == action.of), None)
-        there = found or observed.unusable.get(action.of)
-        if there is None or there.status == action.status:
-            return
-        self._api.patch_status(action.of, status_patch(there.uid, action.status))
-
-    def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
+    async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
-        if action.uid not in self._retiring:
-            self._retiring.add(action.uid)
-            self._tasks.spawn(self._retire_and_delete(action, observed), f"retiring {action.id}")
-
-    async def _retire_and_delete(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
@@ -168,33 +168,11 @@ class ClusterApplier:
             await self._one(action, observed)
 
 
-def _create_service(api: Api, body: Json) -> None:
-    """Create a RosProxy's Service, if need be under another address than before.
-
-    Raises ApiError.
-    """
-    try:
-        _create(api, "services", body)
-    except ApiError as error:
-        if error.kind is not ErrorKind.INVALID or "clusterIP" not in body["spec"]:
-            raise
-        log.info("%s: %s; taking another address", _id(body), error)
-        _create(api, "services", without_cluster_ip(body))
-
-
-def status_patch(uid: str, status: Json) -> list[Json]:
-    """The JSON patch that replaces the whole status, of the RosProxy with this uid only."""
-    return [
-        {"op": "test", "path": "/metadata/uid", "value": uid},
-        {"op": "add", "path": "/status", "value": status},
-    ]
-
-
 def line(action: Action) -> str:
     """An action in one line."""
     match action:
         case CreateService() | CreateProxy():
-            return f"create {action.body.get('kind')} {_id(action.body)}"
+            return f"create {action.body.get('kind')} {_subject(action)}"
         case DeleteService() | DeleteProxy():
             kind = "Service" if isinstance(action, DeleteService) else "Pod"
             return f"delete {kind} {action.id}: {action.why}"
@@ -206,58 +184,15 @@ def line(action: Action) -> str:
             return f"event for {action.of}: {action.reason}: {action.message}"
 
 
-def _create(api: Api, kind: str, body: Json) -> None:
-    try:
-        api.create(kind, body)
-    except ApiError as error:
-        if error.kind is not ErrorKind.CONFLICT:
-            raise
-        _check_ours(api, kind, body)
-
-
-def _check_ours(api: Api, kind: str, body: Json) -> None:
-    """Raise ApiError if the object that has the name already is not the operator's.
-
-    If it is, the list that was planned from was a little old, or a RosProxy of the same name has
-    just been deleted.
-    """
-    try:
-        there = api.get(kind, _id(body))["metadata"]
-    except ApiError as error:
-        if error.kind is ErrorKind.GONE:
-            return
-        raise
-    owners = there.get("ownerReferences") or ()
-    if not is_own(there.get("labels") or {}) or KIND not in {one.get("kind") for one in owners}:
-        raise ApiError(
-            ErrorKind.CONFLICT,
-            f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
-            "or rename the RosProxy",
-        )
-
-
-def _image_patch(action: SetImage) -> list[Json]:
-    container = "/spec/containers/0"
-    return [
-        {"op": "test", "path": "/metadata/uid", "value": action.uid},
-        {"op": "test", "path": f"{container}/name", "value": CONTAINER},
-        {"op": "replace", "path": f"{container}/image", "value": action.image},
-    ]
-
-
 def _subject(action: Action) -> Name:
     """The object that an action is about."""
     match action:
         case CreateService() | CreateProxy():
-            return _id(action.body)
+            return name_of(action.body["metadata"])
         case DeleteService() | DeleteProxy() | SetImage():
             return action.id
         case _:
             return action.of
-
-
-def _id(body: Json) -> Name:
-    return Name(str(body["metadata"]["namespace"]), str(body["metadata"]["name"]))
 
 
 def _nothing_left(action: Action) -> tuple[ErrorKind, ...]:
@@ -268,3 +203,68 @@ def _nothing_left(action: Action) -> tuple[ErrorKind, ...]:
     if isinstance(action, DeleteService | DeleteProxy | SetImage | PatchStatus):
         return ErrorKind.GONE, ErrorKind.CONFLICT
     return (ErrorKind.GONE,)
+
+
+def _create(api: Api, kind: str, body: Json) -> None:
+    """Create an object if it is not there; a Service if need be under another address than before.
+
+    Raises ApiError.
+    """
+    try:
+        api.create(kind, body)
+    except ApiError as error:
+        if error.kind is ErrorKind.CONFLICT:
+            _check_ours(api, kind, body)
+        elif error.kind is ErrorKind.INVALID and "clusterIP" in body["spec"]:
+            log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
+            _create(api, kind, without_cluster_ip(body))
+        else:
+            raise
+
+
+def _check_ours(api: Api, kind: str, body: Json) -> None:
+    """Raise ApiError if the object that has the name already is not the operator's.
+
+    If it is, the list that was planned from was a little old, or a RosProxy of the same name has
+    just been deleted.
+    """
+    try:
+        there = part(api.get(kind, name_of(body["metadata"])), "metadata")
+    except ApiError as error:
+        if error.kind is ErrorKind.GONE:
+            return
+        raise
+    owners = {word(one, "kind") for one in parts(there, "ownerReferences")}
+    if not is_own(words(there, "labels")) or KIND not in owners:
+        raise ApiError(
+            ErrorKind.CONFLICT,
+            f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
+            "or rename the RosProxy",
+        )
+
+
+def _patch_status(api: Api, action: PatchStatus, observed: ClusterSnapshot) -> None:
+    """Replace the whole status, of the RosProxy with this uid only."""
+    every: tuple[RosProxy | InvalidRosProxy, ...] = observed.rosproxies
+    every += tuple(observed.unusable.values())
+    uid = next(one.uid for one in every if one.id == action.of)
+    operations: list[Json] = [
+        {"op": "test", "path": "/metadata/uid", "value": uid},
+        {"op": "add", "path": "/status", "value": action.status},
+    ]
+    api.patch(f"{PLURAL}/status", action.of, operations)
+
+
+def _emit(api: Api, event: Emit) -> None:
+    """Make an Event, or count it if it is there."""
+    now = time.time()
+    body = event_body(event, now)
+    try:
+        api.create("events", body)
+    except ApiError as error:
+        if error.kind is not ErrorKind.CONFLICT:
+            raise
+        id = name_of(body["metadata"])
+        operations = counted(api.get("events", id), now)
+        if operations:
+            api.patch("events", id, operations)

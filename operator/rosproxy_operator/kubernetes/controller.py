@@ -17,17 +17,16 @@ from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.apply import ClusterApplier
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
 from rosproxy_operator.kubernetes.event_filter import EventFilter
-from rosproxy_operator.kubernetes.events import stamp
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyPod
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
+from rosproxy_operator.kubernetes.status.events import stamp
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +47,10 @@ class KubernetesController:
 
     def __init__(self, settings: KubernetesSettings, api: Api, metrics: ClusterMetrics) -> None:
         self._settings, self._metrics = settings, metrics
-        self._loop = loop = ControlLoop(
-            Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK), metrics
-        )
+        pace = Pace("API server", settings.resync, DEBOUNCE, LONGEST_LOOK)
+        self._loop = loop = ControlLoop(pace, metrics)
         self.wake, self.dead, self.unready = loop.wake_threadsafe, loop.dead, loop.unready
-        self._tasks = Tasks()
-        self._proxies = ProxyClient()
+        self._tasks, self._proxies = Tasks(), ProxyClient()
         self._snapshots = SnapshotReader(api)
         self._applier = ClusterApplier(api, self._proxies, self._tasks, metrics.count)
         self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, loop.wake)
@@ -86,26 +83,23 @@ class KubernetesController:
         seen = replace(seen, reports=self._proxy_sync.reports, failures=self._applier.failures)
         planned = plan(seen, self._settings.plan, self._state, time.monotonic(), stamp(time.time()))
         self._state = planned.state
-        self._metrics.look_time.observe(time.monotonic() - started)
-        log.debug("looked in %.3f s", time.monotonic() - started)
+        took = time.monotonic() - started
+        self._metrics.look_time.observe(took)
+        log.debug("looked in %.3f s", took)
         self.event_filter.learn(seen)
         self._proxy_sync.report_gone(planned.gone)
-        await self._act(planned, seen)
-        self._report(seen, planned)
-        return planned.again_in
-
-    async def _act(self, planned: ClusterPlan, seen: ClusterSnapshot) -> None:
-        before = dict(self._applier.failures)
         await self._applier.carry_out(planned.actions, seen)
-        if self._applier.failures != before:
+        if self._applier.failures != seen.failures:
             self._loop.wake()  # the status is to tell
         elif planned.actions:
             self._loop.wake_in(SETTLED)
-
-    def _report(self, seen: ClusterSnapshot, planned: ClusterPlan) -> None:
         if self._missing:
             self._missing = False
             self.appeared()
+        self._report(seen, planned)
+        return planned.again_in
+
+    def _report(self, seen: ClusterSnapshot, planned: ClusterPlan) -> None:
         problems: list[Problem] = [*planned.problems, *self._applier.problems.values()]
         self._log.update(problems)
         metrics = self._metrics

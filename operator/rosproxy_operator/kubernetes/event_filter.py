@@ -1,22 +1,18 @@
 """Which events of a cluster are worth a look: a busy one tells of something every moment.
 
-kopf's watches hand every event to `handlers`, which ask here. An event matters if the object is new
+kopf's watches ask here about every event. An event matters if the object is new
 or gone, or if what a look would read of it has changed. What the last look has found says which
 pods and Services are of interest at all.
 """
 
-import logging
 from collections.abc import Callable
 from typing import Any
 
 from rosproxy_operator.kubernetes.planner.selection import chosen
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json, Name
+from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json
 from rosproxy_operator.kubernetes.resources.names import is_own
-from rosproxy_operator.kubernetes.resources.objects import node as parse_node
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
-
-log = logging.getLogger(__name__)
+from rosproxy_operator.kubernetes.resources.values import part, word, words
 
 MOST = 20_000
 """Objects that are remembered."""
@@ -31,7 +27,7 @@ class EventFilter:
 
     def __init__(self) -> None:
         self._last: ClusterSnapshot | None = None
-        self._seen: dict[tuple[str, str], Any] = {}
+        self._seen: dict[str, Any] = {}
 
     def learn(self, snapshot: ClusterSnapshot) -> None:
         """Take note of what the last look has found."""
@@ -39,53 +35,44 @@ class EventFilter:
 
     def rosproxy(self, type: str | None, body: Json) -> bool:
         """Whether an event of a RosProxy matters: not if only its status has changed."""
-        meta = body.get("metadata") or {}
-        return self._new("rosproxy", type, body, lambda: [meta.get(key) for key in _RESOURCE])
+        return self._new(type, body, _resource)
 
     def node(self, type: str | None, body: Json) -> bool:
         """Whether an event of a node matters."""
-        return self._new("node", type, body, lambda: parse_node(body))
+        return self._new(type, body, objects.node)
 
     def pod(self, type: str | None, body: Json) -> bool:
-        """Whether an event of a pod matters: of a proxy's, or one that a RosProxy selects."""
-        if _own(body):
-            return self._new("pod", type, body, lambda: (parse_proxy_pod(body), parse_pod(body)))
-        return self._selected(body) and self._new("pod", type, body, lambda: parse_pod(body))
+        """Whether an event of a pod matters: of a proxy, or one that a RosProxy selects or has."""
+        if is_own(words(body, "metadata", "labels")):
+            return self._new(type, body, lambda body: (objects.proxy_pod(body), objects.pod(body)))
+        last, pod = self._last, objects.pod(body)
+        if last is not None and pod.uid not in last.selected:
+            choice = chosen(pod, last.rosproxies)
+            if not choice.rosproxy and not choice.finding:
+                return False
+        return self._new(type, body, objects.pod)
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the operator's own, or a master's."""
-        if not _own(body) and (self._last is None or _id(body) not in self._last.masters):
-            return False
-        return self._new("service", type, body, lambda: body.get("spec"))
+        masters = self._last.masters if self._last else {}
+        meta = part(body, "metadata")
+        matters = is_own(words(meta, "labels")) or objects.name_of(meta) in masters
+        return matters and self._new(type, body, lambda body: body.get("spec"))
 
-    def _selected(self, body: Json) -> bool:
-        """Whether a RosProxy selects a pod now, or did at the last look."""
-        last = self._last
-        if last is None:
-            return True
-        pod = parse_pod(body)
-        namespace = [one for one in last.rosproxies if one.id.namespace == pod.id.namespace]
-        choice = chosen(pod, namespace)
-        return bool(choice.rosproxy or choice.finding) or pod.uid in last.selected
-
-    def _new(self, kind: str, type: str | None, body: Json, read: Callable[[], Any]) -> bool:
-        key = kind, str((body.get("metadata") or {}).get("uid"))
+    def _new(self, type: str | None, body: Json, read: Callable[[Json], Any]) -> bool:
+        uid = word(part(body, "metadata"), "uid")
         if type == "DELETED":
-            self._seen.pop(key, None)
+            self._seen.pop(uid, None)
             return True
-        found = read()
-        if key in self._seen and self._seen[key] == found:
+        found = read(body)
+        if uid in self._seen and self._seen[uid] == found:
             return False
         if len(self._seen) >= MOST:
             self._seen.clear()  # deletions that nobody told of
-        self._seen[key] = found
+        self._seen[uid] = found
         return True
 
 
-def _own(body: Json) -> bool:
-    return is_own((body.get("metadata") or {}).get("labels") or {})
-
-
-def _id(body: Json) -> Name:
-    meta = body.get("metadata") or {}
-    return Name(str(meta.get("namespace") or ""), str(meta.get("name") or ""))
+def _resource(body: Json) -> list[Any]:
+    meta = part(body, "metadata")
+    return [meta.get(key) for key in _RESOURCE]

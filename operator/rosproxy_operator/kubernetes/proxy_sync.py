@@ -7,16 +7,20 @@ with each look; a report that is another one than before wakes the operator.
 """
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 
+from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
+from rosproxy.telemetry.text import clean
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.kubernetes.resources.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT
-from rosproxy_operator.kubernetes.resources.proxy_status import no_answer, report
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +34,10 @@ SILENT = 2
 """Unanswered questions in a row before a proxy counts as silent."""
 AT_ONCE = 32
 """Proxies that are asked at the same time."""
+RECENT = 300.0
+"""Seconds that a problem counts: a proxy tells the last ones, however old they are."""
+_LONGEST = 300
+"""Characters of a problem or an error, which may be of any size there."""
 
 
 class ProxyPoller:
@@ -45,14 +53,12 @@ class ProxyPoller:
         room: asyncio.Semaphore,
         changed: Callable[[], None],
     ) -> None:
-        self.where = address_of(proxy)
+        self.where, self._token = address_of(proxy), proxy.token
         self.report: ProxyReport | None = None
-        self._token = proxy.token
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
         self._pending = asyncio.Event()
-        self._recheck = False
-        self._failures = 0
+        self._recheck, self._failures = False, 0
         self._since = time.monotonic()
 
     def report_gone(self, gone: Iterable[str]) -> None:
@@ -70,15 +76,9 @@ class ProxyPoller:
                 self._recheck = told
             answers = self.report is not None and self.report.answered
             pause = EVERY if answers or self._waited(EVERY * 20) else EVERY_STARTING
-            await self._pause(pause)
-
-    async def _pause(self, seconds: float) -> None:
-        """Wait, but not if there is something to tell by now."""
-        try:
-            async with asyncio.timeout(seconds):
-                await self._pending.wait()
-        except TimeoutError:
-            pass
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._pending.wait()  # there is something to tell by now
 
     async def _ask(self) -> None:
         try:
@@ -154,3 +154,31 @@ class ClusterProxySync:
 def address_of(proxy: ProxyPod) -> HostPort:
     """Where a proxy answers the operator."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)
+
+
+def report(status: ProxyStatus) -> ProxyReport:
+    """What a proxy says. Nodes that it has given up already are not among its nodes."""
+    master, nodes = status.master, nodes_by_address(status)
+    every = [node for there in nodes.values() for node in there]
+    return ProxyReport(
+        answered=True,
+        master_up=master.up,
+        error="" if master.up else _short(master.error or "not asked yet"),
+        nodes={
+            address: tuple(sorted({name for node in there for name in node.nodes}))
+            for address, there in nodes.items()
+        },
+        topics=frozenset(topic for node in every for topic in node.publishes + node.subscribes),
+        problems=tuple(
+            _short(f"{one.subject}: {one.text}") for one in status.problems if one.age <= RECENT
+        ),
+    )
+
+
+def no_answer(error: str) -> ProxyReport:
+    """What is known of a proxy that does not answer."""
+    return ProxyReport(answered=False, error=_short(error))
+
+
+def _short(text: str) -> str:
+    return bounded(clean(text), _LONGEST)

@@ -3,6 +3,8 @@
 import asyncio
 import logging
 import signal
+from collections.abc import Coroutine
+from typing import Any
 
 from rosproxy import __version__
 from rosproxy_operator.common.health import HealthServer
@@ -41,12 +43,15 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         api.server,
         settings.admin,
     )
-    rotation = (
-        CertificateRotation(source(api, settings.webhook), metrics) if settings.webhook else None
-    )
-    watch = _watch(settings, controller, api, rotation, metrics)
+    running: list[Coroutine[Any, Any, object]] = [controller.run(), stopped.wait()]
+    webhook = None
+    if settings.webhook:
+        rotation = CertificateRotation(source(api, settings.webhook), metrics)
+        running.append(rotation.run())
+        server = WebhookServer(settings.webhook.bind, rotation)
+        webhook = Injector(api, metrics, controller.wake), server
+    watch = ClusterWatch(settings, controller, webhook, metrics)
     controller.appeared = watch.restart
-    running = [controller.run(), stopped.wait(), *([rotation.run()] if rotation else [])]
     tasks = [asyncio.ensure_future(work) for work in running]
     watch.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -56,18 +61,3 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     watch.stop()
     for task in done:
         task.result()  # raises what it died of
-
-
-def _watch(
-    settings: KubernetesSettings,
-    controller: KubernetesController,
-    api: Api,
-    rotation: CertificateRotation | None,
-    metrics: ClusterMetrics,
-) -> ClusterWatch:
-    if settings.webhook is None or rotation is None:
-        return ClusterWatch(settings, controller, None, None, metrics)
-    server = WebhookServer(settings.webhook.bind, rotation)
-    return ClusterWatch(
-        settings, controller, Injector(api, metrics, controller.wake), server, metrics
-    )

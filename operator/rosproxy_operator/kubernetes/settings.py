@@ -3,7 +3,6 @@
 ``read_…`` makes one value of a text and raises ValueError; see `rosproxy.settings`.
 """
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,12 +11,11 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.settings import SettingError
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
 DEFAULT_WEBHOOK = HostPort("0.0.0.0", 9443)
-_LABEL = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
-_SUBDOMAIN = re.compile(rf"(?=.{{1,253}}$){_LABEL.pattern}(\.{_LABEL.pattern})*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +73,14 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
 
 def read_namespace(text: str) -> str:
     """The name of a namespace. Raises ValueError."""
-    if not _LABEL.fullmatch(text):
+    if not is_label(text):
         raise ValueError(f"{text!r} is not a namespace's name")
     return text
 
 
 def read_object_name(text: str) -> str:
     """The name of an object that has no namespace; empty for no text. Raises ValueError."""
-    if text and not _SUBDOMAIN.fullmatch(text):
+    if text and not is_subdomain(text):
         raise ValueError(f"{text!r} is not an object's name")
     return text
 
@@ -92,7 +90,7 @@ def read_name(text: str) -> Name | None:
     namespace, slash, name = text.partition("/")
     if not text:
         return None
-    if not slash or not _LABEL.fullmatch(namespace) or not _SUBDOMAIN.fullmatch(name):
+    if not slash or not is_label(namespace) or not is_subdomain(name):
         raise ValueError(f"{text!r} is not of the form NAMESPACE/NAME")
     return Name(namespace, name)
 

@@ -6,34 +6,30 @@ Services and selected pods, then all pods on the nodes that matter. All of it or
 
 import asyncio
 import re
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
-from functools import partial
-from ipaddress import ip_address
 from typing import TypeVar
 
+from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.selection import label_selector
-from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
+    Json,
     Name,
     Pod,
     ProxyPod,
-    ProxyService,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.objects import node as parse_node
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import proxy_pod as parse_proxy_pod
-from rosproxy_operator.kubernetes.resources.objects import service as parse_service
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
-from rosproxy_operator.kubernetes.resources.spec import invalid, rosproxy
+from rosproxy_operator.kubernetes.resources.spec import rosproxies
+from rosproxy_operator.kubernetes.resources.values import part, parts, word
 
+K = TypeVar("K")
 T = TypeVar("T")
 AT_ONCE = 8
 """Lists that are asked for at the same time."""
@@ -57,47 +53,45 @@ class SnapshotReader:
         is taken for a leftover.
         """
         usable, unusable = await self._ask(self._rosproxies)
-        api = self._api
+        api, ports = self._api, _master_ports(usable.values())
         nodes, proxies, services, masters, selected = await asyncio.gather(
-            self._ask(lambda: {node.name: node for node in map(parse_node, api.nodes())}),
-            self._ask(self._proxies),
-            self._ask(self._services),
-            self._masters(usable),
-            self._selected(usable),
+            self._ask(lambda: [*map(objects.node, api.nodes())]),
+            self._ask(lambda: [*filter(None, map(objects.proxy_pod, api.own("pods")))]),
+            self._ask(lambda: [*filter(None, map(objects.service, api.own("services")))]),
+            self._each(ports, lambda id: master_service(api, id, ports[id])),
+            self._each(usable, lambda id: self._selected(usable[id])),
         )
         refused = {id: each for id, each in selected.items() if isinstance(each, InvalidRosProxy)}
         found = [pod for each in selected.values() if isinstance(each, list) for pod in each]
-        others = await self._on_nodes({*(pod.node for pod in found), *(p.on for p in proxies)})
+        on = sorted({*(pod.node for pod in found), *(proxy.on for proxy in proxies)} - {""})
+        others = await self._each(on, lambda name: [*map(objects.pod, api.pods_on(name))])
+        # Every pod once; of those that were listed more than once, what was listed last.
+        listed = (found, *others.values(), (proxy.pod for proxy in proxies))
+        pods = {pod.uid: pod for some in listed for pod in some}
         return ClusterSnapshot(
-            rosproxies=tuple(each for each in usable if each.id not in refused),
+            rosproxies=tuple(each for id, each in usable.items() if id not in refused),
             unusable={**unusable, **refused},
-            nodes=nodes,
-            pods=_newest(found, others, [proxy.pod for proxy in proxies]),
-            proxies=tuple(await self._explained(proxies)),
-            services=services,
+            nodes={node.name: node for node in nodes},
+            pods=tuple(pods.values()),
+            proxies=tuple(await asyncio.gather(*map(self._with_event, proxies))),
+            services={service.of: service for service in services},
             masters=masters,
             selected=frozenset(pod.uid for pod in found if not pod.ended),
         )
 
-    async def _ask(self, question: Callable[[], T]) -> T:
+    async def _ask(self, question: Callable[..., T], *about: object) -> T:
         """Ask the API server, and read what it answers, in a thread."""
         async with self._room:
-            return await in_thread(question)
+            return await in_thread(question, *about)
 
-    def _rosproxies(self) -> tuple[list[RosProxy], dict[Name, InvalidRosProxy]]:
-        usable: list[RosProxy] = []
-        unusable: dict[Name, InvalidRosProxy] = {}
-        for found in self._listed_rosproxies():
-            try:
-                usable.append(rosproxy(found))
-            except InvalidField as error:
-                what = invalid(found, error)
-                unusable[what.id] = what
-        return usable, unusable
+    async def _each(self, keys: Collection[K], question: Callable[[K], T]) -> dict[K, T]:
+        """The answers to the same question about each of some."""
+        found = await asyncio.gather(*(self._ask(question, key) for key in keys))
+        return dict(zip(keys, found, strict=True))
 
-    def _listed_rosproxies(self) -> list[Found]:
+    def _rosproxies(self) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
         try:
-            return self._api.rosproxies()
+            return rosproxies(self._api.rosproxies())
         except ApiError as error:
             if error.kind is not ErrorKind.GONE:
                 raise
@@ -107,33 +101,8 @@ class SnapshotReader:
                 "rosproxies.rosproxy.io (it comes with the chart and with manifests/)",
             ) from None
 
-    def _proxies(self) -> list[ProxyPod]:
-        found = map(parse_proxy_pod, self._api.own("pods"))
-        return [proxy for proxy in found if proxy]
-
-    def _services(self) -> dict[Name, ProxyService]:
-        found = map(parse_service, self._api.own("services"))
-        return {service.of: service for service in found if service}
-
-    async def _masters(self, rosproxies: Iterable[RosProxy]) -> dict[Name, tuple[str, str]]:
-        ports: dict[Name, set[int]] = {}
-        for each in rosproxies:
-            if each.spec.master.service is not None:
-                ports.setdefault(each.spec.master.service, set()).add(each.spec.master.service_port)
-        found = await _all(
-            self._ask(partial(master_service, self._api, id, some)) for id, some in ports.items()
-        )
-        return dict(zip(ports, found, strict=True))
-
-    async def _selected(
-        self, rosproxies: Iterable[RosProxy]
-    ) -> dict[Name, list[Pod] | InvalidRosProxy]:
-        """By RosProxy the pods that its selector fits, or why the API server refuses that."""
-        of = list(rosproxies)
-        found = await _all(self._ask(partial(self._pods_of, one)) for one in of)
-        return {one.id: pods for one, pods in zip(of, found, strict=True)}
-
-    def _pods_of(self, of: RosProxy) -> list[Pod] | InvalidRosProxy:
+    def _selected(self, of: RosProxy) -> list[Pod] | InvalidRosProxy:
+        """The pods that a RosProxy's selector fits, or why the API server refuses that."""
         try:
             found = self._api.pods(of.id.namespace, label_selector(of.spec, of.id.name))
         except ApiError as error:
@@ -141,48 +110,35 @@ class SnapshotReader:
                 raise
             text = f"spec.podSelector: {error}"
             return InvalidRosProxy(of.id, of.uid, of.generation, text, of.status)
-        return [parse_pod(each) for each in found]
-
-    async def _on_nodes(self, nodes: set[str]) -> list[Pod]:
-        names = sorted(nodes - {""})
-        found = await _all(self._ask(partial(self._pods_on, name)) for name in names)
-        return [pod for each in found for pod in each]
-
-    def _pods_on(self, node: str) -> list[Pod]:
-        return [parse_pod(each) for each in self._api.pods_on(node)]
-
-    async def _explained(self, proxies: Iterable[ProxyPod]) -> list[ProxyPod]:
-        """The proxies, also those that the kubelet can't set up, of which only an Event tells."""
-        return await _all(map(self._with_event, proxies))
+        return [objects.pod(each) for each in found]
 
     async def _with_event(self, proxy: ProxyPod) -> ProxyPod:
+        """A proxy, also one that the kubelet can't set up, of which only an Event tells."""
         waits = proxy.pod.phase == "Pending" and proxy.pod.node and not proxy.pod.deleting
         if not waits or proxy.stuck or proxy.pod.ip:
             return proxy
-        question = partial(self._api.events_of, proxy.pod.id, proxy.pod.uid, SANDBOX_FAILED)
-        events = await self._ask(question)
+        id, uid = proxy.pod.id, proxy.pod.uid
+        events = await self._ask(self._api.events_of, id, uid, SANDBOX_FAILED)
         if not events:
             return proxy
-        message = str(max(events, key=_when).get("message") or "")
-        return replace(proxy, stuck=stuck_by_event(message), message=_steady(message))
+        message = word(max(events, key=_when), "message")
+        # Without the sandbox's id, which is another one with each try.
+        steady = clean(_IDS.sub("…", " ".join(message.split())))[:_LONGEST]
+        return replace(proxy, stuck=stuck_by_event(message), message=steady)
 
 
-async def _all(work: Iterable[Awaitable[T]]) -> list[T]:
-    return list(await asyncio.gather(*work))
+def _when(event: Json) -> str:
+    return word(event, "lastTimestamp") or word(event, "eventTime")
 
 
-def _newest(*groups: Iterable[Pod]) -> tuple[Pod, ...]:
-    """Every pod once; of those that were listed more than once, what was listed last."""
-    return tuple({pod.uid: pod for group in groups for pod in group}.values())
-
-
-def _steady(message: str) -> str:
-    """What an Event says, without the sandbox's id: that is another one with each try."""
-    return clean(_IDS.sub("…", " ".join(message.split())))[:_LONGEST]
-
-
-def _when(event: Found) -> str:
-    return str(event.get("lastTimestamp") or event.get("eventTime") or "")
+def _master_ports(rosproxies: Iterable[RosProxy]) -> dict[Name, set[int]]:
+    """The ports that RosProxies name of the Services that are their masters."""
+    ports: dict[Name, set[int]] = {}
+    for each in rosproxies:
+        master = each.spec.master
+        if master.service is not None:
+            ports.setdefault(master.service, set()).add(master.service_port)
+    return ports
 
 
 def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str]:
@@ -198,28 +154,18 @@ def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str
         return "", f"there is no Service {id.name} in the namespace {id.namespace}: create it"
 
 
-def read_master(service: Found, id: Name, ports: Collection[int]) -> tuple[str, str]:
+def read_master(service: Json, id: Name, ports: Collection[int]) -> tuple[str, str]:
     """The same, from a Service as the API server gives it."""
-    spec = service.get("spec") or {}
-    address = str(spec.get("clusterIP") or "")
-    if not _is_address(address):
+    spec = part(service, "spec")
+    address = word(spec, "clusterIP")
+    if not is_address(address):
         return "", (
-            f"the Service {id} has no cluster IP ({spec.get('type') or 'headless'}): "
+            f"the Service {id} has no cluster IP ({word(spec, 'type') or 'headless'}): "
             "make it one of type ClusterIP with an address of its own"
         )
-    offered = {port.get("port") for port in spec.get("ports") or () if isinstance(port, dict)}
-    if not offered & set(ports):
+    offered = {port.get("port") for port in parts(spec, "ports")}
+    if offered.isdisjoint(ports):
         has, wanted = (", ".join(sorted(map(str, some))) or "none" for some in (offered, ports))
-        return (
-            "",
-            f"the Service {id} has no port {wanted} (it has {has}): set spec.master.service.port",
-        )
+        text = f"has no port {wanted} (it has {has}): set spec.master.service.port"
+        return "", f"the Service {id} {text}"
     return address, ""
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ip_address(text)
-    except ValueError:
-        return False
-    return True

@@ -1,28 +1,34 @@
 """Running kopf in a thread of its own, again whenever it ends.
 
 kopf ends as a whole when one of its watches does, and then cancels every task of its event loop.
-Nothing depends on it but how soon something is seen: looks go on by the clock.
+Nothing depends on it but how soon something is seen: looks go on by the clock. Events only wake the
+operator; kopf writes nothing to any object for ``on.event``: no annotation, no finalizer.
 """
 
 import asyncio
 import contextlib
 import logging
+import re
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, cast
 
 import kopf
 
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.kubernetes.handlers import Wakeable, registry
+from rosproxy_operator.kubernetes.api import missing_rule
+from rosproxy_operator.kubernetes.controller import KubernetesController
+from rosproxy_operator.kubernetes.resources.names import GROUP, INJECT, PLURAL, VERSION
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 
 log = logging.getLogger(__name__)
 
+WIRE = "wire"
+"""The id of the handler that wires pods, and so the path of the webhook."""
 BACK_OFF = (1.0, 2.0, 5.0, 10.0)
 """Seconds until kopf is started again; the last is repeated."""
 WELL = 60.0
@@ -32,6 +38,11 @@ STOPPING = 3.0
 _BETWEEN_TRIES = (1.0, 1.0, 2.0, 3.0, 5.0)
 _PERIOD = 300
 """Seconds after which the API server is to end a watch: whatever was lost comes again then."""
+_FORBIDDEN = re.compile(r"APIForbiddenError\(\W?(?P<text>.*)")
+
+
+class NotAlive(Exception):
+    """The operator is not alive."""
 
 
 class Endless:
@@ -44,19 +55,51 @@ class Endless:
             yield _BETWEEN_TRIES[-1]
 
 
+class KopfLog(logging.Handler):
+    """Tells once which rule is missing for watching, and everything else only at debug level.
+
+    kopf logs each try at an API server that is away, for every kind of object; the operator's own
+    looks say so once, in one line. But for the rule that only watching needs nobody else asks.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._told: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Tell what a record says, if it is worth it."""
+        text = record.getMessage()
+        found = _FORBIDDEN.search(text)
+        rule = missing_rule(found["text"]) if found else ""
+        if rule and rule not in self._told:
+            self._told.add(rule)
+            log.warning("watching is refused, so changes are seen late: %s", rule)
+        log.debug("kopf: %s", text)
+
+
+def quieten() -> None:
+    """Take kopf's loggers over, and keep the libraries below from telling of each request."""
+    kopf_log, debug = logging.getLogger("kopf"), logging.getLogger().isEnabledFor(logging.DEBUG)
+    kopf_log.handlers, kopf_log.propagate = [KopfLog()], False
+    kopf_log.setLevel(logging.DEBUG if debug else logging.ERROR)
+    for name in ("kubernetes", "urllib3"):
+        logging.getLogger(name).setLevel(logging.INFO if debug else logging.CRITICAL)
+    logging.getLogger("asyncio").setLevel(logging.INFO)
+    logging.getLogger("aiohttp.access").setLevel(logging.WARNING)
+
+
 class ClusterWatch:
-    """Watches the cluster and serves liveness and webhook, in a thread."""
+    """Watches the cluster and serves liveness and, if it is given, the webhook, in a thread."""
 
     def __init__(
         self,
         settings: KubernetesSettings,
-        controller: Wakeable,
-        injector: Injector | None,
-        server: WebhookServer | None,
+        controller: KubernetesController,
+        webhook: tuple[Injector, WebhookServer] | None,
         metrics: ClusterMetrics,
     ) -> None:
         self._settings, self._controller, self._metrics = settings, controller, metrics
-        self._injector, self._server = injector, server
+        self._webhook = webhook
         self._ending = threading.Event()
         self._running: tuple[asyncio.AbstractEventLoop, asyncio.Task[None]] | None = None
         self._thread = threading.Thread(target=self._run, daemon=True, name="kopf")
@@ -78,7 +121,7 @@ class ClusterWatch:
         self.restart()
         self._thread.join(STOPPING)
 
-    def configure(self, settings: kopf.OperatorSettings) -> None:
+    async def configure(self, settings: kopf.OperatorSettings, **_: Any) -> None:
         """Set kopf up."""
         settings.posting.enabled = False
         settings.scanning.disabled = True
@@ -91,7 +134,7 @@ class ClusterWatch:
         settings.watching.server_timeout = _PERIOD
         settings.watching.reconnect_backoff = 1.0
         settings.admission.managed = None
-        settings.admission.server = self._server
+        settings.admission.server = self._webhook[1] if self._webhook else None
 
     def _run(self) -> None:
         failures = 0
@@ -101,17 +144,18 @@ class ClusterWatch:
             failures = 0 if time.monotonic() - started > WELL else failures + 1
             if not self._ending.is_set():
                 self._metrics.watch_restarts.inc()
-                self._controller.wake()
+                self._controller.wake()  # what is missed meanwhile is found by looking
                 self._ending.wait(BACK_OFF[min(failures, len(BACK_OFF)) - 1])
 
     def _once(self) -> None:
         try:
-            with _quiet():
+            with warnings.catch_warnings(action="ignore"):
                 asyncio.run(self._operate())
         except asyncio.CancelledError:
             pass
         except Exception as error:
-            log.warning("watching has ended (%s); starting it again", _reason(error))
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            log.warning("watching has ended (%s); starting it again", reason)
         finally:
             self._running = None
 
@@ -125,7 +169,7 @@ class ClusterWatch:
         namespaces = self._settings.namespaces
         # kopf's own stop flag would hold it up for seconds when it ends for another reason.
         await kopf.operator(
-            registry=registry(self._controller, self._injector, self.configure),
+            registry=self._handlers(),
             standalone=True,
             # kopf would ask for the user's name otherwise, and an image's user has none.
             identity=cast(Any, "rosproxy-operator"),
@@ -134,18 +178,58 @@ class ClusterWatch:
             namespaces=namespaces,
         )
 
+    def _handlers(self) -> kopf.OperatorRegistry:
+        handlers, controller = kopf.OperatorRegistry(), self._controller
+        kopf.on.startup(registry=handlers, id="startup")(self.configure)
+        # As long as there are no credentials, kopf is not to end for it.
+        kopf.on.login(registry=handlers, backoff=5.0)(kopf.login_via_client)
+
+        # Otherwise it would be tried again for a minute before the probe is answered.
+        @kopf.on.probe(registry=handlers, id="alive", errors=kopf.ErrorsMode.PERMANENT)
+        async def alive(**_: Any) -> str:
+            if reason := controller.dead():
+                raise NotAlive(reason)
+            return "ok"
+
+        def on(matters: Callable[[str | None, Any], bool], *resource: str) -> None:
+            @kopf.on.event(*resource, registry=handlers, id=resource[-1])
+            async def happened(event: kopf.RawEvent, **_: Any) -> None:
+                if matters(event["type"], event["object"]):
+                    controller.wake()
+
+        event_filter = controller.event_filter
+        on(event_filter.rosproxy, GROUP, VERSION, PLURAL)
+        on(event_filter.pod, "", "v1", "pods")
+        on(event_filter.node, "", "v1", "nodes")
+        on(event_filter.service, "", "v1", "services")
+        if self._webhook:
+            _serve(handlers, self._webhook[0])
+        return handlers
+
+
+def _serve(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
+    @kopf.on.mutate(
+        "",
+        "v1",
+        "pods",
+        id=WIRE,
+        registry=handlers,
+        operations=["CREATE"],
+        labels={INJECT: kopf.PRESENT},
+        ignore_failures=True,
+    )
+    async def wire(
+        body: kopf.Body, patch: kopf.Patch, warnings: list[str], dryrun: bool, **_: Any
+    ) -> None:
+        # As it was sent: kopf's own is a view whose parts are no dictionaries.
+        wiring = await injector.wiring(dict(body), dryrun)
+        warnings.extend(wiring.warnings)
+        if wiring.spec is not None:
+            patch["spec"] = dict(wiring.spec)
+        if wiring.annotations:
+            patch.metadata["annotations"] = dict(wiring.annotations)
+
 
 def _forgotten(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Tasks that kopf leaves behind when it ends; why it does is told where it is started anew."""
     log.debug("kopf: %s: %r", context.get("message"), context.get("exception"))
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
-def _reason(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

@@ -1,120 +1,94 @@
-"""Objects of the API server into typed structures, by msgspec.
+"""What a user writes, read strictly: the first field that does not fit is refused by its name.
 
-msgspec it is, and not pydantic: all pods of a cluster's nodes are converted with every look, in one
-call of C each; it passes over fields that are not named here, newer ones too; and what it makes is
-frozen and compares by value, as all that the planner works on.
-
-There are two ways. `strict` is for what a user writes, a RosProxy's spec: the first field that does
-not fit is refused by its name. `lenient` is for objects that are not ours and that the API server
-has checked: what does not fit is as if it were not there.
+Not by msgspec, which the proxy's documents are read with: what it says of a field is neither named
+as Kubernetes names it nor tells what to do.
 """
 
-import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import msgspec
+from rosproxy_operator.kubernetes.resources.values import quoted
 
-from rosproxy.telemetry.text import shorten
-
-T = TypeVar("T")
-Path = tuple[str | int | None, ...]
-"""The way to a part of an object: keys, indexes, and None for some value of a map of texts."""
-_AT = re.compile(r"^(?P<what>.*?)(?: - at `\$(?P<path>.*)`)?$", re.S)
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+)\]|\[\.\.\.\]")
-_WORDS = {
-    "`int`": "an integer",
-    "`float`": "a number",
-    "`str`": "a text, in quotes",
-    "`object`": "a map of fields",
-    "`array`": "a list",
-    "`bool`": "true or false",
-}
-_SHOWN = 80
-
-
-class ApiFields(msgspec.Struct, frozen=True, rename="camel"):
-    """Fields of an API object, by their names there in snake case."""
+N = TypeVar("N", int, float)
+V = TypeVar("V")
+_NOTHING: Mapping[str, Any] = {}
 
 
 class InvalidField(Exception):
     """Why an object can't be used: which field, what is wrong, and what to do."""
 
 
-def invalid_field(path: str, value: object, what: str, fix: str) -> InvalidField:
-    """The error to raise for a field. ``path`` names it as Kubernetes does: ``spec.ports``."""
-    return InvalidField(f"{path}: {quoted(value)} {what}: {fix}")
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A part of an object, None if it is not given; ``path`` names it as Kubernetes does.
 
-
-def quoted(value: object) -> str:
-    """A value as it may be shown: not too long, and harmless."""
-    return shorten(repr(value), _SHOWN)
-
-
-def strict(obj: Any, type: type[T], name: str) -> T:
-    """The fields of the object that is called ``name``; null is as if not given, texts are bare.
-
-    Raises InvalidField.
+    All methods but `refused` raise InvalidField if it is not what they are to give.
     """
-    bare = _bare(obj)
-    try:
-        return msgspec.convert({} if bare is None else bare, type)
-    except msgspec.ValidationError as error:
-        what, path = _parsed(error)
-        where, value = _found(bare, path, name)
-        expected = what.removeprefix("Expected ").partition(", got")[0]
-        for word, plain in _WORDS.items():
-            expected = expected.replace(word, plain)
-        raise invalid_field(where, value, "does not fit", f"write {expected}") from None
+
+    path: str
+    value: Any
+
+    def refused(self, what: str, fix: str) -> InvalidField:
+        """The error to raise for it: what is wrong, and what to do."""
+        return InvalidField(f"{self.path}: {quoted(self.value)} {what}: {fix}")
+
+    def __getitem__(self, key: str) -> "Field":
+        return Field(f"{self.path}.{key}", self.map().get(key))
+
+    def map(self, default: Mapping[str, Any] = _NOTHING) -> Mapping[str, Any]:
+        """A map of anything."""
+        return self._of(dict, default, "a map of fields")
+
+    def texts(self) -> dict[str, str]:
+        """A map of texts."""
+        return {key: self[key].text() for key in self.map()}
+
+    def each(self) -> list["Field"]:
+        """What a list holds."""
+        found = [
+            Field(f"{self.path}[{i}]", one) for i, one in enumerate(self._of(list, [], "a list"))
+        ]
+        for one in found:
+            if one.value is None:
+                raise one.refused("does not fit", "leave it out")
+        return found
+
+    def text(self, default: str = "") -> str:
+        """A text."""
+        return self._of(str, default, "a text, in quotes")
+
+    def number(self, default: N, least: int, most: int) -> N:
+        """A number of the type that the default has, within bounds."""
+        if self.value is None:
+            return default
+        kind = type(default)
+        fits = isinstance(self.value, int | kind) and not isinstance(self.value, bool)
+        if not fits or not least <= self.value <= most:
+            word = {int: "an integer", float: "a number"}[kind]
+            raise self.refused("does not fit", f"write {word} from {least} to {most}")
+        return kind(self.value)
+
+    def one_of(self, allowed: Mapping[str, V], default: str) -> V:
+        """What one of some words stands for."""
+        found = self.text(default)
+        if found not in allowed:
+            fix = f"write one of {', '.join(sorted(filter(None, allowed)))}"
+            raise self.refused("is unknown", fix)
+        return allowed[found]
+
+    def _of(self, type: type[V], default: V, word: str) -> V:
+        if self.value is None:
+            return default
+        if not isinstance(self.value, type):
+            raise self.refused("does not fit", f"write {word}")
+        return self.value
 
 
-def lenient(obj: Any, type: type[T]) -> T:
-    """The fields of an object that fit."""
-    while True:
-        try:
-            return msgspec.convert(obj, type)
-        except msgspec.ValidationError as error:
-            obj = _without(obj, _parsed(error)[1])
-
-
-def _bare(obj: Any) -> Any:
+def bare(obj: Any) -> Any:
+    """The same without blanks around its texts; null in a map is as if it were not given."""
     if isinstance(obj, str):
         return obj.strip()
     if isinstance(obj, Mapping):
-        return {key: _bare(value) for key, value in obj.items() if value is not None}
-    return [_bare(one) for one in obj] if isinstance(obj, list | tuple) else obj
-
-
-def _parsed(error: msgspec.ValidationError) -> tuple[str, Path]:
-    """What is wrong, and where."""
-    found = _AT.match(str(error))
-    assert found is not None  # noqa: S101 - it matches anything
-    steps = _STEP.finditer(found["path"] or "")
-    return found["what"], tuple(one[1] or (int(one[2]) if one[2] else None) for one in steps)
-
-
-def _found(obj: Any, path: Path, name: str) -> tuple[str, Any]:
-    """The name of the part of an object that a path leads to, and its value."""
-    for step in path:
-        key = step if step is not None else _no_text(obj)
-        name += f"[{key}]" if isinstance(key, int) else f".{key}"
-        obj = obj[key]
-    return name, obj
-
-
-def _no_text(texts: Mapping[str, Any]) -> str:
-    return next(key for key, value in texts.items() if not isinstance(value, str))
-
-
-def _without(obj: Any, path: Path) -> Any:
-    """The object without the part that a path leads to."""
-    if not path:
-        return {}
-    step, rest = path[0], path[1:]
-    if step is None:
-        return {key: value for key, value in obj.items() if isinstance(value, str)}
-    if isinstance(step, int):
-        changed = [_without(obj[step], rest)] if rest else []
-        return [*obj[:step], *changed, *obj[step + 1 :]]
-    others = {key: value for key, value in obj.items() if key != step}
-    return {**others, step: _without(obj[step], rest)} if rest else others
+        return {key: bare(value) for key, value in obj.items() if value is not None}
+    return [bare(one) for one in obj] if isinstance(obj, list | tuple) else obj

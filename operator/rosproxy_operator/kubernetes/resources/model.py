@@ -226,7 +226,6 @@ class ProxyReport:
     error: str = ""
     nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     topics: frozenset[str] = frozenset()
-    used: int = 0
     problems: tuple[str, ...] = ()
 
 

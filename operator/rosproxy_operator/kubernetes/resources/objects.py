@@ -1,22 +1,14 @@
 """Objects of the API server, read: what the planner wants to know of nodes, pods and Services.
 
-The API server has checked their types; what is missing is as if it were empty.
+Their fields are those of k8s.io/api, core/v1/types.go. The API server has checked their types; what
+is missing is as if it were empty.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import SettingError, parse_range
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.api_objects import (
-    Metadata,
-    NodeObject,
-    ObjectCondition,
-    PodObject,
-    PodSpec,
-    ServiceObject,
-)
-from rosproxy_operator.kubernetes.resources.fields import lenient
 from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterNode,
@@ -27,44 +19,42 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck
+from rosproxy_operator.kubernetes.resources.values import number, part, parts, word, words
 
 VARIABLE = "ROS_MASTER_URI"
 
 
 def node(obj: Json) -> ClusterNode:
     """A node."""
-    found = lenient(obj, NodeObject)
-    meta, spec, status = found.metadata, found.spec, found.status
+    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
+    networks = spec.get("podCIDRs") or (word(spec, "podCIDR"),)
+    addresses = reversed(parts(status, "addresses"))
     return ClusterNode(
-        name=meta.name,
-        labels=meta.labels,
-        addresses={one.type: one.address for one in reversed(status.addresses)},
-        advertise_host=meta.annotations.get(names.ADVERTISE_HOST, "").strip(),
-        pod_networks=tuple(filter(None, spec.pod_cidrs or (spec.pod_cidr,))),
-        ready=_is_ready(status.conditions),
-        cordoned=spec.unschedulable,
-        deleting=meta.deleting,
+        name=word(meta, "name"),
+        labels=words(meta, "labels"),
+        addresses={word(one, "type"): word(one, "address") for one in addresses},
+        advertise_host=word(part(meta, "annotations"), names.ADVERTISE_HOST).strip(),
+        pod_networks=tuple(one for one in networks if one and isinstance(one, str)),
+        ready=_is_ready(status),
+        cordoned=spec.get("unschedulable") is True,
+        deleting=is_deleted(meta),
     )
 
 
-def pod(obj: Json, namespace: str = "") -> Pod:
-    """A pod. ``namespace`` is used where the object has none, as at admission."""
-    return _pod(lenient(obj, PodObject), namespace)
-
-
-def _pod(found: PodObject, namespace: str = "") -> Pod:
-    meta, spec, status = found.metadata, found.spec, found.status
-    wired = meta.annotations.get(names.MASTER_URI, "")
+def pod(obj: Json) -> Pod:
+    """A pod. At admission it may have no name, uid, node and address."""
+    meta, spec, status = part(obj, "metadata"), part(obj, "spec"), part(obj, "status")
+    wired = word(part(meta, "annotations"), names.MASTER_URI)
     return Pod(
-        id=Name(meta.namespace or namespace, meta.name),
-        uid=meta.uid,
-        labels=meta.labels,
-        node=spec.node_name,
-        phase=status.phase or "Pending",
-        ip=status.pod_ip,
+        id=name_of(meta),
+        uid=word(meta, "uid"),
+        labels=words(meta, "labels"),
+        node=word(spec, "nodeName"),
+        phase=word(status, "phase") or "Pending",
+        ip=word(status, "podIP"),
         host_ports=frozenset(_host_ports(spec)),
-        host_network=spec.host_network,
-        deleting=meta.deleting,
+        host_network=spec.get("hostNetwork") is True,
+        deleting=is_deleted(meta),
         own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
         wired=wired,
     )
@@ -72,80 +62,92 @@ def _pod(found: PodObject, namespace: str = "") -> Pod:
 
 def proxy_pod(obj: Json) -> ProxyPod | None:
     """A proxy's pod; None if the object is not one that this operator made, or not whole."""
-    found = lenient(obj, PodObject)
-    meta, notes = found.metadata, found.metadata.annotations
-    container = next((one for one in found.spec.containers if one.name == names.CONTAINER), None)
+    meta, status = part(obj, "metadata"), part(obj, "status")
+    labels, notes = words(meta, "labels"), words(meta, "annotations")
+    containers = parts(part(obj, "spec"), "containers")
+    container = next((one for one in containers if one.get("name") == names.CONTAINER), None)
     ports = _range(notes.get(names.PORT_RANGE, ""))
     on, owner = notes.get(names.NODE, ""), _owner(meta)
-    if not names.is_own(meta.labels) or ports is None or not (on and owner and container):
+    if not names.is_own(labels) or ports is None or not (on and owner and container):
         return None
-    reason, message = stuck(found.status)
-    tokens = (one.value for one in container.env if one.name == names.TOKEN_VARIABLE)
+    reason, message = stuck(status)
+    variables = {word(one, "name"): word(one, "value") for one in parts(container, "env")}
     return ProxyPod(
-        pod=_pod(found),
-        of=Name(meta.namespace, meta.labels[names.PROXY_OF]),
+        pod=pod(obj),
+        of=Name(word(meta, "namespace"), labels[names.PROXY_OF]),
         owner=owner,
         on=on,
         range=ports,
         fingerprint=notes.get(names.FINGERPRINT, ""),
-        image=container.image,
-        token=next(tokens, ""),
-        ready=_is_ready(found.status.conditions),
+        image=word(container, "image"),
+        token=variables.get(names.TOKEN_VARIABLE, ""),
+        ready=_is_ready(status),
         stuck=reason,
         message=message,
-        restarts=sum(one.restart_count for one in found.status.container_statuses),
+        restarts=sum(number(one, "restartCount") for one in parts(status, "containerStatuses")),
     )
 
 
 def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this operator made."""
-    found = lenient(obj, ServiceObject)
-    meta, owner = found.metadata, _owner(found.metadata)
-    if not names.is_own(meta.labels) or not owner:
-        return None
-    of = Name(meta.namespace, meta.labels[names.PROXY_OF])
-    if names.service_id(of) != Name(of.namespace, meta.name):
+    meta, address = part(obj, "metadata"), word(part(obj, "spec"), "clusterIP")
+    labels, owner = words(meta, "labels"), _owner(meta)
+    of = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    if not names.is_own(labels) or not owner or names.service_id(of) != name_of(meta):
         return None
     return ProxyService(
         of=of,
         owner=owner,
-        uid=meta.uid,
-        cluster_ip="" if found.spec.cluster_ip == "None" else found.spec.cluster_ip,
-        fingerprint=meta.annotations.get(names.FINGERPRINT, ""),
-        deleting=meta.deleting,
+        uid=word(meta, "uid"),
+        cluster_ip="" if address == "None" else address,
+        fingerprint=word(part(meta, "annotations"), names.FINGERPRINT),
+        deleting=is_deleted(meta),
     )
 
 
-def _is_ready(conditions: Iterable[ObjectCondition]) -> bool:
-    return any(one.type == "Ready" and one.status == "True" for one in conditions)
+def name_of(metadata: Json) -> Name:
+    """An object's namespace and name."""
+    return Name(word(metadata, "namespace"), word(metadata, "name"))
 
 
-def _host_ports(spec: PodSpec) -> Iterator[int]:
+def is_deleted(metadata: Json) -> bool:
+    """Whether an object is about to go."""
+    return metadata.get("deletionTimestamp") is not None
+
+
+def _is_ready(status: Json) -> bool:
+    conditions = parts(status, "conditions")
+    return any(one.get("type") == "Ready" and one.get("status") == "True" for one in conditions)
+
+
+def _host_ports(spec: Json) -> Iterator[int]:
     """Those of containers that run all the time, as the scheduler counts them.
 
     That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
     """
-    lasting = (one for one in spec.init_containers if one.restart_policy == "Always")
-    for container in (*spec.containers, *lasting):
-        for port in container.ports:
-            if port.protocol == "TCP" and port.host_port:
-                yield port.host_port
+    inits = parts(spec, "initContainers")
+    lasting = (one for one in inits if one.get("restartPolicy") == "Always")
+    for container in (*parts(spec, "containers"), *lasting):
+        for port in parts(container, "ports"):
+            if port.get("protocol", "TCP") == "TCP" and number(port, "hostPort"):
+                yield number(port, "hostPort")
 
 
-def _masters(spec: PodSpec) -> Iterator[str]:
-    for container in (*spec.init_containers, *spec.containers):
-        for variable in container.env:
-            if variable.name == VARIABLE:
-                later = variable.value_from is not None or "$(" in variable.value
-                yield ELSEWHERE if later else variable.value
+def _masters(spec: Json) -> Iterator[str]:
+    for container in (*parts(spec, "initContainers"), *parts(spec, "containers")):
+        for variable in parts(container, "env"):
+            if variable.get("name") == VARIABLE:
+                value = word(variable, "value")
+                later = variable.get("valueFrom") is not None or "$(" in value
+                yield ELSEWHERE if later else value
 
 
-def _owner(meta: Metadata) -> str:
+def _owner(meta: Json) -> str:
     """The uid of the RosProxy that owns an object, empty if none does."""
-    for owner in meta.owner_references:
-        group = owner.api_version.partition("/")[0]
-        if group == names.GROUP and owner.kind == names.KIND and owner.controller:
-            return owner.uid
+    for owner in parts(meta, "ownerReferences"):
+        group = word(owner, "apiVersion").partition("/")[0]
+        if group == names.GROUP and owner.get("kind") == names.KIND and owner.get("controller"):
+            return word(owner, "uid")
     return ""
 
 

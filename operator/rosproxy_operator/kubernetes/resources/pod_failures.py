@@ -6,21 +6,15 @@ The texts are those of Kubernetes 1.36; the files named are in k8s.io/kubernetes
 import re
 
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.resources.api_objects import (
-    ContainerStatus,
-    ObjectCondition,
-    PodStatus,
-    Terminated,
-)
-from rosproxy_operator.kubernetes.resources.model import Stuck
+from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.kubernetes.resources.model import Json, Stuck
 from rosproxy_operator.kubernetes.resources.names import CONTAINER
+from rosproxy_operator.kubernetes.resources.values import number, part, parts, word
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
 """``ErrReason`` in pkg/scheduler/framework/plugins/nodeports/node_ports.go; the kubelet gives the
 same text with the reason ``NodePorts`` (pkg/kubelet/lifecycle/predicate.go).
 """
-_REASON_TRANSIENT = "SchedulerError"
-_REASON_PORTS = "NodePorts"
 _IMAGE = frozenset(
     {
         "ErrImagePull",
@@ -46,7 +40,6 @@ _SANDBOX = frozenset(
     }
 )
 """pkg/kubelet/kuberuntime/kuberuntime_container.go, pkg/kubelet/container/sync_result.go."""
-_CRASHING = "CrashLoopBackOff"
 _NOT_STARTED = ("StartError", "ContainerCannotRun")
 """What containerd and cri-dockerd say of a container whose program could not be started."""
 _BACK_OFF = re.compile(r'Back-off pulling image "[^"]*"(: )?')
@@ -62,18 +55,18 @@ the CNI plugin portmap the port is silently taken over.
 _LONGEST = 300
 
 
-def stuck(status: PodStatus) -> tuple[Stuck | None, str]:
+def stuck(status: Json) -> tuple[Stuck | None, str]:
     """Why a pod does not run, and the same in the words of Kubernetes; None if it does, or may yet.
 
-    The words don't change while the trouble is the same.
+    ``status`` is the pod's. The words don't change while the trouble is the same.
     """
-    if status.phase == "Failed":
-        return _failed(status)
-    for condition in status.conditions:
-        if condition.type == "PodScheduled" and condition.status == "False":
-            return _unscheduled(condition)
-    for container in status.container_statuses:
-        if container.name == CONTAINER:
+    if word(status, "phase") == "Failed":
+        return _failed(word(status, "reason"), word(status, "message"))
+    for one in parts(status, "conditions"):
+        if one.get("type") == "PodScheduled" and one.get("status") == "False":
+            return _unscheduled(word(one, "reason"), word(one, "message"))
+    for container in parts(status, "containerStatuses"):
+        if container.get("name") == CONTAINER:
             return _waiting(container)
     return None, ""
 
@@ -84,62 +77,57 @@ def stuck_by_event(message: str) -> Stuck:
     return Stuck.PORTS if any(text in low for text in _TAKEN) else Stuck.SANDBOX
 
 
-def _failed(status: PodStatus) -> tuple[Stuck, str]:
+def _failed(reason: str, message: str) -> tuple[Stuck, str]:
     """The kubelet did not admit the pod, or ended it (``rejectPod`` in pkg/kubelet/kubelet.go)."""
-    ports = status.reason == _REASON_PORTS or PORTS_TAKEN in status.message
-    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(status.reason, status.message)
+    ports = reason == "NodePorts" or PORTS_TAKEN in message
+    return Stuck.PORTS if ports else Stuck.SCHEDULING, _text(reason, message)
 
 
-def _unscheduled(condition: ObjectCondition) -> tuple[Stuck | None, str]:
+def _unscheduled(reason: str, message: str) -> tuple[Stuck | None, str]:
     """The scheduler found no place: reason Unschedulable or SchedulingGated.
 
     After a SchedulerError, as when a pod of the same name has just been deleted, it tries again by
     itself (``handleSchedulingFailure`` in pkg/scheduler/schedule_one.go).
     """
-    reason, message = condition.reason, condition.message
-    if reason in ("", _REASON_TRANSIENT):
+    if reason in ("", "SchedulerError"):
         return None, ""
     return Stuck.PORTS if PORTS_TAKEN in message else Stuck.SCHEDULING, _text(reason, message)
 
 
-def _waiting(container: ContainerStatus) -> tuple[Stuck | None, str]:
+def _waiting(container: Json) -> tuple[Stuck | None, str]:
     """What a container waits for. One that has ended for the second time waits as well.
 
     The kubelet calls that CrashLoopBackOff only when it looks at the pod again.
     """
-    ended, waiting = container.state.terminated, container.state.waiting
-    if ended.exit_code and container.restart_count:
+    ended, waiting = part(container, "state", "terminated"), part(container, "state", "waiting")
+    reason, message = word(waiting, "reason"), word(waiting, "message")
+    if number(ended, "exitCode") and number(container, "restartCount"):
         return _crashing(ended)
-    if waiting.reason in _IMAGE:
-        return Stuck.IMAGE, _image(waiting.reason, waiting.message)
-    if waiting.reason == _CRASHING:
-        return _crashing(container.last_state.terminated)
-    if waiting.reason in _SANDBOX:
-        return Stuck.SANDBOX, _text(waiting.reason, waiting.message)
+    if reason == "CrashLoopBackOff":
+        return _crashing(part(container, "lastState", "terminated"))
+    if reason in _IMAGE:
+        bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
+        return Stuck.IMAGE, _text("", bare) or reason
+    if reason in _SANDBOX:
+        return Stuck.SANDBOX, _text(reason, message)
     return None, ""
 
 
-def _image(reason: str, message: str) -> str:
-    bare = _REASON.sub("", _BACK_OFF.sub("", message), count=1)
-    return _text("", bare) or reason
+def _crashing(ended: Json) -> tuple[Stuck, str]:
+    """How the container ended; the kubelet's own words count the seconds until it is started.
 
-
-def _crashing(ended: Terminated) -> tuple[Stuck, str]:
-    """Between two tries to start a container that never ran, the kubelet calls that a crash too."""
-    if ended.reason in _NOT_STARTED:
-        return Stuck.SANDBOX, _text("RunContainerError", ended.message)
-    return Stuck.CRASHING, _crash(ended)
-
-
-def _crash(ended: Terminated) -> str:
-    """How the container ended; the kubelet's own words count the seconds until it is started."""
-    lines = ended.message.strip().splitlines() or [""]
-    how = f"exit code {ended.exit_code}"
-    if ended.reason not in ("", "Error", "Completed"):
-        how = f"{ended.reason}, {how}"
-    return _text(how, _STAMP.sub("", lines[-1]))
+    Between two tries to start a container that never ran, the kubelet calls that a crash too.
+    """
+    reason, message = word(ended, "reason"), word(ended, "message")
+    if reason in _NOT_STARTED:
+        return Stuck.SANDBOX, _text("RunContainerError", message)
+    how = f"exit code {number(ended, 'exitCode')}"
+    if reason not in ("", "Error", "Completed"):
+        how = f"{reason}, {how}"
+    lines = message.strip().splitlines() or [""]
+    return Stuck.CRASHING, _text(how, _STAMP.sub("", lines[-1]))
 
 
 def _text(reason: str, message: str) -> str:
-    text = clean(": ".join(one for one in (reason, " ".join(message.split())) if one))
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    text = ": ".join(one for one in (reason, " ".join(message.split())) if one)
+    return bounded(clean(text), _LONGEST)

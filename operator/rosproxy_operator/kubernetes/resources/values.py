@@ -1,16 +1,19 @@
-"""What is a name, a label or a host to Kubernetes; and values out of JSON that may be anything."""
+"""What is a name, a label or a host to Kubernetes; and what JSON holds that may be anything."""
 
 import re
-from collections.abc import Mapping
-from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.settings import SettingError, parse_host
-from rosproxy_operator.kubernetes.resources.fields import quoted
+from rosproxy.telemetry.text import shorten
 from rosproxy_operator.kubernetes.resources.model import Json
 
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?(\.[a-z0-9]([-a-z0-9]*[a-z0-9])?)*")
 _QUALIFIED = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
+
+
+def quoted(value: object) -> str:
+    """A value as it may be shown: not too long, and harmless."""
+    return shorten(repr(value), 80)
 
 
 def host_problem(host: str) -> str:
@@ -45,32 +48,33 @@ def is_label_value(text: str) -> bool:
     return not text or _QUALIFIED.fullmatch(text) is not None
 
 
-def part(obj: Any, *keys: str) -> Json:
+def part(obj: Json, *keys: str) -> Json:
     """The map that is found down some keys, empty if there is none."""
     for key in keys:
-        obj = obj.get(key) if isinstance(obj, Mapping) else None
-    return obj if isinstance(obj, Mapping) else {}
+        found = obj.get(key)
+        obj = found if isinstance(found, dict) else {}
+    return obj
 
 
-def parts(obj: Any, key: str) -> tuple[Json, ...]:
+def parts(obj: Json, key: str) -> tuple[Json, ...]:
     """The maps in the list under a key, none if there is no list."""
-    found = part(obj).get(key)
+    found = obj.get(key)
     listed = found if isinstance(found, list | tuple) else ()
-    return tuple(one for one in listed if isinstance(one, Mapping))
+    return tuple(one for one in listed if isinstance(one, dict))
 
 
-def word(obj: Any, key: str) -> str:
+def word(obj: Json, key: str) -> str:
     """The text under a key, empty if there is none."""
-    found = part(obj).get(key)
+    found = obj.get(key)
     return found if isinstance(found, str) else ""
 
 
-def number(obj: Any, key: str) -> int:
+def number(obj: Json, key: str) -> int:
     """The integer under a key, 0 if there is none."""
-    found = part(obj).get(key)
+    found = obj.get(key)
     return found if isinstance(found, int) and not isinstance(found, bool) else 0
 
 
-def words(obj: Any, *keys: str) -> dict[str, str]:
+def words(obj: Json, *keys: str) -> dict[str, str]:
     """The texts of a map, by their keys."""
     return {key: value for key, value in part(obj, *keys).items() if isinstance(value, str)}

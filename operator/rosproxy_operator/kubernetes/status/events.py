@@ -1,7 +1,9 @@
-"""Which Kubernetes Events are made."""
+"""Which Kubernetes Events (core/v1) are made: each of them once, however often it is planned."""
 
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner.actions import (
@@ -13,7 +15,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
 from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, PORT_RANGE
-from rosproxy_operator.kubernetes.resources.values import part, word
+from rosproxy_operator.kubernetes.resources.values import number, part, word
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
@@ -21,6 +23,10 @@ MOST = 50
 """Warnings that are made at once; the others have their turn at the next look."""
 LONGEST = 1024
 """Bytes of an Event's message."""
+COUNT_EVERY = 60.0
+"""Seconds in which the same Event is counted once at most."""
+_COMPONENT = "rosproxy-operator"
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +45,8 @@ def warnings(
     One that comes and goes all the time is told once. After a restart of the operator all are
     told again: who makes the Events counts those that are there already.
 
-    Args:
-        problems: Those of all objects; only Findings that are about an object become Events.
-        reported: That of the last look, or nothing.
-        now: The time, on the clock of ``reported``, in seconds.
+    Only Findings that are about an object become Events. ``reported`` is that of the last look, or
+    nothing; ``now`` is on its clock, in seconds.
     """
     found = dict.fromkeys(one for one in problems if isinstance(one, ClusterFinding) and one.about)
     new = [one for one in found if one not in reported]
@@ -54,7 +58,7 @@ def warnings(
 
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
-    of = about(Reference(KIND, rosproxy.id, rosproxy.uid))
+    of = _about(Reference(KIND, rosproxy.id, rosproxy.uid))
     return tuple(
         Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
         for action in actions
@@ -63,7 +67,52 @@ def results(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
     )
 
 
-def about(reference: Reference) -> Json:
+def event_body(event: Emit, now: float) -> Json:
+    """An Event. The same thing that happens to the same object gets the same name.
+
+    ``now`` is in seconds of Unix time.
+    """
+    about = event.about
+    what = "\n".join([about["uid"], event.type, event.reason, event.message])
+    digest = hashlib.sha256(what.encode()).hexdigest()[:16]
+    name = f"{about['name'][:_LONGEST_NAME].rstrip('.-')}.{digest}"
+    return {
+        "apiVersion": "v1",
+        "kind": "Event",
+        "metadata": {"name": name, "namespace": about["namespace"]},
+        "involvedObject": about,
+        "type": event.type,
+        "reason": event.reason,
+        "message": event.message,
+        "source": {"component": _COMPONENT},
+        "reportingComponent": _COMPONENT,
+        "reportingInstance": _COMPONENT,
+        "firstTimestamp": stamp(now),
+        "lastTimestamp": stamp(now),
+        "count": 1,
+    }
+
+
+def counted(event: Json, now: float) -> list[Json]:
+    """The JSON patch that counts an Event once more; empty if it was counted a moment ago."""
+    try:
+        last = datetime.fromisoformat(word(event, "lastTimestamp")).timestamp()
+    except (ValueError, OverflowError):
+        last = now - COUNT_EVERY
+    if now - last < COUNT_EVERY:
+        return []
+    return [
+        {"op": "add", "path": "/count", "value": (number(event, "count") or 1) + 1},
+        {"op": "add", "path": "/lastTimestamp", "value": stamp(now)},
+    ]
+
+
+def stamp(now: float) -> str:
+    """A time in seconds of Unix time in RFC 3339, in whole seconds as Kubernetes has it."""
+    return datetime.fromtimestamp(now, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _about(reference: Reference) -> Json:
     """An Event's ``involvedObject``."""
     return {
         "apiVersion": API_VERSION if reference.kind == KIND else "v1",
@@ -80,7 +129,7 @@ def _warning(finding: ClusterFinding) -> Emit:
     assert reference is not None  # noqa: S101 - `warnings` takes no others
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
-    return Emit(finding.of, about(reference), "Warning", finding.reason, _bounded(text))
+    return Emit(finding.of, _about(reference), "Warning", finding.reason, _bounded(text))
 
 
 def _result_of(action: Action) -> Iterator[tuple[str, str]]:

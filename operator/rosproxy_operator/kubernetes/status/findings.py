@@ -37,8 +37,7 @@ def findings(
 ) -> tuple[ClusterFinding, ...]:
     """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
 
-    Each has a reason; those that users are to be told by an Event have ``about``, see
-    `events.warnings`. They go, with other problems, into `statuses.status_of`.
+    Each has a reason; those that users are to be told by an Event have ``about``.
     """
     found = [_refused(rosproxy, one) for one in failures if _TERMINATING not in one.text]
     for state in sorted(states, key=lambda one: one.name):
@@ -63,20 +62,14 @@ def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
 
 def invalid_finding(rosproxy: InvalidRosProxy) -> ClusterFinding:
     """That a RosProxy can't be read, with an Event."""
-    return ClusterFinding(
-        f"rosproxy {rosproxy.id}",
-        rosproxy.text,
-        reason="Invalid",
-        of=rosproxy.id,
-        about=Reference(KIND, rosproxy.id, rosproxy.uid),
-    )
+    about = Reference(KIND, rosproxy.id, rosproxy.uid)
+    subject = f"rosproxy {rosproxy.id}"
+    return ClusterFinding(subject, rosproxy.text, reason="Invalid", of=rosproxy.id, about=about)
 
 
 def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
-    about = Reference(KIND, rosproxy.id, rosproxy.uid)
-    return ClusterFinding(
-        subject, bounded(text, _LONGEST), reason=reason, of=rosproxy.id, about=about
-    )
+    about, text = Reference(KIND, rosproxy.id, rosproxy.uid), bounded(text, _LONGEST)
+    return ClusterFinding(subject, text, reason=reason, of=rosproxy.id, about=about)
 
 
 def _subject(proxy: ProxyPod) -> str:
@@ -103,47 +96,39 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> ClusterFinding:
 
 def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[ClusterFinding]:
     """What follows from a proxy's answer. One that is not asked yet is not to blame."""
-    answer = state.answer
+    answer, subject = state.answer, _subject(proxy)
     if answer is None:
         return
     if not answer.answered:
         if proxy.ready:
-            yield _silent(rosproxy, proxy, answer.error)
+            text = (
+                f"it does not answer the operator ({answer.error}): let the operator's pod connect "
+                f"to port {ADMIN_PORT} of this one (NetworkPolicy)"
+            )
+            # No Event: an operator that is cut off would make one for each proxy.
+            yield ClusterFinding(subject, text, reason=SILENT, of=rosproxy.id)
         return
     if not answer.master_up:
-        yield _no_master(rosproxy, proxy, answer.error)
+        text = f"it does not reach the master ({answer.error}): {_master_remedy(rosproxy)}"
+        yield _finding(rosproxy, subject, text, NO_MASTER)
     for problem in answer.problems:
         if answer.master_up or not problem.startswith("master: "):
-            yield ClusterFinding(
-                _subject(proxy), problem, fatal=False, reason=WARNS, of=rosproxy.id, about=None
-            )
+            yield ClusterFinding(subject, problem, fatal=False, reason=WARNS, of=rosproxy.id)
 
 
-def _silent(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> ClusterFinding:
-    """No Event: an operator that is cut off would make one for each proxy."""
-    text = (
-        f"it does not answer the operator ({error}): let the operator's pod connect to port "
-        f"{ADMIN_PORT} of this one (NetworkPolicy)"
-    )
-    return ClusterFinding(_subject(proxy), text, reason=SILENT, of=rosproxy.id, about=None)
-
-
-def _no_master(rosproxy: RosProxy, proxy: ProxyPod, error: str) -> ClusterFinding:
+def _master_remedy(rosproxy: RosProxy) -> str:
     master = rosproxy.spec.master
     if master.service is not None:
-        fix = f"start roscore behind Service {master.service}, port {master.service_port}"
-    else:
-        fix = f"start roscore there, let pods connect to {master.uri}, or mend spec.master"
-    text = f"it does not reach the master ({error}): {fix}"
-    return _finding(rosproxy, _subject(proxy), text, NO_MASTER)
+        return f"start roscore behind Service {master.service}, port {master.service_port}"
+    return f"start roscore there, let pods connect to {master.uri}, or mend spec.master"
 
 
 def _refused(rosproxy: RosProxy, failure: Failure) -> ClusterFinding:
     said = clean(" ".join(failure.text.split()))
     remedy = _remedy(said, rosproxy)
-    head = "the API server refused it"
-    said = said[: _LONGEST - len(f"{head} (): {remedy}")]
-    return _finding(rosproxy, failure.subject, f"{head} ({said}): {remedy}", NOT_ADMITTED)
+    said = said[: _LONGEST - len(f"the API server refused it (): {remedy}")]
+    text = f"the API server refused it ({said}): {remedy}"
+    return _finding(rosproxy, failure.subject, text, NOT_ADMITTED)
 
 
 def _remedy(said: str, rosproxy: RosProxy) -> str:

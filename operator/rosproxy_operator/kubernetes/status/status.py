@@ -1,33 +1,38 @@
-"""The status of a RosProxy."""
+"""The status of a RosProxy, with its conditions (``metav1.Condition``)."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TypeGuard
 
-from rosproxy.telemetry.text import clean, shorten
+from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
     InvalidRosProxy,
     Json,
     NodeState,
     ProxyReport,
     ProxyService,
     RosProxy,
+    Stuck,
 )
-from rosproxy_operator.kubernetes.resources.names import master_uri
+from rosproxy_operator.kubernetes.resources.names import INJECT, master_uri
 from rosproxy_operator.kubernetes.resources.values import number, parts, word
-from rosproxy_operator.kubernetes.status.conditions import (
-    DEGRADED,
-    READY,
-    Condition,
-    conditions,
-    one_line,
-    serving,
-    verdicts,
+from rosproxy_operator.kubernetes.status.findings import (
+    CONFLICT,
+    EXHAUSTED,
+    NO_MASTER,
+    findings,
+    invalid_finding,
+    of_node,
 )
-from rosproxy_operator.kubernetes.status.findings import findings, invalid_finding, of_node
 
 __all__ = ["findings", "invalid_finding", "status_of", "status_of_invalid"]
 
+READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
+LONGEST = 1024
+"""Characters of a message."""
 MOST_NODES = 200
 """Nodes that are told one by one. The API server takes an object of about a megabyte."""
 MOST_NAMES = 50
@@ -36,7 +41,18 @@ MOST_NAMES_OF_ALL = 4000
 _NAME = 100
 _MESSAGE = 300
 _PORTS = 400
-_INVALID = "Invalid"
+_REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
+_NO_PODS, _INVALID = "NoPods", "Invalid"
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A condition without its times. ``status`` is True, False or Unknown."""
+
+    type: str
+    status: str
+    reason: str
+    message: str
 
 
 def status_of(
@@ -52,14 +68,10 @@ def status_of(
     What only proxies can tell stays as it was until they have been asked, so that an operator that
     is started changes nothing.
 
-    Args:
-        rosproxy: It, with the status that it has.
-        states: Its nodes.
-        problems: All that is wrong with it: `findings`, those of its pods, and others. Those that
-            are no Finding count as such with the reason Problem.
-        service: Its Service, None if it is yet to be made.
-        master: The URI of the real master as the proxies use it, empty if it is not known.
-        stamp: The time for conditions that change, as RFC 3339 has it.
+    ``problems`` are all that is wrong with it: `findings`, those of its pods, and others.
+    ``service`` is None if it is yet to be made. ``master`` is the URI of the real master as the
+    proxies use it, empty if it is not known; ``stamp`` the time for conditions that change, in
+    RFC 3339.
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
@@ -67,18 +79,27 @@ def status_of(
     lines = [_line(rosproxy, state, names) for state in shown]
     nodes = sum(number(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
-    judged = verdicts(rosproxy, states, problems, nodes, former)
+    judged = (
+        _ready(rosproxy, wanted, problems, nodes),
+        _allocated(wanted, problems),
+        _reached(states, problems, former),
+        _degraded(problems),
+    )
+    # The former one as long as there is no Service: it is to be had again.
+    uri = word(former, "masterURI")
+    if service is not None and service.cluster_ip:
+        uri = master_uri(service.cluster_ip)
     return {
         "observedGeneration": rosproxy.generation,
         "master": master,
-        "masterURI": _master_uri(service, former),
+        "masterURI": uri,
         "nodes": len(wanted),
-        "proxies": f"{sum(map(serving, wanted))}/{len(wanted)}",
+        "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
         "rosNodes": nodes,
         "topics": _topics(states, former),
         "ports": _ports(states),
         "perNode": lines,
-        "conditions": conditions(judged, former, rosproxy.generation, stamp),
+        "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
 
 
@@ -88,23 +109,17 @@ def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
     What it has goes on as it is, so that the other conditions stay.
     """
     former, text = rosproxy.status, rosproxy.text
+    others = [_read(one) for one in parts(former, "conditions")]
     judged = [
         Condition(READY, "False", _INVALID, text),
-        *(_same(one) for one in parts(former, "conditions") if one.get("type") not in _OVERRULED),
+        *(one for one in others if one.type not in (READY, DEGRADED)),
         Condition(DEGRADED, "True", _INVALID, text),
     ]
     return {
         **former,
         "observedGeneration": rosproxy.generation,
-        "conditions": conditions(judged, former, rosproxy.generation, stamp),
+        "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
-
-
-_OVERRULED = (READY, DEGRADED)
-
-
-def _same(was: Json) -> Condition:
-    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
 
 
 def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
@@ -114,16 +129,16 @@ def _shown_nodes(states: Sequence[NodeState]) -> list[NodeState]:
 
 
 def _line(rosproxy: RosProxy, state: NodeState, names: int) -> dict[str, object]:
-    proxy = state.proxy
+    proxy, wrong = state.proxy, next(of_node(rosproxy, state), None)
     line = {
         "name": state.name,
         "advertiseHost": state.advertise_host,
         "ports": str(state.range or ""),
         "proxy": proxy.pod.id.name if proxy else "",
-        "ready": serving(state),
+        "ready": _serving(state),
         "pods": len(state.pods),
         **_ros(state, names, rosproxy.status),
-        "message": _message(rosproxy, state),
+        "message": bounded(_one_line(wrong), _MESSAGE) if wrong else "",
     }
     return {key: value for key, value in line.items() if value != ""}
 
@@ -147,11 +162,6 @@ def _has_answered(answer: ProxyReport | None) -> TypeGuard[ProxyReport]:
     return answer is not None and answer.answered
 
 
-def _message(rosproxy: RosProxy, state: NodeState) -> str:
-    found = next(of_node(rosproxy, state), None)
-    return bounded(one_line(found), _MESSAGE) if found else ""
-
-
 def _topics(states: Sequence[NodeState], former: Json) -> int:
     answers = [state.answer for state in states if state.proxy is not None]
     known = len({topic for answer in answers if _has_answered(answer) for topic in answer.topics})
@@ -166,10 +176,113 @@ def _ports(states: Sequence[NodeState]) -> str:
     return bounded(", ".join(f"{name}: {ports}" for name, ports in sorted(given.items())), _PORTS)
 
 
-def _master_uri(service: ProxyService | None, former: Json) -> str:
-    """The former one as long as there is no Service: it is to be had again."""
-    return (
-        master_uri(service.cluster_ip)
-        if service and service.cluster_ip
-        else word(former, "masterURI")
-    )
+def _serving(state: NodeState) -> bool:
+    """Whether a node's proxy has its ports and works.
+
+    One that has not been asked since the operator started counts if the kubelet finds it ready.
+    """
+    proxy = state.proxy
+    if proxy is None or proxy.pod.deleting or not proxy.ready or proxy.stuck is not None:
+        return False
+    return state.answer is None or state.answer.answered
+
+
+def _conditions(
+    judged: Iterable[Condition], former: Json, generation: int, stamp: str
+) -> list[dict[str, object]]:
+    """Conditions as the API server takes them.
+
+    One whose status is the same as in the ``former`` status keeps its time; the time of the others
+    is ``stamp``, in RFC 3339.
+    """
+    since = {
+        (word(was, "type"), word(was, "status")): word(was, "lastTransitionTime")
+        for was in parts(former, "conditions")
+    }
+    return [
+        {
+            "type": one.type,
+            "status": one.status,
+            "observedGeneration": generation,
+            "lastTransitionTime": since.get((one.type, one.status)) or stamp,
+            "reason": one.reason if _REASON.fullmatch(one.reason) else "Problem",
+            "message": bounded(one.message, LONGEST),
+        }
+        for one in judged
+    ]
+
+
+def _read(was: Json) -> Condition:
+    return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
+
+
+def _one_line(problem: Problem) -> str:
+    return f"{problem.subject}: {problem.text}"
+
+
+def _reason_of(problem: Problem) -> str:
+    return problem.reason if isinstance(problem, ClusterFinding) else "Problem"
+
+
+def _ready(
+    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[Problem], nodes: int
+) -> Condition:
+    if not wanted:
+        fix = "give pods the labels that spec.podSelector asks for"
+        if rosproxy.spec.pod_selector is None:
+            fix = f"label pods with {INJECT}=true"
+        return Condition(READY, "True", _NO_PODS, f"no pod is selected: {fix}")
+    waiting = [state for state in wanted if not _serving(state)]
+    if not waiting:
+        text = f"{len(wanted)} of {len(wanted)} proxies serve {plural(nodes, 'ROS node')}"
+        return Condition(READY, "True", "Serving", text)
+    blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
+    if blocking:
+        return Condition(READY, "False", _reason_of(blocking[0]), _one_line(blocking[0]))
+    name, proxy = waiting[0].name, waiting[0].proxy
+    doing = "its proxy is being created"
+    if proxy is not None and not proxy.pod.deleting:
+        doing = f"its proxy {proxy.pod.id.name} is starting"
+    return Condition(READY, "False", "ProxiesStarting", f"node {name}: {doing}")
+
+
+def _of_pod(problem: Problem) -> bool:
+    """Whether it concerns one of the users' pods, without which the others are served."""
+    about = problem.about if isinstance(problem, ClusterFinding) else None
+    return about is not None and about.kind == "Pod"
+
+
+def _allocated(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Condition:
+    if not wanted:
+        return Condition(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
+    lacking = [state for state in wanted if state.range is None]
+    refused = [one for one in wanted if one.proxy is not None and one.proxy.stuck is Stuck.PORTS]
+    if not lacking and not refused:
+        return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
+    reason = CONFLICT if refused else EXHAUSTED
+    lines = [_one_line(one) for one in problems if _reason_of(one) in (CONFLICT, EXHAUSTED)]
+    names = ", ".join(state.name for state in (*refused, *lacking))
+    return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
+
+
+def _reached(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Condition:
+    """Of proxies that are not asked yet nothing is known: what was so far holds on."""
+    proxies = [state for state in states if state.proxy is not None]
+    answers = [one.answer for one in proxies if one.answer is not None and one.answer.answered]
+    if not all(answer.master_up for answer in answers):
+        lines = [_one_line(one) for one in problems if _reason_of(one) == NO_MASTER]
+        return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
+    if not proxies:
+        return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
+    if len(answers) == len(proxies):
+        return Condition(MASTER, "True", "Reached", "every proxy reaches the master")
+    was = (one for one in parts(former, "conditions") if one.get("type") == MASTER)
+    unknown = Condition(MASTER, "Unknown", "NotAsked", "no proxy has told yet")
+    return next(map(_read, was), unknown)
+
+
+def _degraded(problems: Sequence[Problem]) -> Condition:
+    if not problems:
+        return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
+    lines = "; ".join(map(_one_line, problems))
+    return Condition(DEGRADED, "True", _reason_of(problems[0]), lines)

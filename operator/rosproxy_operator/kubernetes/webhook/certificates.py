@@ -43,22 +43,24 @@ class KeyPair:
     @property
     def expires(self) -> datetime:
         """When it is not valid any more."""
-        return x509.load_pem_x509_certificate(self.certificate).not_valid_after_utc
+        return self._read().not_valid_after_utc
 
     def due(self, now: datetime) -> bool:
         """Whether it is time for another one."""
-        found = x509.load_pem_x509_certificate(self.certificate)
+        found = self._read()
         life = found.not_valid_after_utc - found.not_valid_before_utc
         return now >= found.not_valid_before_utc + life * RENEW_AFTER
 
     def names(self) -> set[str]:
         """The DNS names that it is for."""
-        found = x509.load_pem_x509_certificate(self.certificate)
         try:
-            names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            names = self._read().extensions.get_extension_for_class(x509.SubjectAlternativeName)
         except x509.ExtensionNotFound:
             return set()
-        return set(names.get_values_for_type(x509.DNSName))
+        return set(names.value.get_values_for_type(x509.DNSName))
+
+    def _read(self) -> x509.Certificate:
+        return x509.load_pem_x509_certificate(self.certificate)
 
     def secret(self) -> dict[str, str]:
         """The ``data`` of a Secret that holds it."""
@@ -68,16 +70,11 @@ class KeyPair:
 
 def service_names(namespace: str, name: str) -> list[str]:
     """The names under which an API server may call a Service."""
-    return [
-        f"{name}.{namespace}.svc",
-        f"{name}.{namespace}",
-        f"{name}.{namespace}.svc.cluster.local",
-    ]
+    bare = f"{name}.{namespace}"
+    return [f"{bare}.svc", bare, f"{bare}.svc.cluster.local"]
 
 
-def make(
-    names: Iterable[str], now: datetime, before: bytes = b"", life: timedelta = LIFE
-) -> KeyPair:
+def make(names: Iterable[str], now: datetime, before: bytes = b"") -> KeyPair:
     """A new certificate for DNS names, with a new CA.
 
     ``before`` are the CAs until now: those that are valid stay trusted for the time in which the
@@ -86,38 +83,28 @@ def make(
     authority_key, key = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
     # A name of its own: of two CAs that are called the same, some clients try only the first.
     authority = _name(f"rosproxy webhook {secrets.token_hex(8)}")
-    ca = (
-        _builder(authority, authority_key, now, life)
-        .subject_name(authority)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(signs=True), critical=True)
-        .sign(authority_key, hashes.SHA256())
-    )
+    ca = _builder(authority, authority, authority_key, now, signs=True)
     certificate = (
-        _builder(authority, key, now, life)
-        .subject_name(_name("rosproxy webhook"))
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(signs=False), critical=True)
+        _builder(_name("rosproxy webhook"), authority, key, now, signs=False)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .add_extension(
             x509.SubjectAlternativeName([x509.DNSName(name) for name in names]), critical=False
         )
-        .sign(authority_key, hashes.SHA256())
     )
     private = key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption(),
     )
-    return KeyPair(_pem(certificate), private, _pem(ca) + still_valid(before, now))
+    signed, trusted = (one.sign(authority_key, hashes.SHA256()) for one in (certificate, ca))
+    return KeyPair(_pem(signed), private, _pem(trusted) + _still_valid(before, now))
 
 
-def read(data: Mapping[str, object]) -> KeyPair:
-    """A pair from the ``data`` of a Secret. Raises Unfit."""
+def read(data: Mapping[str, str]) -> KeyPair:
+    """A pair from the ``data`` of a Secret. Raises InvalidCertificate."""
+    names = (CERTIFICATE, KEY, CA)
     try:
-        found = [
-            base64.b64decode(str(data[name]), validate=True) for name in (CERTIFICATE, KEY, CA)
-        ]
+        found = [base64.b64decode(data[name], validate=True) for name in names]
     except KeyError as error:
         raise InvalidCertificate(f"it has no {error.args[0]}") from None
     except ValueError:
@@ -126,7 +113,7 @@ def read(data: Mapping[str, object]) -> KeyPair:
 
 
 def checked(pair: KeyPair) -> KeyPair:
-    """The same pair, if it is one that can be served. Raises Unfit."""
+    """The same pair, if it is one that can be served. Raises InvalidCertificate."""
     try:
         load(ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), pair)
         x509.load_pem_x509_certificate(pair.certificate)
@@ -149,7 +136,7 @@ def load(context: ssl.SSLContext, pair: KeyPair) -> None:
         os.close(file)
 
 
-def still_valid(authorities: bytes, now: datetime) -> bytes:
+def _still_valid(authorities: bytes, now: datetime) -> bytes:
     """Those of some certificates that are valid; nothing if they can't be read."""
     try:
         found = x509.load_pem_x509_certificates(authorities)
@@ -168,20 +155,14 @@ def _name(text: str) -> x509.Name:
 
 
 def _builder(
-    issuer: x509.Name, key: ec.EllipticCurvePrivateKey, now: datetime, life: timedelta
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    now: datetime,
+    signs: bool,
 ) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .issuer_name(issuer)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACKDATED)
-        .not_valid_after(now + life)
-    )
-
-
-def _usage(signs: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
+    """A certificate to be signed; one that ``signs`` is a CA's."""
+    usage = x509.KeyUsage(
         digital_signature=not signs,
         key_cert_sign=signs,
         content_commitment=False,
@@ -191,6 +172,18 @@ def _usage(signs: bool) -> x509.KeyUsage:
         crl_sign=False,
         encipher_only=False,
         decipher_only=False,
+    )
+    constraints = x509.BasicConstraints(ca=signs, path_length=0 if signs else None)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _BACKDATED)
+        .not_valid_after(now + LIFE)
+        .add_extension(constraints, critical=True)
+        .add_extension(usage, critical=True)
     )
 
 

@@ -1,6 +1,6 @@
 """Wires a pod, as the API server is about to create it, to the proxy of its node.
 
-A pod with the label rosproxy.io/inject comes here from kopf (`handlers`). The RosProxies of its
+A pod with the label rosproxy.io/inject comes here from kopf (`watch`). The RosProxies of its
 namespace and their Service are read as they are at this moment; the planner says which RosProxy
 takes the pod and what it needs. Nothing is written: the Service is the operator's alone to make,
 which knows its address, its owner and what to do when it is refused. Where it is not there yet,
@@ -16,16 +16,13 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import SOON, Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
-from rosproxy_operator.kubernetes.resources.fields import InvalidField
-from rosproxy_operator.kubernetes.resources.model import Json, Pod, RosProxy
+from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
-from rosproxy_operator.kubernetes.resources.objects import pod as parse_pod
-from rosproxy_operator.kubernetes.resources.objects import service as parse_service
-from rosproxy_operator.kubernetes.resources.spec import rosproxy
+from rosproxy_operator.kubernetes.resources.spec import rosproxies
 
 log = logging.getLogger(__name__)
 
@@ -99,28 +96,18 @@ class Injector:
             await asyncio.sleep(AGAIN)
 
     def _wiring(self, body: Json, dry_run: bool) -> tuple[Wiring, float]:
-        pod = parse_pod(body)
-        rosproxies, unusable = self._rosproxies(pod.id.namespace)
-        choice = chosen(pod, rosproxies)
+        pod = objects.pod(body)
+        found, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
+        usable = [each for each in found.values() if not each.deleting]
+        choice = chosen(pod, usable)
         if choice.rosproxy is not None:
             address, hold = self._address(choice.rosproxy, dry_run)
             return wire(body, master_uri(address), choice.rosproxy.spec.host_aliases), hold
-        text = choice.finding.text if choice.finding else self._nobody(pod, rosproxies, unusable)
-        return Wiring(warnings=(NOT_WIRED + text,) if text else ()), 0.0
-
-    def _nobody(self, pod: Pod, rosproxies: list[RosProxy], unusable: list[str]) -> str:
-        text = nobody(pod, rosproxies)
-        return "; ".join([text, *unusable]) if text else ""
-
-    def _rosproxies(self, namespace: str) -> tuple[list[RosProxy], list[str]]:
-        """Those of a namespace, and what is wrong with those that can't be read."""
-        usable, unusable = [], []
-        for found in self._api.rosproxies(namespace, SOON):
-            try:
-                usable.append(rosproxy(found))
-            except InvalidField as error:
-                unusable.append(f"RosProxy {found['metadata']['name']}: {error}")
-        return [each for each in usable if not each.deleting], unusable
+        if choice.finding is not None:
+            return Wiring(warnings=(NOT_WIRED + choice.finding.text,)), 0.0
+        text = nobody(pod, usable)
+        why = [f"RosProxy {one.id.name}: {one.text}" for one in unusable.values()]
+        return Wiring(warnings=("; ".join([NOT_WIRED + text, *why]),) if text else ()), 0.0
 
     def _address(self, of: RosProxy, dry_run: bool) -> tuple[str, float]:
         """The cluster IP of a RosProxy's Service, and in how many seconds it works everywhere.
@@ -140,18 +127,12 @@ class Injector:
             if dry_run and of.cluster_ip:
                 return of.cluster_ip, 0.0
             raise missing from None
-        found = parse_service(there)
+        found = objects.service(there)
         if found is None:
             raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
         if found.owner != of.uid or found.deleting or not found.cluster_ip:
             raise missing
-        return found.cluster_ip, 0.0 if dry_run else _until_known(there, time.time())
-
-
-def _until_known(service: Found, now: float) -> float:
-    """Seconds until all nodes know a Service. ``now`` is in seconds of Unix time."""
-    try:
-        made = datetime.fromisoformat(str(service["metadata"]["creationTimestamp"])).timestamp()
-    except (KeyError, ValueError):
-        return 0.0
-    return min(max(made + YOUNG - now, 0.0), YOUNG)
+        if dry_run:
+            return found.cluster_ip, 0.0
+        made = datetime.fromisoformat(there["metadata"]["creationTimestamp"]).timestamp()
+        return found.cluster_ip, min(max(made + YOUNG - time.time(), 0.0), YOUNG)

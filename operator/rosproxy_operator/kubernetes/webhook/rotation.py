@@ -3,17 +3,16 @@
 import asyncio
 import base64
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Protocol
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, Found
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import WEBHOOKS, Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -29,69 +28,24 @@ OVERLAP = 10.0
 _SUBJECT = "webhook"
 
 
-class CertificateSource(Protocol):
-    """Where the certificate comes from."""
-
-    every: float
-
-    def refresh(self) -> KeyPair:
-        """The certificate to serve by now. May take long. Raises Unfit and ApiError."""
-
-
-class CertificateRotation:
-    """Holds the certificate that is to be served. `pair` may be read from any thread."""
-
-    def __init__(self, source: CertificateSource, metrics: ClusterMetrics) -> None:
-        self.pair: KeyPair | None = None
-        self._source, self._metrics = source, metrics
-        self._log = ProblemLog()
-
-    async def run(self) -> None:
-        """Keep it valid until cancelled, whatever happens."""
-        while True:
-            await self.refresh()
-            await asyncio.sleep(self._source.every if self.pair else 2.0)
-
-    async def refresh(self) -> None:
-        """Check it once, and renew it if it is due."""
-        problems = []
-        try:
-            pair = await in_thread(self._source.refresh)
-        except (ApiError, InvalidCertificate) as error:
-            problems.append(Problem(_SUBJECT, f"no certificate: {error}"))
-        except Exception as error:  # a mistake of ours must not end the certificate
-            log.exception("checking the webhook's certificate failed; going on")
-            problems.append(Problem(_SUBJECT, f"the operator failed: {error!r}"))
-        else:
-            if pair != self.pair:
-                log.info("webhook: serving a certificate that is valid until %s", pair.expires)
-            self.pair = pair
-            self._metrics.certificate_expiry.set(pair.expires.timestamp())
-            problems += getattr(self._source, "problems", ())
-        self._log.update(problems)
-
-
 class CertificateDirectory:
     """A certificate that somebody else renews, cert-manager for one, as a mounted Secret."""
 
     every = EVERY_DIRECTORY
+    problems: Sequence[Problem] = ()
 
     def __init__(self, directory: str) -> None:
         self._directory = Path(directory)
 
     def refresh(self) -> KeyPair:
-        """What is there now. Raises Unfit."""
+        """What is there now. Raises InvalidCertificate."""
+        names = certificates.CERTIFICATE, certificates.KEY
         try:
-            found = [
-                (self._directory / name).read_bytes()
-                for name in (certificates.CERTIFICATE, certificates.KEY)
-            ]
-        except OSError as error:
-            raise InvalidCertificate(
-                f"--webhook-cert-dir: {error.filename}: {error.strerror}"
-            ) from None
-        try:
+            found = [(self._directory / name).read_bytes() for name in names]
             return certificates.checked(KeyPair(*found))
+        except OSError as error:
+            text = f"--webhook-cert-dir: {error.filename}: {error.strerror}"
+            raise InvalidCertificate(text) from None
         except InvalidCertificate as error:
             raise InvalidCertificate(f"--webhook-cert-dir {self._directory}: {error}") from None
 
@@ -123,18 +77,16 @@ class SelfSigned:
     def refresh(self) -> KeyPair:
         """Renew it if it is due, and see to it that its CA is trusted. Raises ApiError."""
         self.problems = []
-        self._pair = self._kept()
+        now, self._pair = self._now(), self._kept()
         trusted = self._trust(self._pair.ca)
-        if self._serving is None or self._is_expired(self._serving) or not self._configuration:
+        if self._serving is None or self._serving.expires <= now or not self._configuration:
             self._serving = self._pair
-        elif self._pair != self._serving and trusted and self._is_known():
-            self._serving, self._trusted_at = self._pair, None
+        elif self._pair != self._serving and trusted:
+            # API servers are to have the time to learn of the new CA.
+            self._trusted_at = self._trusted_at or now
+            if (now - self._trusted_at).total_seconds() >= OVERLAP:
+                self._serving, self._trusted_at = self._pair, None
         return self._serving
-
-    def _is_known(self) -> bool:
-        """Whether API servers have had the time to learn of the new CA."""
-        self._trusted_at = self._trusted_at or self._now()
-        return (self._now() - self._trusted_at).total_seconds() >= OVERLAP
 
     def _kept(self) -> KeyPair:
         """The pair in the Secret, or a new one that is put there."""
@@ -148,14 +100,12 @@ class SelfSigned:
             self._complain(error)
             return self._usable(self._pair) or self._new(self._pair)
         found = self._read(there)
-        if usable := self._usable(found):
-            return usable
-        return self._put(self._new(found or self._pair), self._secret, there)
+        return self._usable(found) or self._put(self._secret, self._new(found or self._pair), there)
 
-    def _put(self, pair: KeyPair, secret: Name, there: Found) -> KeyPair:
+    def _put(self, secret: Name, pair: KeyPair, there: Json) -> KeyPair:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
-            self._api.patch("secrets", secret, secret_patch(pair, there))
+            self._api.patch("secrets", secret, _secret_patch(pair, there))
         except ApiError as error:
             if error.kind in (ErrorKind.INVALID, ErrorKind.CONFLICT):
                 raise ApiError(ErrorKind.AWAY, f"somebody else writes {secret}: {error}") from None
@@ -175,9 +125,9 @@ class SelfSigned:
             text += "; create an empty Secret of this name (the chart does)"
         self.problems.append(Problem(_SUBJECT, text))
 
-    def _read(self, secret: Found) -> KeyPair | None:
-        data = secret.get("data")
-        if not isinstance(data, dict) or not data.get(certificates.KEY):
+    def _read(self, secret: Json) -> KeyPair | None:
+        data = words(secret, "data")
+        if not data.get(certificates.KEY):
             return None
         try:
             return certificates.read(data)
@@ -194,18 +144,15 @@ class SelfSigned:
     def _new(self, before: KeyPair | None) -> KeyPair:
         return certificates.make(self._names, self._now(), before.ca if before else b"")
 
-    def _is_expired(self, pair: KeyPair) -> bool:
-        return pair.expires <= self._now()
-
     def _trust(self, authorities: bytes) -> bool:
         """Write the CAs where the API server looks for them; whether they are there."""
         if not self._configuration:
             return True
         try:
-            there = self._api.webhook_configuration(self._configuration)
-            operations = trust_patch(there, authorities)
+            name = Name("", self._configuration)
+            operations = _trust_patch(self._api.get(WEBHOOKS, name), authorities)
             if operations:
-                self._api.patch_webhook_configuration(self._configuration, operations)
+                self._api.patch(WEBHOOKS, name, operations)
                 log.info("webhook: its CA is now in %s", self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
@@ -217,32 +164,64 @@ class SelfSigned:
         return True
 
 
-def source(api: Api, settings: WebhookSettings) -> CertificateSource:
-    """Where the certificate comes from, by the settings."""
-    if settings.directory or settings.service is None:
-        return CertificateDirectory(settings.directory)
-    names = certificates.service_names(settings.service.namespace, settings.service.name)
-    return SelfSigned(api, names, settings.secret, settings.configuration)
-
-
-def secret_patch(pair: KeyPair, there: Found) -> list[Json]:
+def _secret_patch(pair: KeyPair, there: Json) -> list[Json]:
     """The JSON patch that puts a pair into a Secret, if it is as it was when it was read."""
-    version = there.get("metadata", {}).get("resourceVersion")
+    version = word(part(there, "metadata"), "resourceVersion")
     return [
         {"op": "test", "path": "/metadata/resourceVersion", "value": version},
-        {"op": "add", "path": "/data", "value": {**(there.get("data") or {}), **pair.secret()}},
+        {"op": "add", "path": "/data", "value": {**part(there, "data"), **pair.secret()}},
     ]
 
 
-def trust_patch(configuration: Found, authorities: bytes) -> list[Json]:
+def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
     """The JSON patch that makes a configuration's webhooks trust these CAs; empty if they do."""
     bundle = base64.b64encode(authorities).decode()
     operations: list[Json] = []
-    for index, webhook in enumerate(configuration.get("webhooks") or ()):
-        if webhook.get("clientConfig", {}).get("caBundle") != bundle:
+    for index, webhook in enumerate(parts(configuration, "webhooks")):
+        if part(webhook, "clientConfig").get("caBundle") != bundle:
             where = f"/webhooks/{index}"
             operations += [
                 {"op": "test", "path": f"{where}/name", "value": webhook.get("name")},
                 {"op": "add", "path": f"{where}/clientConfig/caBundle", "value": bundle},
             ]
     return operations
+
+
+class CertificateRotation:
+    """Holds the certificate that is to be served. `pair` may be read from any thread."""
+
+    def __init__(self, source: CertificateDirectory | SelfSigned, metrics: ClusterMetrics) -> None:
+        self.pair: KeyPair | None = None
+        self._source, self._metrics = source, metrics
+        self._log = ProblemLog()
+
+    async def run(self) -> None:
+        """Keep it valid until cancelled, whatever happens."""
+        while True:
+            await self.refresh()
+            await asyncio.sleep(self._source.every if self.pair else 2.0)
+
+    async def refresh(self) -> None:
+        """Check it once, and renew it if it is due."""
+        try:
+            pair = await in_thread(self._source.refresh)
+        except (ApiError, InvalidCertificate) as error:
+            problems = [Problem(_SUBJECT, f"no certificate: {error}")]
+        except Exception as error:  # a mistake of ours must not end the certificate
+            log.exception("checking the webhook's certificate failed; going on")
+            problems = [Problem(_SUBJECT, f"the operator failed: {error!r}")]
+        else:
+            problems = [*self._source.problems]
+            if pair != self.pair:
+                log.info("webhook: serving a certificate that is valid until %s", pair.expires)
+            self.pair = pair
+            self._metrics.certificate_expiry.set(pair.expires.timestamp())
+        self._log.update(problems)
+
+
+def source(api: Api, settings: WebhookSettings) -> CertificateDirectory | SelfSigned:
+    """Where the certificate comes from, by the settings."""
+    if settings.directory or settings.service is None:
+        return CertificateDirectory(settings.directory)
+    names = certificates.service_names(settings.service.namespace, settings.service.name)
+    return SelfSigned(api, names, settings.secret, settings.configuration)

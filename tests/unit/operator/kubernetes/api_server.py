@@ -7,7 +7,8 @@ import asyncio
 import copy
 import itertools
 import json
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ class ApiServer:
         if kind not in ("nodes", "mutatingwebhookconfigurations"):
             meta.setdefault("namespace", namespace)
         meta.setdefault("uid", f"uid-{next(self._numbers)}")
+        meta.setdefault("creationTimestamp", "2026-01-01T00:00:00Z")
         key = kind, meta.get("namespace", ""), meta["name"]
         event = "MODIFIED" if key in self.objects else "ADDED"
         return self._hold(event, key, {"apiVersion": "v1", "kind": PLURALS[kind], **obj})
@@ -185,6 +187,14 @@ class ApiServer:
         """Tell all who watch the same, for example an error."""
         for _, _, queue in self._watches:
             queue.put_nowait(event)
+
+
+async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait for something to be true."""
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.01)
 
 
 @asynccontextmanager

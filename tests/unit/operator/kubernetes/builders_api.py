@@ -3,19 +3,23 @@
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.resources.model import (
+    Json,
     MasterSpec,
     Name,
     NodeState,
     Pod,
     ProxyPod,
     ProxyReport,
+    ProxyService,
     RosProxy,
     RosProxySpec,
     Selector,
     Stuck,
 )
 from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_name, service_name
+from rosproxy_operator.kubernetes.status.status import findings, status_of
 
 Obj = dict[str, Any]
 
@@ -24,6 +28,7 @@ ROBOT = "http://robot:11311"
 CLUSTER_IP = "10.96.7.7"
 URI = f"http://{CLUSTER_IP}:11311"
 RANGE = PortRange(11400, 11431)
+INJECT = {"rosproxy.io/inject": "true"}
 STAMP = "2026-11-21T14:00:00Z"
 LATER = "2026-11-21T15:00:00Z"
 
@@ -152,3 +157,30 @@ def state(node: str = "node1", **more: Any) -> NodeState:
         **more,
     }
     return NodeState(node, "192.0.2.11", found.pop("range", RANGE), **found)
+
+
+SERVICE = ProxyService(Name("robots", "arm"), "uid-arm", "uid-service", CLUSTER_IP, "f")
+
+
+def status(
+    *states: NodeState, of: RosProxy | None = None, more: tuple[Problem, ...] = (), **given: Any
+) -> Json:
+    """The status that follows from some nodes; ``more`` problems besides those that they have."""
+    one = of or rosproxy()
+    problems = (*findings(one, states, given.get("failures", ())), *more)
+    stamp = given.get("stamp", STAMP)
+    return status_of(one, states, problems, given.get("service", SERVICE), ROBOT, stamp)
+
+
+def condition(found: Json, type: str) -> Any:
+    (one,) = [one for one in found["conditions"] if one["type"] == type]
+    return one
+
+
+def judged(found: Json, type: str) -> tuple[str, str]:
+    one = condition(found, type)
+    return one["status"], one["reason"]
+
+
+def message(found: Json, type: str = "Ready") -> str:
+    return str(condition(found, type)["message"])

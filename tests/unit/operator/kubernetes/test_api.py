@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind, missing_rule, refusal
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind, missing_rule, refusal
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
@@ -147,7 +146,7 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
 @pytest.mark.parametrize(
     ("status", "message", "kind", "told"),
     [
-        (403, FORBIDDEN, ErrorKind.DENIED, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
+        (403, FORBIDDEN, ErrorKind.OTHER, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
         (
             403,
             'pods "p" is forbidden: violates PodSecurity "baseline"',

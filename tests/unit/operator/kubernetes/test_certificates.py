@@ -8,15 +8,14 @@ import ssl
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError
+from rosproxy_operator.kubernetes.api import Api, ApiError
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.webhook import certificates, rotation
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -89,7 +88,8 @@ def call(port: int, authorities: bytes, host: str = HOST) -> bytes:
         socket.create_connection(("127.0.0.1", port), 5) as plain,
         context.wrap_socket(plain, server_hostname=host) as secure,
     ):
-        return secure.recv(10)
+        secure.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        return secure.recv(100)
 
 
 @pytest.mark.parametrize("host", NAMES)
@@ -297,12 +297,12 @@ async def test_a_half_written_directory_keeps_the_one_before(tmp_path: Path) -> 
 
 async def test_the_keeper_survives_mistakes(caplog: pytest.LogCaptureFixture) -> None:
     class Broken:
-        every = 1.0
+        every, problems = 1.0, ()
 
         def refresh(self) -> KeyPair:
             raise RuntimeError("oops")
 
-    one = CertificateRotation(Broken(), ClusterMetrics())
+    one = CertificateRotation(cast(Any, Broken()), ClusterMetrics())
     await one.refresh()
     assert one.pair is None
     assert "the operator failed: RuntimeError('oops')" in caplog.text
@@ -328,22 +328,12 @@ async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPa
     held.pair = old
     await started
     keeping = asyncio.ensure_future(anext(serving))
-    assert b"HTTP" in await in_thread(ask, port, old.ca)
+    assert b"HTTP" in await in_thread(call, port, old.ca)
     held.pair = new
     await asyncio.sleep(0.1)
-    assert b"HTTP" in await in_thread(ask, port, new.ca)
+    assert b"HTTP" in await in_thread(call, port, new.ca)
     with pytest.raises(ssl.SSLCertVerificationError):
-        await in_thread(ask, port, old.ca)
+        await in_thread(call, port, old.ca)
     keeping.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await keeping
-
-
-def ask(port: int, authorities: bytes) -> bytes:
-    context = ssl.create_default_context(cadata=authorities.decode())
-    with (
-        socket.create_connection(("127.0.0.1", port), 5) as plain,
-        context.wrap_socket(plain, server_hostname=HOST) as secure,
-    ):
-        secure.sendall(b"GET / HTTP/1.0\r\n\r\n")
-        return secure.recv(100)

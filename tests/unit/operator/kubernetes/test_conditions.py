@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.kubernetes.proxy_sync import no_answer
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Failure,
@@ -14,10 +15,17 @@ from rosproxy_operator.kubernetes.resources.model import (
     Reference,
     Stuck,
 )
-from rosproxy_operator.kubernetes.resources.proxy_status import no_answer
 from rosproxy_operator.kubernetes.status.status import findings
-from tests.unit.operator.kubernetes.builders_api import answer, proxy, rosproxy, state, stuck_proxy
-from tests.unit.operator.kubernetes.status_cases import judged, message, status
+from tests.unit.operator.kubernetes.builders_api import (
+    answer,
+    judged,
+    message,
+    proxy,
+    rosproxy,
+    state,
+    status,
+    stuck_proxy,
+)
 
 NAME = "rosproxy-arm-node1-"
 

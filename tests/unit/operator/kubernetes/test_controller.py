@@ -2,8 +2,7 @@
 
 import asyncio
 import logging
-import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -19,10 +18,9 @@ from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
-from tests.unit.operator.kubernetes.api_server import ApiServer
-from tests.unit.operator.kubernetes.builders_api import NAMESPACE, pod_obj, rosproxy_obj
+from tests.unit.operator.kubernetes.api_server import ApiServer, until
+from tests.unit.operator.kubernetes.builders_api import INJECT, NAMESPACE, pod_obj, rosproxy_obj
 
-INJECT = {"rosproxy.io/inject": "true"}
 NODE = {
     "metadata": {"name": "node1"},
     "spec": {"podCIDRs": ["127.0.0.0/24"]},
@@ -57,13 +55,6 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     yield one
     one.task.cancel()
     await asyncio.gather(one.task, return_exceptions=True)
-
-
-async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.01)
 
 
 def put_all(server: ApiServer) -> None:

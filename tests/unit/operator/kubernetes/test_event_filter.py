@@ -8,9 +8,7 @@ import pytest
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name
 from rosproxy_operator.kubernetes.resources.spec import rosproxy
-from tests.unit.operator.kubernetes.builders_api import pod_obj, proxy_obj, rosproxy_obj
-
-INJECT = {"rosproxy.io/inject": "true"}
+from tests.unit.operator.kubernetes.builders_api import INJECT, pod_obj, proxy_obj, rosproxy_obj
 
 
 def cluster(**more: Any) -> ClusterSnapshot:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosproxy_operator.kubernetes.planner.injection import MIRROR, Wiring, unwired, wire
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import ELSEWHERE
-from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, NAMESPACE, URI, pod, rosproxy
+from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, URI, pod, rosproxy
 
 MASTER = {"name": "ROS_MASTER_URI", "value": URI}
 IP = {
@@ -211,7 +211,7 @@ def test_every_container_has_a_master_and_an_address_in_the_end(obj):
 def test_a_wired_pod_is_wired():
     obj = admitted(container())
 
-    stored = objects.pod(applied(obj, wire(obj, URI)), NAMESPACE)
+    stored = objects.pod(applied(obj, wire(obj, URI)))
 
     assert stored.wired == URI
     assert unwired(stored, rosproxy(), CLUSTER_IP) is None

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
+from rosproxy_operator.kubernetes.proxy_sync import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.model import ELSEWHERE, Name
 from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
-from rosproxy_operator.kubernetes.resources.proxy_status import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.values import host_problem
 from tests.unit.operator.kubernetes.builders_api import (
     CLUSTER_IP,
@@ -74,9 +74,9 @@ def test_a_pod():
 
 
 def test_a_pod_at_admission_has_neither_name_nor_node():
-    obj = {"metadata": {"generateName": "talker-"}, "spec": {"containers": [{"name": "ros"}]}}
+    meta = {"generateName": "talker-", "namespace": "robots"}
 
-    found = pod(obj, "robots")
+    found = pod({"metadata": meta, "spec": {"containers": [{"name": "ros"}]}})
 
     assert found.id == Name("robots", "")
     assert (found.uid, found.node, found.ip, found.phase) == ("", "", "", "Pending")
@@ -200,9 +200,12 @@ def test_a_pod_that_lacks_something_is_no_proxy(path):
     assert proxy_pod(obj) is None
 
 
-def test_somebody_elses_pod_with_the_same_labels_is_no_proxy():
+@pytest.mark.parametrize(
+    "owner", [{"apiVersion": "apps/v1"}, {"kind": "ReplicaSet"}, {"controller": False}]
+)
+def test_somebody_elses_pod_with_the_same_labels_is_no_proxy(owner):
     obj = proxy_obj()
-    obj["metadata"]["ownerReferences"][0].update(apiVersion="apps/v1", kind="ReplicaSet")
+    obj["metadata"]["ownerReferences"][0].update(owner)
 
     assert proxy_pod(obj) is None
     assert proxy_pod(pod_obj()) is None
@@ -229,7 +232,6 @@ def test_other_services_are_not_ours():
 
 STATUS = {
     "master": {"up": True, "error": ""},
-    "ports": {"used": 2},
     "nodes": [
         {
             "nodes": ["/talker"],
@@ -251,7 +253,7 @@ STATUS = {
 def test_what_a_proxy_answers():
     found = report(read_status(STATUS))
 
-    assert (found.answered, found.master_up, found.error, found.used) == (True, True, "", 2)
+    assert (found.answered, found.master_up, found.error) == (True, True, "")
     assert found.nodes == {"10.244.1.5": ("/a", "/b", "/talker"), "fd00::5": ("/v6",)}
     assert found.topics == {"/chatter", "/rosout"}
     assert found.problems == ("/talker: does not answer",)

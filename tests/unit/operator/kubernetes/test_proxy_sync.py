@@ -1,8 +1,7 @@
 """What is known of proxies that start, answer, fall silent and go."""
 
 import asyncio
-import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +15,7 @@ from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
 from rosproxy_operator.kubernetes.resources.model import ProxyPod
 from rosproxy_operator.kubernetes.resources.objects import proxy_pod
+from tests.unit.operator.kubernetes.api_server import until
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
 UP = {"master": {"up": True}, "nodes": []}
@@ -66,13 +66,6 @@ async def talk(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Talk]:
     one = Talk()
     yield one
     await one.tasks.cancel()
-
-
-async def until(true: Callable[[], bool]) -> None:
-    end = time.monotonic() + 30
-    while not true():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.005)
 
 
 def proxy(ip: str = "10.244.1.7") -> ProxyPod:

@@ -4,19 +4,18 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.api import Api
-from rosproxy_operator.kubernetes.errors import ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
 from rosproxy_operator.kubernetes.resources.model import Name, Stuck
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader, read_master
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
+    INJECT,
     NAMESPACE,
     pod_obj,
     proxy_obj,
     rosproxy_obj,
 )
 
-INJECT = {"rosproxy.io/inject": "true"}
 SANDBOX = 'Failed to create pod sandbox: plugin "portmap" (id "{}"): cannot open hostport 11400'
 
 

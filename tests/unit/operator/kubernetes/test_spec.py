@@ -167,6 +167,7 @@ def _selector(key: str = "app", operator: str = "In", values: Any = ("a",)) -> d
         (_selector(key="/x"), "spec.podSelector.matchExpressions[0].key"),
         (_selector(key="A.b/x/y"), "spec.podSelector.matchExpressions[0].key"),
         (_selector(values=["a)"]), "spec.podSelector.matchExpressions[0].values[0]"),
+        (_selector(values=[None]), "spec.podSelector.matchExpressions[0].values[0]"),
         (_selector(values=[]), "spec.podSelector.matchExpressions[0].values"),
         (_selector(operator="Exists"), "spec.podSelector.matchExpressions[0].values"),
         ({"nodeSelector": {"a": 1}}, "spec.nodeSelector.a"),
@@ -198,7 +199,7 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
 @pytest.mark.parametrize(
     ("spec", "text"),
     [
-        ({"ports": 501}, "spec.ports: 501 does not fit: write an integer <= 500"),
+        ({"ports": 501}, "spec.ports: 501 does not fit: write an integer from 1 to 500"),
         ({"ports": "32"}, "spec.ports: '32' does not fit: write an integer"),
         ({"image": 7}, "spec.image: 7 does not fit: write a text, in quotes"),
         (
@@ -207,7 +208,10 @@ def test_what_can_not_be_used_is_told_by_its_field(spec, field):
         ),
         ({"portWindow": [1]}, "spec.portWindow: [1] does not fit: write a map of fields"),
         ({"dataPlane": "kernel"}, "spec.dataPlane: 'kernel' is unknown: write one of Auto, Copy, "),
-        ({"graceSeconds": -1}, "spec.graceSeconds: -1 does not fit: write a number >= 0.0"),
+        (
+            {"graceSeconds": -1},
+            "spec.graceSeconds: -1 does not fit: write a number from 0 to 86400",
+        ),
     ],
 )
 def test_the_cure_is_told(spec, text):

@@ -15,8 +15,8 @@ from rosproxy_operator.kubernetes.resources.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.status.conditions import LONGEST
 from rosproxy_operator.kubernetes.status.status import (
+    LONGEST,
     MOST_NAMES,
     MOST_NODES,
     invalid_finding,
@@ -28,12 +28,15 @@ from tests.unit.operator.kubernetes.builders_api import (
     STAMP,
     URI,
     answer,
+    condition,
+    judged,
+    message,
     pod,
     proxy,
     rosproxy,
     state,
+    status,
 )
-from tests.unit.operator.kubernetes.status_cases import condition, judged, message, status
 
 
 def test_all_is_well():

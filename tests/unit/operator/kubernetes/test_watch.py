@@ -11,16 +11,16 @@ import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jsonpatch
+import kopf
 import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes import kopf_log, watch
+from rosproxy_operator.kubernetes import watch
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
@@ -29,8 +29,9 @@ from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateDirectory, CertificateRotation
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
-from tests.unit.operator.kubernetes.api_server import ApiServer
+from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import (
+    INJECT,
     NAMESPACE,
     pod_obj,
     rosproxy_obj,
@@ -38,7 +39,7 @@ from tests.unit.operator.kubernetes.builders_api import (
 )
 
 PAIR = certificates.make(["localhost"], certificates.now())
-INJECT = {"rosproxy.io/inject": "true"}
+OTHER = {**service_obj()["metadata"]["ownerReferences"][0], "uid": "another"}
 
 
 class Woken:
@@ -68,8 +69,9 @@ class Running:
         rotation.pair = PAIR
         settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
         serving = WebhookServer(HostPort("127.0.0.1", self.webhook), rotation)
-        self.injector = Injector(api, self.metrics, self.controller.wake)
-        self.watch = ClusterWatch(settings, self.controller, self.injector, serving, self.metrics)
+        injector = Injector(api, self.metrics, self.controller.wake)
+        controller: Any = self.controller
+        self.watch = ClusterWatch(settings, controller, (injector, serving), self.metrics)
 
     async def health(self) -> tuple[int, str]:
         return await in_thread(get, f"http://127.0.0.1:{self.liveness}/healthz")
@@ -101,7 +103,7 @@ async def running(
 ) -> AsyncIterator[Running]:
     monkeypatch.setattr(watch, "BACK_OFF", (0.05,))
     monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.05,))
-    kopf_log.quieten()
+    watch.quieten()
     one = Running(server, api)
     one.watch.start()
     await until(lambda: watched(server))
@@ -113,13 +115,6 @@ async def running(
 def watched(server: ApiServer) -> bool:
     kinds = ("rosproxies", "pods", "nodes", "services")
     return all(server.watches(kind) == 1 for kind in kinds)
-
-
-async def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.02)
 
 
 def free_port() -> int:
@@ -207,7 +202,7 @@ async def test_a_missing_rule_is_told_once(
     server: ApiServer, api: Api, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watch, "_BETWEEN_TRIES", (0.02,))
-    kopf_log.quieten()
+    watch.quieten()
     text = 'User "x" cannot list resource "nodes" in API group "" at the cluster scope'
     server.refuse("GET", "nodes", 403, text)
     one = Running(server, api)
@@ -258,6 +253,19 @@ async def test_a_pod_whose_service_does_not_come_is_admitted(
     found = await running.admit(pod_obj("talker", INJECT))
     assert "has no cluster IP yet: kubectl -n robots describe rosproxy arm" in found["warnings"][0]
     assert running.controller.times > 0
+
+
+@pytest.mark.parametrize(
+    "change", [{"ownerReferences": [OTHER]}, {"deletionTimestamp": "2026-01-01T00:00:00Z"}]
+)
+async def test_a_service_that_is_about_to_go_is_waited_for(
+    running: Running, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 0.3)
+    running.server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    running.server.put("services", service_obj(**change), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert "has no cluster IP yet" in found["warnings"][0]
 
 
 async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> None:
@@ -325,7 +333,7 @@ async def test_a_mistake_of_ours_admits_the_pod(
     def broken(*_: Any) -> Any:
         raise RuntimeError("oops")
 
-    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.parse_pod", broken)
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.objects.pod", broken)
     found = await running.admit(pod_obj("talker", INJECT))
     assert "the operator failed: RuntimeError('oops')" in found["warnings"][0]
 
@@ -343,12 +351,10 @@ async def test_nonsense_is_refused(running: Running) -> None:
         caught.value.close()
 
 
-def test_everything_that_would_surprise_is_off(tmp_path: Path) -> None:
-    import kopf
-
-    settings = kopf.OperatorSettings()
-    one = ClusterWatch(KubernetesSettings(), Woken(), None, None, ClusterMetrics())
-    one.configure(settings)
+async def test_everything_that_would_surprise_is_off() -> None:
+    settings, controller = kopf.OperatorSettings(), cast(Any, Woken())
+    one = ClusterWatch(KubernetesSettings(), controller, None, ClusterMetrics())
+    await one.configure(settings)
     assert not settings.posting.enabled
     assert settings.scanning.disabled
     assert settings.peering.standalone
