@@ -90,14 +90,11 @@ class Retries:
 
     def failures(self, of: Name) -> tuple[Failure, ...]:
         """What can't be done for a RosProxy."""
-        found = (Failure(task.subject, tried.error) for task, tried in self._of(of) if tried.error)
-        return tuple(dict.fromkeys(found))
+        noted = [(task.subject, tried.error) for task, tried in self.noted.items() if task.of == of]
+        return tuple(dict.fromkeys(Failure(*one) for one in noted if one[1]))
 
     def waits(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
         for tried in self.noted.values():
             if not tried.effect:
                 yield max(tried.at + tried.pause - self._now, 0.0)
-
-    def _of(self, of: Name) -> Iterator[tuple[Task, RetryRecord]]:
-        yield from ((task, tried) for task, tried in self.noted.items() if task.of == of)

@@ -8,7 +8,7 @@ from typing import Any
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, Emit, PatchStatus
-from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
+from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
@@ -69,7 +69,7 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> Site:
     host = on.advertise_host or on.addresses["InternalIP"]
-    return Site(of, on, host, ports, Upstream(of.spec.master.uri, of.spec.master.address), publish)
+    return Site(of, on, host, ports, replace(of.spec.master, publish=publish))
 
 
 def proxy(

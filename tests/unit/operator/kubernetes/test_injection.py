@@ -275,11 +275,3 @@ def test_a_pod_that_is_wired_to_an_address_of_the_past_is_told():
 
     assert found is not None
     assert f"its proxy is at {URI} now" in found.text
-
-
-@pytest.mark.parametrize(
-    ("more", "address"),
-    [({}, ""), ({"phase": "Succeeded"}, CLUSTER_IP), ({"deleting": True}, CLUSTER_IP)],
-)
-def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(more, address):
-    assert unwired(pod(**more), rosproxy(), address) is None

@@ -332,6 +332,22 @@ def test_a_pod_that_is_not_wired_is_told() -> None:
     assert "create the pod anew" in told(found, "NotWired")[0]
 
 
+@pytest.mark.parametrize(
+    "seen",
+    [
+        complete(pods=(pod(wired="", phase="Succeeded"),)),
+        complete(pods=(pod(wired="", deleting=True),)),
+        complete(pods=(pod(wired=""),), services={}),
+        complete(pods=(pod(wired=""),), services={ROBOT: service(ip="")}),
+        complete(pods=(pod(wired=""),), services={ROBOT: service(owner="uid-old")}),
+    ],
+)
+def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(
+    seen: ClusterSnapshot,
+) -> None:
+    assert told(look(seen), "NotWired") == []
+
+
 # Services
 
 
