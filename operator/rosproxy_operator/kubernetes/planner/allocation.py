@@ -75,7 +75,7 @@ class _Allocation:
         ranges: ClusterRanges,
     ) -> None:
         self.view, self.state, self.node, self.ranges = view, state, node, ranges
-        self.places = [place for place in view.wanted if place.node == node]
+        self.of = {one: view.rosproxies[one.of] for one in view.wanted if one.node == node}
         self.proxies = view.on.get(node, ())
         self.strangers = view.strangers.get(node, ())
         self.refused = {port for where, port in state.taken if where == node}
@@ -86,7 +86,7 @@ class _Allocation:
 
     def run(self) -> None:
         """Who has ports comes before who had some, and that one before who wants some."""
-        order = sorted(self.places, key=self._rank)
+        order = sorted(self.of, key=self._rank)
         for place in order:
             self._keep(place)
         for place in order:
@@ -101,13 +101,13 @@ class _Allocation:
             proxy is not None and has_ports(proxy),
             place in self.state.served,
             proxy is not None,
-            self._former(place) is not None,
+            self.of[place].former.get(self.node) is not None,
         )
         return ranks.index(True) if True in ranks else len(ranks), place
 
     def _keep(self, place: ProxyPlace) -> None:
         """Give a proxy the range that it has or had, if it can have it."""
-        proxy, spec = self.view.current(place), self._spec(place)
+        proxy, spec = self.view.current(place), self.of[place].spec
         reserved, kernel = self._reserved(place), [*self.kernel.values()]
         for ports in self._candidates(place):
             cut = PortRange(ports.first, min(ports.last, ports.first + spec.ports - 1))
@@ -121,7 +121,11 @@ class _Allocation:
         current = self.view.current(place)
         there = [one for one in self.proxies if place_of(one) == place]
         yield from (one.range for one in sorted(there, key=lambda one: one is not current))
-        known = (self.state.given.get(place), self.state.served.get(place), self._former(place))
+        known = (
+            self.state.given.get(place),
+            self.state.served.get(place),
+            self.of[place].former.get(self.node),
+        )
         yield from filter(None, known)
 
     def _is_to_be_had(self, place: ProxyPlace, ports: PortRange) -> bool:
@@ -142,7 +146,7 @@ class _Allocation:
 
     def _publish(self, place: ProxyPlace) -> None:
         """Give a proxy its port for a master in the cluster, if it is to have one and can."""
-        proxy, port = self.view.current(place), self._spec(place).master.publish
+        proxy, port = self.view.current(place), self.of[place].spec.master.publish
         if not port:
             return
         if proxy is None or not has_ports(proxy) or port not in proxy.pod.host_ports:
@@ -155,13 +159,13 @@ class _Allocation:
                     f"{self.node}, which is held by {by}: choose another spec.master.publish, or "
                     "let that go"
                 )
-                self._flaw(place, "PortConflict", text)
+                self.ranges.findings.append(finding(self.of[place], "PortConflict", text))
                 return
         self.ranges.published.add(place)
 
     def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
-        spec, given = self._spec(place), self.ranges.given
+        spec, given = self.of[place].spec, self.ranges.given
         blocked = ports_held(self._pods_of_others(place)) | self.refused | self._reserved(place)
         held = [*self.kernel.values(), *self._promised_to_others(place)]
         if kept := given.get(place):
@@ -174,7 +178,7 @@ class _Allocation:
                     "let the pods go that hold them, or move spec.portWindow away from there, so "
                     "that all ports are given anew"
                 )
-                self._flaw(place, "PortsExhausted", text)
+                self.ranges.findings.append(finding(self.of[place], "PortsExhausted", text))
             return
         try:
             given[place] = self._found(spec, blocked, held)
@@ -211,21 +215,12 @@ class _Allocation:
 
     def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:
         """What other proxies on the node have been given by now."""
-        for other in self.places:
-            if other != place and other in self.ranges.given:
+        for other in self.of.keys() - {place}:
+            if other in self.ranges.given:
                 yield self.ranges.given[other]
-            if other != place and other in self.ranges.published:
-                port = self._spec(other).master.publish
+            if other in self.ranges.published:
+                port = self.of[other].spec.master.publish
                 yield PortRange(port, port)
 
     def _reserved(self, place: ProxyPlace) -> set[int]:
-        return {MASTER_PORT, ADMIN_PORT, self._spec(place).master.publish}
-
-    def _spec(self, place: ProxyPlace) -> RosProxySpec:
-        return self.view.rosproxies[place.of].spec
-
-    def _former(self, place: ProxyPlace) -> PortRange | None:
-        return self.view.rosproxies[place.of].former.get(self.node)
-
-    def _flaw(self, place: ProxyPlace, reason: str, text: str) -> None:
-        self.ranges.findings.append(finding(self.view.rosproxies[place.of], reason, text))
+        return {MASTER_PORT, ADMIN_PORT, self.of[place].spec.master.publish}

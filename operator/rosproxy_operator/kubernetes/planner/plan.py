@@ -84,7 +84,7 @@ def plan(
         own = list(reconcile_service(context, rosproxy))
         for place in seen.places.get(of, ()):
             own += reconcile_proxy(context, place)
-        states = _states(context, rosproxy)
+        states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
         service = context.own_service(rosproxy)
         master, _ = master_of(rosproxy, observed)
@@ -108,31 +108,25 @@ def plan(
     )
 
 
-def _states(context: ClusterContext, of: RosProxy) -> tuple[NodeState, ...]:
+def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
-    nodes = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
-    return tuple(
-        _state(context, of, node) for node in sorted(nodes & context.observed.nodes.keys())
-    )
-
-
-def _state(context: ClusterContext, of: RosProxy, node: str) -> NodeState:
-    place = ProxyPlace(of.id, node)
-    current, wanted = context.view.current(place), place in context.view.wanted
-    site = site_of(context, place) if wanted else None
-    former = context.state.given.get(place) or of.former.get(node)
-    kept = current.range if current else former
-    host, _ = advertise_host(of, context.observed.nodes[node])
-    return NodeState(
-        name=node,
-        advertise_host=host,
-        range=context.ranges.given.get(place) if wanted else kept,
-        proxy=current,
-        pods=context.view.wanted.get(place, ()),
-        answer=context.observed.reports.get(current.pod.uid) if current else None,
-        problem=site.text if isinstance(site, Obstacle) else "",
-        reason=site.reason if isinstance(site, Obstacle) else "",
-    )
+    named = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
+    for node in sorted(named & context.observed.nodes.keys()):
+        place = ProxyPlace(of.id, node)
+        current, wanted = context.view.current(place), place in context.view.wanted
+        site = site_of(context, place) if wanted else None
+        former = context.state.given.get(place) or of.former.get(node)
+        kept = current.range if current else former
+        yield NodeState(
+            name=node,
+            advertise_host=advertise_host(of, context.observed.nodes[node])[0],
+            range=context.ranges.given.get(place) if wanted else kept,
+            proxy=current,
+            pods=context.view.wanted.get(place, ()),
+            answer=context.observed.reports.get(current.pod.uid) if current else None,
+            problem=site.text if isinstance(site, Obstacle) else "",
+            reason=site.reason if isinstance(site, Obstacle) else "",
+        )
 
 
 def _problems(
@@ -163,5 +157,5 @@ def _patch(
     if status != of.status:
         conditions = [{**one, "lastTransitionTime": ""} for one in status.get("conditions", ())]
         said = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
-        if context.retries.ask(Task(of.id, "status", str(of.id), said)):
+        if context.retries.ask(Task(of.id, "status", of.id, said)):
             yield PatchStatus(of.id, status)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy_operator.common.allocation import RETRY_FOR
+from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -22,14 +23,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
-from rosproxy_operator.kubernetes.planner.manifests import (
-    Site,
-    finds_again,
-    fingerprint_of,
-    image_of,
-    proxy_pod,
-    service,
-)
+from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
@@ -142,52 +136,45 @@ def site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
 
 def reconcile_service(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
     """The Service of a RosProxy, made if it is not there, made anew if it is not right."""
-    there, body = context.observed.services.get(of.id), service(of, _cluster_ip(context, of))
+    wired = (parse_slave_uri(pod.wired) for pod in context.view.taken.get(of.id, ()))
+    hosts = Counter(where.host for where in wired if where and is_address(where.host))
+    # The address that its pods have been given already, if any.
+    common = min(hosts, key=lambda host: (-hosts[host], host), default="")
+    body = manifests.service(of, of.cluster_ip or common)
+    there = context.observed.services.get(of.id)
     if there is None:
-        if context.retries.ask(Task(of.id, "create", str(service_id(of.id)))):
+        if context.retries.ask(Task(of.id, "create", service_id(of.id))):
             yield CreateService(of.id, body)
     elif there.owner != of.uid:
         yield from _delete_service(context, there, "it is that of a RosProxy that is gone")
-    elif there.fingerprint != fingerprint_of(body):
+    elif there.fingerprint != manifests.fingerprint_of(body):
         yield from _delete_service(context, there, "made anew")
 
 
 def _delete_service(context: ClusterContext, there: ProxyService, why: str) -> Iterator[Action]:
     """Delete a Service, if that is not being done."""
     name = service_id(there.of)
-    if not there.deleting and context.retries.ask(Task(there.of, "delete", str(name), there.uid)):
+    if not there.deleting and context.retries.ask(Task(there.of, "delete", name, there.uid)):
         yield DeleteService(there.of, name, there.uid, why)
-
-
-def _cluster_ip(context: ClusterContext, of: RosProxy) -> str:
-    """The address that pods of a RosProxy have been given already, if any."""
-    wired = (parse_slave_uri(pod.wired) for pod in context.view.taken.get(of.id, ()))
-    hosts = Counter(where.host for where in wired if where and is_address(where.host))
-    common = min(hosts, key=lambda host: (-hosts[host], host), default="")
-    return of.cluster_ip or common
 
 
 def reconcile_proxy(context: ClusterContext, place: ProxyPlace) -> Iterator[Action]:
     """The next actions for a RosProxy's proxy on a node."""
+    node, proxies = context.observed.nodes.get(place.node), context.view.proxies.get(place, ())
     if place in context.view.wanted:
         site = site_of(context, place)
         if isinstance(site, Obstacle):
             _note(context, place)
         else:
             yield from _wanted(context, place, site)
-    elif _is_over(context, place):
-        there = place.node in context.observed.nodes
-        grace = f"{context.view.rosproxies[place.of].spec.grace:g}"
-        why = f"no pod on node {place.node} wants it since {grace} s"
-        for one in context.view.proxies[place]:
-            yield from _delete_proxy(context, one, why if there else "its node is gone", there)
-
-
-def _is_over(context: ClusterContext, place: ProxyPlace) -> bool:
-    node = context.observed.nodes.get(place.node)
-    if node is None:
-        return context.lost(place.node) <= 0
-    return node.ready and not node.deleting and context.left(place) <= 0
+    elif node is None:
+        for one in proxies if context.lost(place.node) <= 0 else ():
+            yield from _delete_proxy(context, one, "its node is gone")
+    elif node.ready and not node.deleting and context.left(place) <= 0:
+        grace = context.view.rosproxies[place.of].spec.grace
+        for one in proxies:
+            why = f"no pod on node {place.node} wants it since {grace:g} s"
+            yield from _delete_proxy(context, one, why, retire=True)
 
 
 def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[Action]:
@@ -202,24 +189,24 @@ def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[
         if current is not None:  # else it is about to go
             yield from _tended(context, current, site)
     elif context.retries.ask(_creation(place)):
-        yield CreateProxy(place.of, place.node, proxy_pod(site, context.settings))
+        yield CreateProxy(place.of, place.node, manifests.proxy_pod(site, context.settings))
 
 
 def _tended(context: ClusterContext, one: ProxyPod, site: Site) -> Iterator[Action]:
-    body, image = proxy_pod(site, context.settings), image_of(site.rosproxy, context.settings)
+    image = manifests.image_of(site.rosproxy, context.settings)
+    fingerprint = manifests.fingerprint_of(manifests.proxy_pod(site, context.settings))
+    task = Task(one.of, "image", one.pod.id, f"{one.pod.uid} {image}")
     if one.pod.ended:
         yield from _delete_proxy(context, one, f"it has ended: {one.message or one.pod.phase}")
-    elif one.fingerprint != fingerprint_of(body):
+    elif one.fingerprint != fingerprint:
         moved = one.range.first != site.ports.first
-        lost = moved or not finds_again(one.fingerprint, fingerprint_of(body))
+        lost = moved or not manifests.finds_again(one.fingerprint, fingerprint)
         what = "its RosProxy, its node or the operator's options have changed"
         if one.range != site.ports:
             what = f"its ports are to be {site.ports} instead of {one.range}"
         yield from _delete_proxy(context, one, f"made anew: {what}", retire=serves(one) and lost)
-    elif one.image != image:
-        task = Task(one.of, "image", str(one.pod.id), f"{one.pod.uid} {image}")
-        if context.retries.ask(task):
-            yield SetImage(one.of, one.pod.id, one.pod.uid, image)
+    elif one.image != image and context.retries.ask(task):
+        yield SetImage(one.of, one.pod.id, one.pod.uid, image)
 
 
 def _delete_proxy(
@@ -232,8 +219,7 @@ def _delete_proxy(
     node = context.observed.nodes.get(one.on)
     runs = serves(one) and node is not None and node.ready
     useful = not one.pod.deleting or (retire and runs)
-    task = Task(one.of, "delete", str(one.pod.id), one.pod.uid)
-    if useful and context.retries.ask(task):
+    if useful and context.retries.ask(Task(one.of, "delete", one.pod.id, one.pod.uid)):
         yield DeleteProxy(one.of, one.pod.id, one.pod.uid, why, retire)
 
 
@@ -245,7 +231,7 @@ def _note(context: ClusterContext, place: ProxyPlace) -> None:
 
 
 def _creation(place: ProxyPlace) -> Task:
-    return Task(place.of, "create", str(proxy_id(place.of, place.node)))
+    return Task(place.of, "create", proxy_id(place.of, place.node))
 
 
 def reconcile_orphans(context: ClusterContext) -> Iterator[Action]:
