@@ -20,7 +20,9 @@ from tests.unit.operator.kubernetes.objects import (
     RANGE,
     ROBOT,
     SETTINGS,
+    creation,
     done,
+    kinds,
     look,
     node,
     observed,
@@ -28,6 +30,7 @@ from tests.unit.operator.kubernetes.objects import (
     ports_of,
     proxy,
     rosproxy,
+    scene,
     service,
     status,
     told,
@@ -40,12 +43,6 @@ ARM = {names.INJECT: "arm"}
 OURS = {names.INJECT: "robot"}
 
 
-def scene(*more: Any, of: Any = None) -> ClusterSnapshot:
-    """A pod that wants a proxy, and other things."""
-    of = of or rosproxy()
-    return observed(of, service(of), pod(), *more)
-
-
 A, B = pod("a", labels=ARM), pod("b", labels=OURS)
 
 
@@ -55,18 +52,8 @@ def two(*more: Any, arm: Any = None, robot: Any = None) -> ClusterSnapshot:
     return observed(arm, robot, service(arm), service(robot), *more)
 
 
-def creation(found: ClusterPlan) -> CreateProxy:
-    (action,) = done(found)
-    assert isinstance(action, CreateProxy), action
-    return action
-
-
 def created(found: ClusterPlan) -> str:
     return ports_of(creation(found))
-
-
-def kinds(found: ClusterPlan) -> list[type]:
-    return [type(one) for one in done(found)]
 
 
 def publishing(port: int, name: str = "robot") -> Any:

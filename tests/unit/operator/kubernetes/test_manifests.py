@@ -65,8 +65,7 @@ def test_clean_up_can_be_switched_off() -> None:
 
 
 def test_each_port_is_the_same_on_the_node() -> None:
-    ports = container(site(rosproxy(), node(), publish=11500))["ports"]
-    assert ports == [
+    assert container(site(rosproxy(), node(), publish=11500))["ports"] == [
         {"containerPort": port, "hostPort": port, "protocol": "TCP"}
         for port in (11400, 11401, 11402, 11403, 11500)
     ]
