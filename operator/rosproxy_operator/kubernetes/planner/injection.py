@@ -52,7 +52,7 @@ def wire(pod: Json, uri: str, host_aliases: Iterable[Json] = ()) -> Wiring:
     (``$(ROS_MASTER_URI)``). A ROS_MASTER_URI that this webhook has set before, as in a copy of a
     wired pod, is set anew. Wiring a wired pod changes nothing.
 
-    A pod in its node's own network must not be given here: see `select.chosen`.
+    A pod in its node's own network must not be given here: see `selection.chosen`.
     """
     notes = words(pod, "metadata", "annotations")
     if MIRROR in notes:
@@ -113,10 +113,8 @@ def _is_proxys(uri: str, of: Name, cluster_ip: str) -> bool:
     where, service = parse_slave_uri(uri.strip()), service_id(of)
     if where is None or where.port != MASTER_PORT:
         return False
-    host = where.host.lower().rstrip(".")
-    full = f"{service.name}.{service.namespace}.svc."
-    short = host in (service.name, f"{service.name}.{service.namespace}")
-    return host == cluster_ip.lower() or short or f"{host}.".startswith(full)
+    host, name = where.host.lower().rstrip("."), f"{service.name}.{service.namespace}"
+    return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
 def _wired(container: Json, uri: str, former: str) -> Json:

@@ -1,6 +1,6 @@
 """Which pods a RosProxy takes."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from rosproxy_operator.kubernetes.resources.model import (
@@ -17,6 +17,8 @@ from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT
 OFF = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""
 _ANY = "true"
+_TEXTS = {"In": "{0} in {1}", "NotIn": "{0} notin {1}", "Exists": "{0}", "DoesNotExist": "!{0}"}
+"""The operators of a label selector as the API server takes them, of a key and listed values."""
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
 
 
@@ -43,9 +45,12 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
 
 def label_selector(spec: RosProxySpec, name: str) -> str:
     """The selector of the pods of the RosProxy ``name`` as the API server takes it."""
-    if spec.pod_selector is None:
+    selector = spec.pod_selector
+    if selector is None:
         return f"{INJECT} in {_listed((_ANY, name))}"
-    return ",".join([*_requirements(spec.pod_selector), f"{INJECT} notin {_listed(OFF)}"])
+    equal = (f"{key}={value}" for key, value in sorted(selector.labels.items()))
+    others = (_TEXTS[how].format(key, _listed(values)) for key, how, values in selector.expressions)
+    return ",".join([*equal, *others, f"{INJECT} notin {_listed(OFF)}"])
 
 
 def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> Choice:
@@ -138,19 +143,6 @@ def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, 
         case "DoesNotExist":
             return key not in labels
     return False
-
-
-def _requirements(selector: Selector) -> Iterator[str]:
-    for key, value in sorted(selector.labels.items()):
-        yield f"{key}={value}"
-    for key, operator, values in selector.expressions:
-        match operator:
-            case "In" | "NotIn":
-                yield f"{key} {operator.lower()} {_listed(values)}"
-            case "Exists":
-                yield key
-            case "DoesNotExist":
-                yield f"!{key}"
 
 
 def _listed(values: Iterable[str]) -> str:

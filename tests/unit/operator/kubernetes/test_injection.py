@@ -103,6 +103,7 @@ def test_a_pod_of_which_one_container_sets_it_is_still_wired():
 
     assert env_of(found, place=1) == [MASTER, IP]
     assert found.annotations == {ANNOTATION: URI}
+    assert wire(admitted(container(own, MASTER, IP)), URI).annotations == {ANNOTATION: URI}
 
 
 def test_host_aliases_are_added_to_those_of_the_pod():
