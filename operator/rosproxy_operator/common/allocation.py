@@ -24,54 +24,29 @@ class Move:
 class PortsExhausted(Exception):
     """A window has not as many free ports in a row as were asked for.
 
-    ``free`` counts its free ports, ``longest`` is the most that there are in a row.
+    ``free`` are the lengths of its free stretches.
     """
 
-    def __init__(self, count: int, window: PortRange, free: int, longest: int) -> None:
+    def __init__(self, count: int, window: PortRange, free: Collection[int]) -> None:
         super().__init__(
             f"no {count} free ports in a row between {window.first} and {window.last}: "
-            f"{free} of {len(window)} are free, {longest} at most in a row"
+            f"{sum(free)} of {len(window)} are free, {max(free, default=0)} at most in a row"
         )
-        self.count = count
-        self.window = window
-        self.free = free
-        self.longest = longest
+        self.count, self.window = count, window
 
 
 def negotiate(
-    count: int,
-    window: PortRange,
-    blocked: Collection[int],
-    ranges: Iterable[PortRange] = (),
-    prefer: PortRange | None = None,
+    count: int, window: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()
 ) -> PortRange:
-    """A range of free ports: the preferred one if it can be had, else the first that fits.
+    """The first ``count`` ports in a row of a window that can be had.
 
-    Args:
-        count: How many ports are needed, at least one.
-        window: Where to look.
-        blocked: Single ports that can't be had.
-        ranges: Ranges that can't be had.
-        prefer: Where the ports were before, if they were. It is taken whole even if it is longer
-            than needed or outside the window, and made longer at its end if it is too short.
-
-    Returns:
-        Exactly ``count`` ports, unless ``prefer`` has more.
-
-    Raises:
-        PortsExhausted: The window has no such range.
+    ``blocked`` are single ports that can't be had, ``ranges`` whole ranges. Raises PortsExhausted.
     """
-    held = tuple(ranges)
-    if prefer is not None and is_free(prefer, blocked, held):
-        kept = extended(prefer, count, window, blocked, held)
-        if kept is not None:
-            return kept
-    gaps = list(_gaps(window, blocked, held))
+    gaps = list(_gaps(window, blocked, ranges))
     for gap in gaps:
         if len(gap) >= count:
             return PortRange(gap.first, gap.first + count - 1)
-    lengths = [len(gap) for gap in gaps]
-    raise PortsExhausted(count, window, sum(lengths), max(lengths, default=0))
+    raise PortsExhausted(count, window, [len(gap) for gap in gaps])
 
 
 def extended(
@@ -94,9 +69,7 @@ def extended(
 
 def is_free(ports: PortRange, blocked: Collection[int], ranges: Iterable[PortRange] = ()) -> bool:
     """Whether a range can be had."""
-    if any(overlap(ports, held) for held in ranges):
-        return False
-    return not any(port in ports for port in blocked)
+    return not (any(overlap(ports, held) for held in ranges) or any(p in ports for p in blocked))
 
 
 def overlap(one: PortRange, other: PortRange) -> bool:

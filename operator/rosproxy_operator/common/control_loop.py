@@ -27,6 +27,9 @@ BEAT = 1.0
 LONGEST_BEAT = 20.0
 """Seconds after which an event loop that shows none hangs."""
 
+UNSETTLED = 1.0
+"""Seconds until the next look of `ControlLoop.run_until`, if nothing happens."""
+
 Look = Callable[[], Awaitable[float | None]]
 """Looks and acts; returns in how many seconds to look again at the latest. Raises LookFailed."""
 
@@ -79,9 +82,7 @@ class ControlLoop:
                     self._failed(LookFailed(f"the operator failed: {error!r}"))
                 await self._pause(self._pace.resync)
 
-    async def run_until(
-        self, look: Look, settled: Callable[[], bool], seconds: float, resync: float = 1.0
-    ) -> None:
+    async def run_until(self, look: Look, settled: Callable[[], bool], seconds: float) -> None:
         """Look until one that succeeded has ``settled`` everything, for so many seconds at most.
 
         Raises LookFailed if the engine is away.
@@ -90,7 +91,7 @@ class ControlLoop:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(seconds):
                     while not (await self._try(look, patient=False) and settled()):
-                        await self._pause(resync)
+                        await self._pause(UNSETTLED)
 
     @property
     def woken(self) -> bool:
@@ -149,17 +150,14 @@ class ControlLoop:
                 raise  # whoever asked tells it
             self._failed(error)
         else:
-            self._succeeded()
+            if self._failures:
+                log.info("looking works again")
+            self._failures, self._error = 0, None
+            self._metrics.looks.labels("ok").inc()
+            self._metrics.up.set(1)
         finally:
             self._looking_since, self._looked_at = None, asyncio.get_running_loop().time()
         return not self._failures
-
-    def _succeeded(self) -> None:
-        if self._failures:
-            log.info("looking works again")
-        self._failures, self._error = 0, None
-        self._metrics.looks.labels("ok").inc()
-        self._metrics.up.set(1)
 
     def _failed(self, error: LookFailed) -> None:
         if str(error) != self._error:

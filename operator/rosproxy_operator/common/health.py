@@ -1,6 +1,7 @@
 """The operator's own endpoint: /healthz, /readyz, /metrics."""
 
 from collections.abc import Callable
+from functools import partial
 
 from aiohttp import web
 from prometheus_client import CollectorRegistry
@@ -17,17 +18,15 @@ class HealthServer:
     """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not."""
 
     def __init__(self, metrics: CollectorRegistry, alive: Check, ready: Check) -> None:
-        self._metrics, self._alive, self._ready = metrics, alive, ready
-        self._runner: web.AppRunner | None = None
+        app = web.Application()
+        app.router.add_get("/", _greet)
+        app.router.add_get("/healthz", partial(_check, alive))
+        app.router.add_get("/readyz", partial(_check, ready))
+        app.router.add_get("/metrics", partial(_show, metrics))
+        self._runner = web.AppRunner(app, access_log=None)
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises SettingError if the address can't be bound."""
-        app = web.Application()
-        app.router.add_get("/", self._greet)
-        app.router.add_get("/healthz", self._healthz)
-        app.router.add_get("/readyz", self._readyz)
-        app.router.add_get("/metrics", self._get_metrics)
-        self._runner = web.AppRunner(app, access_log=None)
         await self._runner.setup()
         try:
             await web.TCPSite(self._runner, where.host, where.port).start()
@@ -37,22 +36,18 @@ class HealthServer:
 
     async def stop(self) -> None:
         """Stop listening."""
-        if self._runner is not None:
-            await self._runner.cleanup()
-
-    async def _greet(self, request: web.Request) -> web.Response:
-        return web.Response(text=GREETING)
-
-    async def _healthz(self, request: web.Request) -> web.Response:
-        return _answer(self._alive())
-
-    async def _readyz(self, request: web.Request) -> web.Response:
-        return _answer(self._ready())
-
-    async def _get_metrics(self, request: web.Request) -> web.Response:
-        body = generate_latest(self._metrics)
-        return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})
+        await self._runner.cleanup()
 
 
-def _answer(reason: str | None) -> web.Response:
+async def _greet(request: web.Request) -> web.Response:
+    return web.Response(text=GREETING)
+
+
+async def _check(check: Check, request: web.Request) -> web.Response:
+    reason = check()
     return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
+
+
+async def _show(metrics: CollectorRegistry, request: web.Request) -> web.Response:
+    body = generate_latest(metrics)
+    return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})

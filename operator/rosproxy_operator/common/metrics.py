@@ -3,15 +3,9 @@
 import re
 from collections import Counter as Tally
 from collections.abc import Iterable, Sequence
+from functools import partial
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    Info,
-    ProcessCollector,
-)
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
 
 from rosproxy import __version__
 
@@ -19,6 +13,7 @@ STATES = ("created", "restarting", "running", "paused", "exited", "dead", "remov
 """The states of a container, in the engine's words."""
 POD_STATES = ("ready", "starting", "stuck")
 """The states of a proxy's pod."""
+_PREFIX = "rosproxy_operator"
 _BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 20)
 _WORD = re.compile(r"(?<!^)(?=[A-Z])")
 
@@ -32,28 +27,24 @@ class CommonMetrics:
 
     def __init__(self, of: str, on: str, states: Sequence[str], up: str) -> None:
         self.registry = registry = CollectorRegistry()
+        self._counter = partial(Counter, namespace=_PREFIX, registry=registry)
+        self._gauge = partial(Gauge, namespace=_PREFIX, registry=registry)
         self._states = states
         ProcessCollector(registry=registry)
-        build = Info("rosproxy_operator_build", "The operator's version.", registry=registry)
-        build.info({"version": __version__})
-        self.looks = self.counter(
-            "looks", f"Looks at the {of} by outcome (ok, unavailable, failed).", "outcome"
+        Info("build", "The operator's version.", namespace=_PREFIX, registry=registry).info(
+            {"version": __version__}
         )
+        text = f"Looks at the {of} by outcome (ok, unavailable, failed)."
+        self.looks = self._counter("looks", text, ["outcome"])
+        text = "Time for a look: listing everything and planning."
         self.look_time = Histogram(
-            "rosproxy_operator_look_seconds",
-            "Time for a look: listing everything and planning.",
-            registry=registry,
-            buckets=_BUCKETS,
+            "look_seconds", text, namespace=_PREFIX, registry=registry, buckets=_BUCKETS
         )
-        self.actions = self.counter(
-            "actions",
-            f"What was done to the {on} by action and outcome (ok, failed, taken: a port was).",
-            "action",
-            "outcome",
-        )
-        self.up = self.gauge(up, f"Whether the {of} answers.")
-        self.problems = self.gauge("problems", "Problems that are there now.")
-        self.proxies = self.gauge("proxies", "Proxies by state.", "state")
+        text = f"What was done to the {on} by action and outcome (ok, failed, taken: a port was)."
+        self.actions = self._counter("actions", text, ["action", "outcome"])
+        self.up = self._gauge(up, f"Whether the {of} answers.")
+        self.problems = self._gauge("problems", "Problems that are there now.")
+        self.proxies = self._gauge("proxies", "Proxies by state.", ["state"])
 
     def show_proxies(self, states: Iterable[str]) -> None:
         """Set the number of proxies in each state."""
@@ -66,21 +57,13 @@ class CommonMetrics:
         word = _WORD.sub("_", type(action).__name__).lower()
         self.actions.labels(word, outcome).inc()
 
-    def counter(self, name: str, text: str, *labels: str) -> Counter:
-        """A new counter."""
-        return Counter(f"rosproxy_operator_{name}", text, labels, registry=self.registry)
-
-    def gauge(self, name: str, text: str, *labels: str) -> Gauge:
-        """A new gauge."""
-        return Gauge(f"rosproxy_operator_{name}", text, labels, registry=self.registry)
-
 
 class DockerMetrics(CommonMetrics):
     """All metrics for a Docker host."""
 
     def __init__(self) -> None:
         super().__init__("engine", "host", STATES, up="engine_up")
-        self.containers = self.gauge("containers", "Containers that a proxy is there for.")
+        self.containers = self._gauge("containers", "Containers that a proxy is there for.")
 
 
 class ClusterMetrics(CommonMetrics):
@@ -88,15 +71,11 @@ class ClusterMetrics(CommonMetrics):
 
     def __init__(self) -> None:
         super().__init__("API server", "cluster", POD_STATES, up="api_up")
-        self.rosproxies = self.gauge("rosproxies", "RosProxies that can be read.")
-        self.pods = self.gauge("pods", "Running pods that a RosProxy selects.")
-        self.admissions = self.counter(
-            "admissions", "Pods at admission by outcome (wired, left, failed).", "outcome"
-        )
-        self.certificate_expiry = self.gauge(
-            "certificate_expiry_seconds",
-            "When the admission webhook's certificate expires, in seconds of Unix time.",
-        )
-        self.watch_restarts = self.counter(
-            "watch_restarts", "How often watching had to be started anew; looks go on meanwhile."
-        )
+        self.rosproxies = self._gauge("rosproxies", "RosProxies that can be read.")
+        self.pods = self._gauge("pods", "Running pods that a RosProxy selects.")
+        text = "Pods at admission by outcome (wired, left, failed)."
+        self.admissions = self._counter("admissions", text, ["outcome"])
+        text = "When the admission webhook's certificate expires, in seconds of Unix time."
+        self.certificate_expiry = self._gauge("certificate_expiry_seconds", text)
+        text = "How often watching had to be started anew; looks go on meanwhile."
+        self.watch_restarts = self._counter("watch_restarts", text)

@@ -38,8 +38,6 @@ class ProblemLog:
             if problem not in self._told:
                 level = logging.ERROR if problem.fatal else logging.WARNING
                 log.log(level, "%s: %s", problem.subject, problem.text)
-        subjects = {problem.subject for problem in now}
-        solved = {p.subject for p in self._told} - subjects
-        for subject in sorted(solved):
+        for subject in sorted({p.subject for p in self._told} - {p.subject for p in now}):
             log.info("%s: solved", subject)
         self._told = now

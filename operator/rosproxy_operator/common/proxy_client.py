@@ -1,11 +1,11 @@
 """Asking and telling running proxies, over their admin endpoints."""
 
 import errno
-import json
 from collections.abc import Mapping
 from typing import Any
 
 import aiohttp
+import msgspec
 
 from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status
 from rosproxy.net.addresses import HostPort
@@ -93,12 +93,9 @@ class ProxyClient:
 
 def _read(text: str, where: HostPort) -> Json:
     try:
-        found = json.loads(text)
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise _no_rosproxy(where)
-    return found
+        return msgspec.json.decode(text, type=Json)
+    except msgspec.DecodeError:
+        raise _no_rosproxy(where) from None
 
 
 def _no_rosproxy(where: HostPort) -> ProxyError:

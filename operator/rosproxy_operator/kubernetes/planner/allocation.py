@@ -7,8 +7,8 @@ some; a hostPort is taken if any pod of the node has it, whosever that is. `stat
 were refused of late, and who had to leave his.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
@@ -21,8 +21,20 @@ from rosproxy_operator.common.allocation import (
 )
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
-from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves, short
-from rosproxy_operator.kubernetes.resources.model import ProxyPlace, ProxyPod
+from rosproxy_operator.kubernetes.planner.view import (
+    View,
+    finding,
+    has_ports,
+    place_of,
+    serves,
+    short,
+)
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
+    Pod,
+    ProxyPlace,
+    RosProxySpec,
+)
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
 
 
@@ -31,13 +43,13 @@ class ClusterRanges:
     """The range of each wanted proxy that can have one.
 
     ``published`` are the places whose port for the master in the cluster is free. ``exhausted``
-    says of the others why there is none, ``flaws`` what is not as asked for: reason and text.
+    says of the others why there is none, ``findings`` what is not as asked for.
     """
 
-    given: Mapping[ProxyPlace, PortRange]
-    published: frozenset[ProxyPlace]
-    exhausted: Mapping[ProxyPlace, str]
-    flaws: Mapping[ProxyPlace, tuple[tuple[str, str], ...]]
+    given: dict[ProxyPlace, PortRange] = field(default_factory=dict)
+    published: set[ProxyPlace] = field(default_factory=set)
+    exhausted: dict[ProxyPlace, str] = field(default_factory=dict)
+    findings: list[ClusterFinding] = field(default_factory=list)
 
 
 def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:
@@ -45,39 +57,36 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
 
     A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
     """
-    given: dict[ProxyPlace, PortRange] = {}
-    published: set[ProxyPlace] = set()
-    exhausted: dict[ProxyPlace, str] = {}
-    flaws: dict[ProxyPlace, tuple[tuple[str, str], ...]] = {}
+    ranges = ClusterRanges()
     for node in sorted({place.node for place in view.wanted}):
-        one = _Allocation(view, settings, state, node)
-        one.run()
-        given |= one.given
-        published |= one.published
-        exhausted |= one.exhausted
-        flaws |= {place: tuple(some) for place, some in one.flaws.items()}
-    return ClusterRanges(given, frozenset(published), exhausted, flaws)
+        _Allocation(view, settings, state, node, ranges).run()
+    return ranges
 
 
 class _Allocation:
-    """The ranges of one node being given out."""
+    """The ranges of one node being given out, into ``ranges``."""
 
     def __init__(
-        self, view: View, settings: ClusterSettings, state: ClusterState, node: str
+        self,
+        view: View,
+        settings: ClusterSettings,
+        state: ClusterState,
+        node: str,
+        ranges: ClusterRanges,
     ) -> None:
-        self.view, self.settings, self.state, self.node = view, settings, state, node
-        self.places = sorted(place for place in view.wanted if place.node == node)
-        self.proxies = view.on(node)
+        self.view, self.state, self.node, self.ranges = view, state, node, ranges
+        self.of = {one: view.rosproxies[one.of] for one in view.wanted if one.node == node}
+        self.proxies = view.on.get(node, ())
         self.strangers = view.strangers.get(node, ())
         self.refused = {port for where, port in state.taken if where == node}
-        self.given: dict[ProxyPlace, PortRange] = {}
-        self.published: set[ProxyPlace] = set()
-        self.exhausted: dict[ProxyPlace, str] = {}
-        self.flaws: dict[ProxyPlace, list[tuple[str, str]]] = {}
+        self.kernel = {
+            "NodePorts are": settings.node_ports,
+            "the nodes' ephemeral ports are": settings.ephemeral,
+        }
 
     def run(self) -> None:
         """Who has ports comes before who had some, and that one before who wants some."""
-        order = sorted(self.places, key=self._rank)
+        order = sorted(self.of, key=self._rank)
         for place in order:
             self._keep(place)
         for place in order:
@@ -92,133 +101,107 @@ class _Allocation:
             proxy is not None and has_ports(proxy),
             place in self.state.served,
             proxy is not None,
-            self._former(place) is not None,
+            self.of[place].former.get(self.node) is not None,
         )
         return ranks.index(True) if True in ranks else len(ranks), place
 
     def _keep(self, place: ProxyPlace) -> None:
         """Give a proxy the range that it has or had, if it can have it."""
-        proxy = self.view.current(place)
+        proxy, spec = self.view.current(place), self.of[place].spec
+        reserved, kernel = self._reserved(place), [*self.kernel.values()]
         for ports in self._candidates(place):
-            cut = PortRange(ports.first, min(ports.last, ports.first + self._count(place) - 1))
+            cut = PortRange(ports.first, min(ports.last, ports.first + spec.ports - 1))
+            lawful = within(cut, spec.window) and is_free(cut, reserved, kernel)
             holds = proxy is not None and has_ports(proxy) and proxy.range == ports
-            if self._lawful(place, cut) and (holds or self._is_to_be_had(place, cut)):
-                self.given[place] = cut
+            if lawful and (holds or self._is_to_be_had(place, cut)):
+                self.ranges.given[place] = cut
                 return
 
     def _candidates(self, place: ProxyPlace) -> Iterator[PortRange]:
         current = self.view.current(place)
         there = [one for one in self.proxies if place_of(one) == place]
         yield from (one.range for one in sorted(there, key=lambda one: one is not current))
-        known = (self.state.given.get(place), self.state.served.get(place), self._former(place))
-        yield from (ports for ports in known if ports is not None)
-
-    def _lawful(self, place: ProxyPlace, ports: PortRange) -> bool:
-        window = self.view.rosproxies[place.of].spec.window
-        return within(ports, window) and is_free(ports, self._reserved(place), self._kernel())
+        known = (
+            self.state.given.get(place),
+            self.state.served.get(place),
+            self.of[place].former.get(self.node),
+        )
+        yield from filter(None, known)
 
     def _is_to_be_had(self, place: ProxyPlace, ports: PortRange) -> bool:
         """Whether a range where nothing runs now can be had.
 
         Ports of pods that are about to end are let go in time for one that has served; those of
-        the operator's own also for one that waits for them already.
+        the operator's own also for one that waits for them already. Others must be heeded if they
+        have their ports, or if their place is not given another range.
         """
         served = place in self.state.served
         waits = served or self.view.current(place) is not None
-        strangers = [pod for pod in self.strangers if not (served and pod.deleting)]
-        others = [one for one in self._others(place) if self._is_fixed(one)]
-        others = [one for one in others if not (waits and one.pod.deleting)]
-        blocked = ports_held(strangers)
-        held = [*_held(others), *self._given_to_others(place)]
-        return is_free(ports, blocked | self.refused, held)
-
-    def _is_fixed(self, proxy: ProxyPod) -> bool:
-        """Whether others must heed a proxy's range, even if its place is given another one."""
-        return has_ports(proxy) or place_of(proxy) not in self.view.wanted
+        pods = [pod for pod in self.strangers if not (served and pod.deleting)]
+        for one in self.proxies:
+            heeded = has_ports(one) or place_of(one) not in self.view.wanted
+            if heeded and place_of(one) != place and not (waits and one.pod.deleting):
+                pods.append(one.pod)
+        return is_free(ports, ports_held(pods) | self.refused, self._promised_to_others(place))
 
     def _publish(self, place: ProxyPlace) -> None:
-        port = self._wants_published(place)
+        """Give a proxy its port for a master in the cluster, if it is to have one and can."""
+        proxy, port = self.view.current(place), self.of[place].spec.master.publish
         if not port:
             return
-        proxy = self.view.current(place)
         if proxy is None or not has_ports(proxy) or port not in proxy.pod.host_ports:
-            holders = [pod.id for pod in self.strangers if port in pod.host_ports]
-            others = self._others(place)
-            holders += [one.pod.id for one in others if port in one.pod.host_ports]
-            given = [*self._given_to_others(place), *self._published_by_others(place)]
-            if holders or port in self.refused or any(port in ports for ports in given):
-                self._flaw(place, "PortConflict", _not_published(port, self.node, holders))
+            holders = [str(p.id) for p in self._pods_of_others(place) if port in p.host_ports]
+            promised = any(port in ports for ports in self._promised_to_others(place))
+            if holders or promised or port in self.refused:
+                by = short(holders) or "another RosProxy, or something that is about to end"
+                text = (
+                    f"the master in the cluster is not published on port {port} of node "
+                    f"{self.node}, which is held by {by}: choose another spec.master.publish, or "
+                    "let that go"
+                )
+                self.ranges.findings.append(finding(self.of[place], "PortConflict", text))
                 return
-        self.published.add(place)
+        self.ranges.published.add(place)
 
     def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
-        spec = self.view.rosproxies[place.of].spec
-        blocked = ports_held(self.strangers) | self.refused | self._reserved(place)
-        held = [*self._kernel(), *_held(self._others(place)), *self._given_to_others(place)]
-        held += self._published_by_others(place)
-        kept = self.given.get(place)
-        if kept is not None:
-            self.given[place] = extended(kept, spec.ports, spec.window, blocked, held) or kept
-            if len(self.given[place]) < spec.ports:
-                self._flaw(place, "PortsExhausted", _too_few(kept, spec.ports, self.node))
+        spec, given = self.of[place].spec, self.ranges.given
+        blocked = ports_held(self._pods_of_others(place)) | self.refused | self._reserved(place)
+        held = [*self.kernel.values(), *self._promised_to_others(place)]
+        if kept := given.get(place):
+            given[place] = extended(kept, spec.ports, spec.window, blocked, held) or kept
+            if len(given[place]) < spec.ports:
+                more = PortRange(kept.last + 1, kept.first + spec.ports - 1)
+                text = (
+                    f"spec.ports is {spec.ports}, but the proxy on node {self.node} keeps its "
+                    f"{len(kept)} at {kept}, since {more} are not free or not in spec.portWindow: "
+                    "let the pods go that hold them, or move spec.portWindow away from there, so "
+                    "that all ports are given anew"
+                )
+                self.ranges.findings.append(finding(self.of[place], "PortsExhausted", text))
             return
         try:
-            self.given[place] = self._found(place, blocked, held)
+            given[place] = self._found(spec, blocked, held)
         except PortsExhausted as error:
-            self.exhausted[place] = self._exhausted(place, error)
+            self.ranges.exhausted[place] = self._exhausted(place, error)
 
     def _found(
-        self, place: ProxyPlace, blocked: Collection[int], held: list[PortRange]
+        self, spec: RosProxySpec, blocked: Collection[int], held: list[PortRange]
     ) -> PortRange:
         """A new range, if possible none that another RosProxy has had here."""
-        spec = self.view.rosproxies[place.of].spec
-        had = [one.former.get(self.node) for one in self.view.rosproxies.values()]
+        had = filter(None, (one.former.get(self.node) for one in self.view.rosproxies.values()))
         try:
-            more = [ports for ports in had if ports is not None]
-            return negotiate(spec.ports, spec.window, blocked, [*held, *more])
+            return negotiate(spec.ports, spec.window, blocked, [*held, *had])
         except PortsExhausted:
             return negotiate(spec.ports, spec.window, blocked, held)
 
-    def _others(self, place: ProxyPlace) -> list[ProxyPod]:
-        return [one for one in self.proxies if place_of(one) != place]
-
-    def _given_to_others(self, place: ProxyPlace) -> list[PortRange]:
-        return [ports for other, ports in self.given.items() if other != place]
-
-    def _published_by_others(self, place: ProxyPlace) -> list[PortRange]:
-        ports = (self._wants_published(other) for other in self.published if other != place)
-        return [PortRange(port, port) for port in ports]
-
-    def _kernel(self) -> list[PortRange]:
-        return [self.settings.node_ports, self.settings.ephemeral]
-
-    def _reserved(self, place: ProxyPlace) -> set[int]:
-        return {MASTER_PORT, ADMIN_PORT, self._wants_published(place)}
-
-    def _wants_published(self, place: ProxyPlace) -> int:
-        return self.view.rosproxies[place.of].spec.master.publish
-
-    def _count(self, place: ProxyPlace) -> int:
-        return self.view.rosproxies[place.of].spec.ports
-
-    def _former(self, place: ProxyPlace) -> PortRange | None:
-        return self.view.rosproxies[place.of].former.get(self.node)
-
-    def _flaw(self, place: ProxyPlace, reason: str, text: str) -> None:
-        self.flaws.setdefault(place, []).append((reason, text))
-
     def _exhausted(self, place: ProxyPlace, error: PortsExhausted) -> str:
-        holders = {
-            str(pod.id)
-            for pod in (*self.strangers, *(one.pod for one in self._others(place)))
-            if any(port in error.window for port in pod.host_ports)
-        }
-        kernel = (
-            (f"NodePorts are {self.settings.node_ports}", self.settings.node_ports),
-            (f"the nodes' ephemeral ports are {self.settings.ephemeral}", self.settings.ephemeral),
-        )
-        why = [text for text, ports in kernel if overlap(ports, error.window)]
+        """Why there are no ports, and what to do."""
+        why = [
+            f"{what} {ports}" for what, ports in self.kernel.items() if overlap(ports, error.window)
+        ]
+        pods = self._pods_of_others(place)
+        holders = [str(pod.id) for pod in pods if any(p in error.window for p in pod.host_ports)]
         why += [f"others are held by {short(holders)}"] if holders else []
         by = ", ".join(why) or "the others were refused just now"
         return (
@@ -226,28 +209,18 @@ class _Allocation:
             f"({error.count}), or let one of those pods go"
         )
 
+    def _pods_of_others(self, place: ProxyPlace) -> list[Pod]:
+        """All other pods that hold ports on the node."""
+        return [*self.strangers, *(one.pod for one in self.proxies if place_of(one) != place)]
 
-def _held(proxies: Iterable[ProxyPod]) -> list[PortRange]:
-    """The ranges of proxies, and what else they hold."""
-    found = []
-    for one in proxies:
-        more = sorted(port for port in one.pod.host_ports if port not in one.range)
-        found += [one.range, *(PortRange(port, port) for port in more)]
-    return found
+    def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:
+        """What other proxies on the node have been given by now."""
+        for other in self.of.keys() - {place}:
+            if other in self.ranges.given:
+                yield self.ranges.given[other]
+            if other in self.ranges.published:
+                port = self.of[other].spec.master.publish
+                yield PortRange(port, port)
 
-
-def _not_published(port: int, node: str, holders: Iterable[object]) -> str:
-    by = short(map(str, holders)) or "another RosProxy, or something that is about to end"
-    return (
-        f"the master in the cluster is not published on port {port} of node {node}, which is held "
-        f"by {by}: choose another spec.master.publish, or let that go"
-    )
-
-
-def _too_few(kept: PortRange, count: int, node: str) -> str:
-    more = PortRange(kept.last + 1, kept.first + count - 1)
-    return (
-        f"spec.ports is {count}, but the proxy on node {node} keeps its {len(kept)} at {kept}, "
-        f"since {more} are not free or not in spec.portWindow: let the pods go that hold them, or "
-        "move spec.portWindow away from there, so that all ports are given anew"
-    )
+    def _reserved(self, place: ProxyPlace) -> set[int]:
+        return {MASTER_PORT, ADMIN_PORT, self.of[place].spec.master.publish}

@@ -11,13 +11,13 @@ from typing import Any
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
+from rosproxy_operator.kubernetes.planner.selection import pod_finding
 from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterFinding,
     Json,
     Name,
     Pod,
-    Reference,
     RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import (
@@ -30,15 +30,9 @@ from rosproxy_operator.kubernetes.resources.names import (
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 
 VARIABLE = "ROS_MASTER_URI"
-IP_VARIABLE = "ROS_IP"
-HOST_VARIABLE = "ROS_HOSTNAME"
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the API server's picture of a static pod: a change of it changes no container."""
 _KINDS = ("initContainers", "containers")
-_STATIC = (
-    "is a static pod, made from a file on its node, which can't be wired: set ROS_MASTER_URI and "
-    "ROS_IP in that file, or run it as an ordinary pod"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +52,15 @@ def wire(pod: Json, uri: str, host_aliases: Iterable[Json] = ()) -> Wiring:
     (``$(ROS_MASTER_URI)``). A ROS_MASTER_URI that this webhook has set before, as in a copy of a
     wired pod, is set anew. Wiring a wired pod changes nothing.
 
-    A pod in its node's own network must not be given here: see `select.chosen`.
+    A pod in its node's own network must not be given here: see `selection.chosen`.
     """
     notes = words(pod, "metadata", "annotations")
     if MIRROR in notes:
-        return Wiring(warnings=(_STATIC,))
+        static = (
+            "is a static pod, made from a file on its node, which can't be wired: set "
+            "ROS_MASTER_URI and ROS_IP in that file, or run it as an ordinary pod"
+        )
+        return Wiring(warnings=(static,))
     spec = part(pod, "spec")
     wired: dict[str, Any] = {
         kind: [_wired(one, uri, notes.get(MASTER_URI, "")) for one in parts(spec, kind)]
@@ -73,25 +71,17 @@ def wire(pod: Json, uri: str, host_aliases: Iterable[Json] = ()) -> Wiring:
     if aliases:
         wired["hostAliases"] = aliases
     changed = any(spec.get(key) != value for key, value in wired.items())
-    ours = any(_value(one, VARIABLE) == uri for kind in _KINDS for one in wired.get(kind, ()))
+    ours = any(_master(one) == uri for kind in _KINDS for one in wired.get(kind, ()))
     return Wiring({**spec, **wired} if changed else None, {MASTER_URI: uri} if ours else {})
 
 
 def unwired(pod: Pod, rosproxy: RosProxy, cluster_ip: str) -> ClusterFinding | None:
     """What is wrong with a selected pod's ROS_MASTER_URI (reason NotWired); None if nothing is.
 
-    ``cluster_ip`` is that of the RosProxy's Service; without one nothing can be said yet.
+    ``cluster_ip`` is that of the RosProxy's Service.
     """
-    if not cluster_ip or pod.ended or pod.deleting:
-        return None
     text = _wrong_master(pod, rosproxy.id, cluster_ip)
-    about = Reference("Pod", pod.id, pod.uid)
-    subject = f"pod {pod.id}"
-    return (
-        ClusterFinding(subject, text, fatal=False, reason="NotWired", of=rosproxy.id, about=about)
-        if text
-        else None
-    )
+    return pod_finding(pod, rosproxy, "NotWired", text, fatal=False) if text else None
 
 
 def _wrong_master(pod: Pod, of: Name, cluster_ip: str) -> str:
@@ -108,15 +98,12 @@ def _wrong_master(pod: Pod, of: Name, cluster_ip: str) -> str:
         )
     if pod.wired or pod.own_masters:
         return ""
+    text = "has no ROS_MASTER_URI of its proxy"
     if INJECT not in pod.labels:
-        return (
-            "has no ROS_MASTER_URI of its proxy: add the label "
-            f"{INJECT}={of.name} to its template, then create the pod anew"
-        )
-    return (
-        "has no ROS_MASTER_URI of its proxy, since it was created while the webhook was not there "
-        "or there was no RosProxy: create the pod anew"
-    )
+        label = f"{INJECT}={of.name}"
+        return f"{text}: add the label {label} to its template, then create the pod anew"
+    why = "since it was created while the webhook was not there or there was no RosProxy"
+    return f"{text}, {why}: create the pod anew"
 
 
 def _is_proxys(uri: str, of: Name, cluster_ip: str) -> bool:
@@ -126,40 +113,37 @@ def _is_proxys(uri: str, of: Name, cluster_ip: str) -> bool:
     where, service = parse_slave_uri(uri.strip()), service_id(of)
     if where is None or where.port != MASTER_PORT:
         return False
-    host = where.host.lower().rstrip(".")
-    full = f"{service.name}.{service.namespace}.svc."
-    short = host in (service.name, f"{service.name}.{service.namespace}")
-    return host == cluster_ip.lower() or short or f"{host}.".startswith(full)
+    host, name = where.host.lower().rstrip("."), f"{service.name}.{service.namespace}"
+    return host in (cluster_ip.lower(), service.name, name) or f"{host}.".startswith(f"{name}.svc.")
 
 
 def _wired(container: Json, uri: str, former: str) -> Json:
-    variables = [_renewed(one, uri, former) for one in parts(container, "env")]
+    variables = list(parts(container, "env"))
+    for place, one in enumerate(variables):
+        if one.get("name") == VARIABLE and former and one.get("value") == former:
+            variables[place] = {**one, "value": uri}
     there = {word(one, "name") for one in variables}
     first: list[Json] = []
     if VARIABLE not in there:
         first.append({"name": VARIABLE, "value": uri})
-    if not there & {IP_VARIABLE, HOST_VARIABLE}:
+    if not there & {"ROS_IP", "ROS_HOSTNAME"}:
         source = {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.podIP"}}
-        first.append({"name": IP_VARIABLE, "valueFrom": source})
+        first.append({"name": "ROS_IP", "valueFrom": source})
     env = [*first, *variables]
     return {**container, "env": env} if env else container
 
 
-def _renewed(variable: Json, uri: str, former: str) -> Json:
-    ours = word(variable, "name") == VARIABLE and former and variable.get("value") == former
-    return {**variable, "value": uri} if ours else variable
-
-
-def _value(container: Json, name: str) -> str:
-    found = [word(one, "value") for one in parts(container, "env") if one.get("name") == name]
-    return found[-1] if found else ""
+def _master(container: Json) -> str:
+    """The ROS_MASTER_URI of a container; of several that count it is the last."""
+    env = parts(container, "env")
+    return next((word(one, "value") for one in reversed(env) if one.get("name") == VARIABLE), "")
 
 
 def _merged(own: Iterable[Json], more: Iterable[Json]) -> list[Json]:
     """Host aliases with others added: one entry per address, as the API server merges them."""
     merged = list(own)
     for alias in more:
-        place = _place(merged, word(alias, "ip"))
+        place = next((n for n, one in enumerate(merged) if one.get("ip") == alias.get("ip")), None)
         if place is None:
             merged.append(alias)
             continue
@@ -168,8 +152,3 @@ def _merged(own: Iterable[Json], more: Iterable[Json]) -> list[Json]:
         if new:
             merged[place] = {**merged[place], "hostnames": [*there, *new]}
     return merged
-
-
-def _place(aliases: list[Json], ip: str) -> int | None:
-    found = (place for place, alias in enumerate(aliases) if alias.get("ip") == ip)
-    return next(found, None)

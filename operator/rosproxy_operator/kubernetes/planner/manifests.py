@@ -3,14 +3,14 @@
 import copy
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.resources.model import ClusterNode, Json, RosProxy
+from rosproxy_operator.kubernetes.resources.model import ClusterNode, Json, MasterSpec, RosProxy
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
     ADVERTISE_HOST,
@@ -51,23 +51,18 @@ _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000
 
 
 @dataclass(frozen=True, slots=True)
-class Upstream:
-    """The real master as a proxy is told it. ``address`` is empty if its name is to be resolved."""
-
-    uri: str
-    address: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Site:
-    """A proxy on a node. ``publish`` is the port for a master in the cluster, 0 for none."""
+    """A proxy on a node.
+
+    ``master`` is the real master as a proxy is told it: ``uri`` also of a Service, ``address``
+    empty if its name is to be resolved, ``publish`` 0 where that port can't be had.
+    """
 
     rosproxy: RosProxy
     node: ClusterNode
     advertise_host: str
     ports: PortRange
-    upstream: Upstream
-    publish: int = 0
+    master: MasterSpec
 
 
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
@@ -76,41 +71,32 @@ def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
 
 
 def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
-    """A proxy's pod. Its token is empty: see `with_token`."""
-    of = site.rosproxy
-    metadata: dict[str, Any] = {
-        "name": proxy_name(of.id.name, site.node.name),
-        "namespace": of.id.namespace,
-        "labels": own_labels(of.id.name),
-        "annotations": {
-            NODE: site.node.name,
-            PORT_RANGE: str(site.ports),
-            ADVERTISE_HOST: site.advertise_host,
-        },
-        "ownerReferences": [_owner(of)],
+    """A proxy's pod. Its token is empty: see `with_token`.
+
+    The fingerprint says what the pod is made of, but for its image, which can be exchanged; then
+    as what its nodes know it, see `finds_again`.
+    """
+    of, container = site.rosproxy, _container(site, settings)
+    notes = {
+        NODE: site.node.name,
+        PORT_RANGE: str(site.ports),
+        ADVERTISE_HOST: site.advertise_host,
     }
-    body = {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": _spec(site, settings)}
-    metadata["annotations"][FINGERPRINT] = f"{fingerprint(body)}-{_known_as(site)}"
-    return body
-
-
-def _known_as(site: Site) -> str:
-    return hashlib.sha256(f"{site.upstream.uri} {site.advertise_host}".encode()).hexdigest()[:8]
+    metadata = _metadata(of, proxy_name(of.id.name, site.node.name), notes)
+    spec = {**_spec(site), "containers": [{**container, "image": ""}]}
+    body = {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec}
+    known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
+    notes[FINGERPRINT] = f"{_fingerprint(body)}-{known_as}"
+    return {**body, "spec": {**spec, "containers": [container]}}
 
 
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     """A RosProxy's Service, under one address the proxy on each pod's own node."""
-    labels = own_labels(rosproxy.id.name)
-    metadata: dict[str, Any] = {
-        "name": service_name(rosproxy.id.name),
-        "namespace": rosproxy.id.namespace,
-        "labels": labels,
-        "annotations": {},
-        "ownerReferences": [_owner(rosproxy)],
-    }
+    notes: dict[str, str] = {}
+    metadata = _metadata(rosproxy, service_name(rosproxy.id.name), notes)
     spec: dict[str, Any] = {
         "type": "ClusterIP",
-        "selector": labels,
+        "selector": metadata["labels"],
         "internalTrafficPolicy": "Local",
         # A proxy that does not reach its master must still be there to say so.
         "publishNotReadyAddresses": True,
@@ -119,18 +105,10 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
         ],
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": metadata, "spec": spec}
-    metadata["annotations"][FINGERPRINT] = fingerprint(body)
+    notes[FINGERPRINT] = _fingerprint(body)
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
     return body
-
-
-def fingerprint(body: Json) -> str:
-    """What an object is made of, in 16 hex digits, but for the image, which can be exchanged."""
-    bare = copy.deepcopy(dict(body))
-    for container in bare["spec"].get("containers", ()):
-        container["image"] = ""
-    return hashlib.sha256(json.dumps(bare, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def finds_again(old: str, new: str) -> bool:
@@ -161,22 +139,47 @@ def without_cluster_ip(body: Json) -> Json:
     return {**body, "spec": spec}
 
 
-def _owner(rosproxy: RosProxy) -> dict[str, Any]:
-    return {
+def _fingerprint(body: Json) -> str:
+    return _digest(json.dumps(body, sort_keys=True))[:16]
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _metadata(of: RosProxy, name: str, annotations: dict[str, str]) -> dict[str, Any]:
+    owner = {
         "apiVersion": API_VERSION,
         "kind": KIND,
-        "name": rosproxy.id.name,
-        "uid": rosproxy.uid,
+        "name": of.id.name,
+        "uid": of.uid,
         "controller": True,
+    }
+    return {
+        "name": name,
+        "namespace": of.id.namespace,
+        "labels": own_labels(of.id.name),
+        "annotations": annotations,
+        "ownerReferences": [owner],
     }
 
 
-def _spec(site: Site, settings: ClusterSettings) -> dict[str, Any]:
+def _spec(site: Site) -> dict[str, Any]:
+    """The spec of a proxy's pod but for its container.
+
+    The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
+    """
     spec = site.rosproxy.spec
+    field = {"key": "metadata.name", "operator": "In", "values": [site.node.name]}
+    terms = {"nodeSelectorTerms": [{"matchFields": [field]}]}
+    tolerations = [
+        {"key": f"node.kubernetes.io/{taint}", "operator": "Exists", "effect": effect}
+        for taint, effect in _TAINTS
+    ]
     more = {"imagePullSecrets": spec.image_pull_secrets, "hostAliases": spec.host_aliases}
     return {
-        "affinity": _on(site.node.name),
-        "tolerations": [*_tolerations(), *map(dict, spec.tolerations)],
+        "affinity": {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": terms}},
+        "tolerations": [*tolerations, *map(dict, spec.tolerations)],
         "restartPolicy": "Always",
         "terminationGracePeriodSeconds": STOPS_WITHIN,
         "automountServiceAccountToken": False,
@@ -189,34 +192,28 @@ def _spec(site: Site, settings: ClusterSettings) -> dict[str, Any]:
             "seccompProfile": {"type": "RuntimeDefault"},
             "sysctls": [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}],
         },
-        "containers": [_container(site, settings)],
         **{key: [dict(one) for one in value] for key, value in more.items() if value},
     }
 
 
-def _on(node: str) -> dict[str, Any]:
-    """Bound to a node, but through the scheduler, as a DaemonSet's pods: it checks the ports."""
-    field = {"key": "metadata.name", "operator": "In", "values": [node]}
-    terms = {"nodeSelectorTerms": [{"matchFields": [field]}]}
-    return {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": terms}}
-
-
-def _tolerations() -> Iterable[dict[str, str]]:
-    for taint, effect in _TAINTS:
-        yield {"key": f"node.kubernetes.io/{taint}", "operator": "Exists", "effect": effect}
-
-
 def _local_ports(site: Site) -> str:
-    fixed = [PortRange(port, port) for port in (MASTER_PORT, ADMIN_PORT, site.publish) if port]
-    listening = [site.ports, *fixed]
+    fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
+    listening = [site.ports, *(PortRange(port, port) for port in fixed if port)]
     free = (one for one in _LOCAL_PORTS if not any(overlap(one, other) for other in listening))
     ports = next(free, _LOCAL_PORTS[0])
     return f"{ports.first} {ports.last}"
 
 
 def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
+    """A proxy's container.
+
+    The programs that make rules in the kernel have their capability from their files: Kubernetes
+    calls it escalation.
+    """
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
+    publish = [site.master.publish] if site.master.publish else []
+    forwards = spec.data_plane == "kernel"
     return {
         "name": CONTAINER,
         "image": image_of(site.rosproxy, settings),
@@ -224,39 +221,30 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
         "env": [{"name": name, "value": value} for name, value in _environment(site).items()],
         "ports": [
             {"containerPort": port, "hostPort": port, "protocol": "TCP"}
-            for port in (*site.ports.ports(), *((site.publish,) if site.publish else ()))
+            for port in [*site.ports.ports(), *publish]
         ],
         "resources": dict(spec.resources),
         "livenessProbe": _probe("/healthz", 10),
         "readinessProbe": _probe("/readyz", 2),
         "lifecycle": {"preStop": {"exec": {"command": ["sleep", str(_LINGERS)]}}},
         "terminationMessagePolicy": "FallbackToLogsOnError",
-        "securityContext": _rights(spec.data_plane == "kernel"),
-    }
-
-
-def _rights(forwarding: bool) -> dict[str, Any]:
-    """What a proxy may do; ``forwarding`` is by rules that it makes in the kernel.
-
-    The programs for that have the capability from their files: Kubernetes calls it escalation.
-    """
-    add = {"add": ["NET_ADMIN"]} if forwarding else {}
-    return {
-        "allowPrivilegeEscalation": forwarding,
-        "readOnlyRootFilesystem": True,
-        "capabilities": {"drop": ["ALL"], **add},
+        "securityContext": {
+            "allowPrivilegeEscalation": forwards,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"], **({"add": ["NET_ADMIN"]} if forwards else {})},
+        },
     }
 
 
 def _environment(site: Site) -> Mapping[str, str]:
     spec = site.rosproxy.spec
     variables = {
-        "ROS_MASTER_URI": site.upstream.uri,
-        "ROSPROXY_MASTER_ADDRESS": site.upstream.address,
+        "ROS_MASTER_URI": site.master.uri,
+        "ROSPROXY_MASTER_ADDRESS": site.master.address,
         "ROSPROXY_ADVERTISE_HOST": site.advertise_host,
         "ROSPROXY_PORT_RANGE": str(site.ports),
         "ROSPROXY_MASTER_PORT": str(MASTER_PORT),
-        "ROSPROXY_PUBLISH_MASTER": str(site.publish or ""),
+        "ROSPROXY_PUBLISH_MASTER": str(site.master.publish or ""),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{ADMIN_PORT}",
         "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
@@ -267,8 +255,5 @@ def _environment(site: Site) -> Mapping[str, str]:
 
 
 def _probe(path: str, period: int) -> dict[str, Any]:
-    return {
-        "httpGet": {"path": path, "port": ADMIN_PORT},
-        "periodSeconds": period,
-        "timeoutSeconds": 3,
-    }
+    where = {"path": path, "port": ADMIN_PORT}
+    return {"httpGet": where, "periodSeconds": period, "timeoutSeconds": 3}

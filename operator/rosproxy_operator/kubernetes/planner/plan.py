@@ -6,12 +6,10 @@ wanted proxy its ports, `reconcile` says what is to be done to Services and prox
 `events` what users are told of it, `departures` what proxies are told.
 """
 
-import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
@@ -19,20 +17,19 @@ from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
+    Obstacle,
     advertise_host,
     ends,
-    nodes_by_rosproxy,
-    obstacle,
+    master_of,
     reconcile_orphans,
     reconcile_proxy,
     reconcile_service,
-    service_of,
-    upstream,
+    site_of,
 )
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
-from rosproxy_operator.kubernetes.planner.view import finding, view
+from rosproxy_operator.kubernetes.planner.view import view
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterSnapshot,
@@ -83,12 +80,16 @@ def plan(
     actions = list(reconcile_orphans(context))
     problems: list[Problem] = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
-    nodes = nodes_by_rosproxy(context)
     for of, rosproxy in sorted(seen.rosproxies.items()):
-        own = _reconciled(context, rosproxy)
-        states = tuple(_state(context, ProxyPlace(of, node)) for node in nodes[of])
+        own = list(reconcile_service(context, rosproxy))
+        for place in seen.places.get(of, ()):
+            own += reconcile_proxy(context, place)
+        states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
-        status = _status(context, rosproxy, states, found, stamp)
+        service = context.own_service(rosproxy)
+        master, _ = master_of(rosproxy, observed)
+        uri = master.uri if master else ""
+        status = statuses.status_of(rosproxy, states, found, service, uri, stamp)
         problems += found
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
@@ -97,109 +98,64 @@ def plan(
     every = tuple(dict.fromkeys(problems))
     new = events.warnings(every, decided.reported, now)
     gone = departures.gone(observed, decided, now)
+    soon = (left for left in ends(context) if left > 0)
     return ClusterPlan(
         actions=(*actions, *new.emits),
         problems=every,
         state=replace(gone.state, attempts=retries.noted, reported=new.reported),
         gone=gone.gone,
-        again_in=min((*_waits(context), *departures.waits(gone, now)), default=None),
+        again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
     )
 
 
-def _waits(context: ClusterContext) -> Iterator[float]:
-    """In how many seconds there is something to be done or decided."""
-    yield from ends(context)
-    yield from context.retries.waits()
-    refused_for = (at + RETRY_FOR - context.now for at in context.state.refused.values())
-    yield from (left for left in refused_for if left > 0)
-
-
-def _reconciled(context: ClusterContext, rosproxy: RosProxy) -> list[Action]:
-    actions = list(reconcile_service(context, rosproxy))
-    for place in sorted(context.view.places()):
-        if place.of == rosproxy.id:
-            actions += reconcile_proxy(context, place)
-    return actions
+def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
+    """What a RosProxy has on each node that its status names: also where it had a proxy."""
+    named = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
+    for node in sorted(named & context.observed.nodes.keys()):
+        place = ProxyPlace(of.id, node)
+        current, wanted = context.view.current(place), place in context.view.wanted
+        site = site_of(context, place) if wanted else None
+        former = context.state.given.get(place) or of.former.get(node)
+        kept = current.range if current else former
+        yield NodeState(
+            name=node,
+            advertise_host=advertise_host(of, context.observed.nodes[node])[0],
+            range=context.ranges.given.get(place) if wanted else kept,
+            proxy=current,
+            pods=context.view.wanted.get(place, ()),
+            answer=context.observed.reports.get(current.pod.uid) if current else None,
+            problem=site.text if isinstance(site, Obstacle) else "",
+            reason=site.reason if isinstance(site, Obstacle) else "",
+        )
 
 
 def _problems(
     context: ClusterContext,
-    rosproxy: RosProxy,
+    of: RosProxy,
     states: tuple[NodeState, ...],
     moved: Iterable[ClusterFinding],
 ) -> tuple[Problem, ...]:
     """All that is wrong with a RosProxy."""
-    flaws = (
-        finding(rosproxy, reason, text)
-        for place, some in sorted(context.ranges.flaws.items())
-        if place.of == rosproxy.id
-        for reason, text in some
-    )
+    service = context.own_service(of)
+    address = service.cluster_ip if service else ""
+    pods = context.view.taken.get(of.id, ()) if address else ()
+    others = (*context.view.findings, *moved, *context.ranges.findings)
     return (
-        *statuses.findings(rosproxy, states, context.retries.failures(rosproxy.id)),
-        *(one for one in (*context.view.findings, *moved) if one.of == rosproxy.id),
-        *flaws,
-        *_unwired(context, rosproxy),
+        *statuses.findings(of, states, context.retries.failures(of.id)),
+        *(one for one in others if one.of == of.id),
+        *filter(None, (unwired(pod, of, address) for pod in pods)),
     )
-
-
-def _status(
-    context: ClusterContext,
-    rosproxy: RosProxy,
-    states: tuple[NodeState, ...],
-    problems: tuple[Problem, ...],
-    stamp: str,
-) -> Json:
-    master, _ = upstream(rosproxy, context.observed)
-    there = service_of(context.observed, rosproxy.id)
-    mine = there if there and there.owner == rosproxy.uid else None
-    uri = master.uri if master else ""
-    return statuses.status_of(rosproxy, states, problems, mine, uri, stamp)
-
-
-def _state(context: ClusterContext, place: ProxyPlace) -> NodeState:
-    of, node = context.view.rosproxies[place.of], context.observed.nodes[place.node]
-    current, wanted = context.view.current(place), place in context.view.wanted
-    reason, problem = obstacle(context, place) if wanted else ("", "")
-    former = context.state.given.get(place) or of.former.get(place.node)
-    kept = current.range if current else former
-    host, _ = advertise_host(of, node)
-    return NodeState(
-        name=place.node,
-        advertise_host=host,
-        range=context.ranges.given.get(place) if wanted else kept,
-        proxy=current,
-        pods=context.view.wanted.get(place, ()),
-        answer=context.observed.reports.get(current.pod.uid) if current else None,
-        problem=problem,
-        reason=reason,
-    )
-
-
-def _unwired(context: ClusterContext, rosproxy: RosProxy) -> Iterator[ClusterFinding]:
-    there = service_of(context.observed, rosproxy.id)
-    if there is not None and there.owner == rosproxy.uid and there.cluster_ip:
-        for pod in context.view.taken.get(rosproxy.id, ()):
-            found = unwired(pod, rosproxy, there.cluster_ip)
-            if found is not None:
-                yield found
 
 
 def _patch(
     context: ClusterContext, of: RosProxy | InvalidRosProxy, status: Json
 ) -> Iterator[Action]:
-    """Write a status if it is another one; not over and over again if that does not help."""
+    """Write a status if it is another one; not over and over again if that does not help.
+
+    Whether it is the same that was written before is told without its times.
+    """
     if status != of.status:
-        task = Task(of.id, "status", str(of.id), _digest(status))
-        if context.retries.ask(task):
+        conditions = [{**one, "lastTransitionTime": ""} for one in status.get("conditions", ())]
+        said = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
+        if context.retries.ask(Task(of.id, "status", of.id, said)):
             yield PatchStatus(of.id, status)
-
-
-def _digest(status: Json) -> str:
-    """What a status says, without its times."""
-    said = [
-        {key: value for key, value in one.items() if key != "lastTransitionTime"}
-        for one in status.get("conditions", ())
-    ]
-    text = json.dumps({**status, "conditions": said}, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -22,14 +22,14 @@ AT_ONCE = 3
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Something to be done for a RosProxy. ``subject`` is the object, as in `Failure`.
+    """Something to be done for a RosProxy to the object ``id``.
 
     ``detail`` tells tasks apart that concern objects of one name, or one object in several ways.
     """
 
     of: Name
     verb: str
-    subject: str
+    id: Name
     detail: str = ""
 
 
@@ -67,7 +67,7 @@ class Retries:
     ) -> None:
         said = {(of, one.subject): one.text for of, some in failures.items() for one in some}
         self._known = {
-            task: replace(tried, error=said.get((task.of, task.subject), tried.error))
+            task: replace(tried, error=said.get((task.of, str(task.id)), tried.error))
             for task, tried in known.items()
         }
         self._now = now
@@ -88,16 +88,14 @@ class Retries:
         if task in self._known:
             self.noted[task] = replace(self._known[task], effect=True, error="")
 
-    def failures(self, of: Name) -> tuple[Failure, ...]:
+    def failures(self, of: Name) -> Iterator[Failure]:
         """What can't be done for a RosProxy."""
-        found = (Failure(task.subject, tried.error) for task, tried in self._of(of) if tried.error)
-        return tuple(dict.fromkeys(found))
+        for task, tried in self.noted.items():
+            if task.of == of and tried.error:
+                yield Failure(str(task.id), tried.error)
 
     def waits(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
         for tried in self.noted.values():
             if not tried.effect:
                 yield max(tried.at + tried.pause - self._now, 0.0)
-
-    def _of(self, of: Name) -> Iterator[tuple[Task, RetryRecord]]:
-        yield from ((task, tried) for task, tried in self.noted.items() if task.of == of)

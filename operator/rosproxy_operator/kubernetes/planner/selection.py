@@ -1,6 +1,6 @@
 """Which pods a RosProxy takes."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from rosproxy_operator.kubernetes.resources.model import (
@@ -17,6 +17,8 @@ from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT
 OFF = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""
 _ANY = "true"
+_TEXTS = {"In": "{0} in {1}", "NotIn": "{0} notin {1}", "Exists": "{0}", "DoesNotExist": "!{0}"}
+"""The operators of a label selector as the API server takes them, of a key and listed values."""
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
 
 
@@ -42,13 +44,13 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
 
 
 def label_selector(spec: RosProxySpec, name: str) -> str:
-    """The selector of a RosProxy's pods as the API server takes it (``labelSelector=``).
-
-    ``name`` is the RosProxy's.
-    """
-    if spec.pod_selector is None:
-        return f"{INJECT} in {_listed({_ANY, name})}"
-    return ",".join([*_requirements(spec.pod_selector), f"{INJECT} notin {_listed(OFF)}"])
+    """The selector of the pods of the RosProxy ``name`` as the API server takes it."""
+    selector = spec.pod_selector
+    if selector is None:
+        return f"{INJECT} in {_listed((_ANY, name))}"
+    equal = (f"{key}={value}" for key, value in sorted(selector.labels.items()))
+    others = (_TEXTS[how].format(key, _listed(values)) for key, how, values in selector.expressions)
+    return ",".join([*equal, *others, f"{INJECT} notin {_listed(OFF)}"])
 
 
 def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> Choice:
@@ -61,11 +63,28 @@ def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> Choice:
     if not taking:
         return Choice()
     if not named and len(taking) > 1:
-        return Choice(finding=_finding(pod, taking[0], "Ambiguous", _ambiguous(taking)))
+        names = [one.id.name for one in taking]
+        text = (
+            f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to "
+            f"one of them, as {INJECT}={names[0]}"
+        )
+        return Choice(finding=pod_finding(pod, taking[0], "Ambiguous", text))
     of = (named or taking)[0]
     if pod.host_network:
-        return Choice(finding=_finding(pod, of, "HostNetwork", _HOST_NETWORK))
+        text = (
+            "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
+            f"none: take hostNetwork off, or the label {INJECT}"
+        )
+        return Choice(finding=pod_finding(pod, of, "HostNetwork", text))
     return Choice(of)
+
+
+def pod_finding(
+    pod: Pod, of: RosProxy, reason: str, text: str, fatal: bool = True
+) -> ClusterFinding:
+    """Something about a pod that a RosProxy selects."""
+    subject, about = f"pod {pod.id}", Reference("Pod", pod.id, pod.uid)
+    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
 
 
 def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
@@ -99,32 +118,11 @@ def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
     return matches(Selector(rosproxy.spec.node_selector), node.labels)
 
 
-_HOST_NETWORK = (
-    "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get none: take "
-    f"hostNetwork off, or the label {INJECT}"
-)
-
-
-def _ambiguous(taking: Iterable[RosProxy]) -> str:
-    names = [one.id.name for one in taking]
-    return (
-        f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to one "
-        f"of them, as {INJECT}={names[0]}"
-    )
-
-
-def _finding(pod: Pod, of: RosProxy, reason: str, text: str) -> ClusterFinding:
-    about = Reference("Pod", pod.id, pod.uid)
-    return ClusterFinding(f"pod {pod.id}", text, reason=reason, of=of.id, about=about)
-
-
 def _selects(rosproxy: RosProxy, pod: Pod) -> bool:
-    if rosproxy.id.namespace != pod.id.namespace or rosproxy.deleting or _is_ours(pod.labels):
+    label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
+    here = rosproxy.id.namespace == pod.id.namespace
+    if not here or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
         return False
-    label = pod.labels.get(INJECT)
-    if label in OFF:
-        return False
-    selector = rosproxy.spec.pod_selector
     return label in (_ANY, rosproxy.id.name) if selector is None else matches(selector, pod.labels)
 
 
@@ -145,19 +143,6 @@ def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, 
         case "DoesNotExist":
             return key not in labels
     return False
-
-
-def _requirements(selector: Selector) -> Iterator[str]:
-    for key, value in sorted(selector.labels.items()):
-        yield f"{key}={value}"
-    for key, operator, values in selector.expressions:
-        match operator:
-            case "In" | "NotIn":
-                yield f"{key} {operator.lower()} {_listed(values)}"
-            case "Exists":
-                yield key
-            case "DoesNotExist":
-                yield f"!{key}"
 
 
 def _listed(values: Iterable[str]) -> str:

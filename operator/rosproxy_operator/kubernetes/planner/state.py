@@ -20,13 +20,7 @@ from rosproxy_operator.common.allocation import (
 )
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
 from rosproxy_operator.kubernetes.planner.view import View, finding, has_ports, place_of, serves
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterFinding,
-    Pod,
-    ProxyPlace,
-    ProxyPod,
-    Stuck,
-)
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Pod, ProxyPlace, Stuck
 
 TRIED_FOR = 60.0
 """Seconds for which it is told that a proxy got other ports than were tried first."""
@@ -68,9 +62,8 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
     A range that its proxy does not get is given up at once if it has never served, else after
     `RETRY_FOR` seconds, since its ports may only be slow to be let go: they count as taken then.
     """
-    absent = (place for place in sorted(view.proxies) if place not in view.wanted)
-    nodes = {one.on for one in view.observed.proxies}
-    lost = (node for node in sorted(nodes) if node not in view.observed.nodes)
+    absent = view.proxies.keys() - view.wanted.keys()
+    lost = {one.on for one in view.observed.proxies} - view.observed.nodes.keys()
     served = _served(view, state)
     waiting, refused = _refused(view, served, state.refused, now)
     taken = {port: at for port, at in state.taken.items() if now - at < TAKEN_FOR}
@@ -80,7 +73,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
         absent={place: state.absent.get(place, now) for place in absent},
         lost={node: state.lost.get(node, now) for node in lost},
         served=served,
-        given={place: ports for place, ports in state.given.items() if _may_be(view, place)},
+        given=_possible(view, state.given),
         refused=waiting,
         taken=taken | dict.fromkeys(refused, now),
         moved=_recent(view, state.moved, now - MOVED_FOR),
@@ -90,9 +83,8 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
 
 def decide(state: ClusterState, ranges: Mapping[ProxyPlace, PortRange], now: float) -> ClusterState:
     """The state with the ranges that are given, and with who had to leave which."""
-    served = {place: ports for place, ports in state.served.items() if place in ranges}
-    tried = {p: ports for p, ports in state.given.items() if p in ranges and p not in served}
-    left = _left(served, ranges, now)
+    left = _left(state.served, ranges, now)
+    tried = {place: ports for place, ports in state.given.items() if place not in state.served}
     return replace(
         state,
         given={**state.given, **ranges},
@@ -108,10 +100,10 @@ def moves(
     """Who has had to leave which ports."""
     for left, why in ((state.moved, _MOVED), (state.tried, _TRIED)):
         for place, move in sorted(left.items()):
-            ports = ranges.get(place)
-            if ports is not None and not _is_kept(move.ports, ports):
-                text = f"the proxy on node {place.node} has left ports {move.ports} for {ports}"
-                yield finding(view.rosproxies[place.of], "PortConflict", f"{text}, {why}")
+            if place in ranges and not _is_kept(move.ports, ranges[place]):
+                what = f"has left ports {move.ports} for {ranges[place]}"
+                text = f"the proxy on node {place.node} {what}, {why}"
+                yield finding(view.rosproxies[place.of], "PortConflict", text)
 
 
 _MOVED = (
@@ -128,11 +120,13 @@ def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
         for of, rosproxy in view.rosproxies.items():
             served |= {ProxyPlace(of, node): ports for node, ports in rosproxy.former.items()}
     served |= {place_of(one): one.range for one in view.observed.proxies if serves(one)}
-    return {place: ports for place, ports in served.items() if _may_be(view, place)}
+    return _possible(view, served)
 
 
-def _may_be(view: View, place: ProxyPlace) -> bool:
-    return place.of in view.rosproxies and place.node in view.observed.nodes
+def _possible(view: View, given: Mapping[ProxyPlace, PortRange]) -> dict[ProxyPlace, PortRange]:
+    """Those whose RosProxy and whose node are there."""
+    rosproxies, nodes = view.rosproxies, view.observed.nodes
+    return {p: ports for p, ports in given.items() if p.of in rosproxies and p.node in nodes}
 
 
 def _recent(view: View, moves: Mapping[ProxyPlace, Move], since: float) -> dict[ProxyPlace, Move]:
@@ -149,37 +143,36 @@ def _refused(
 
     A proxy whose ports another one of the operator's still holds, while it ends, has only to wait.
     """
-    waiting = {place: at for place, at in since.items() if not _is_back(view, place)}
+    waiting = {place: at for place, at in since.items() if _waits(view, place)}
     taken: set[tuple[str, int]] = set()
-    stuck = (one for one in view.observed.proxies if one.stuck is Stuck.PORTS)
-    for proxy in (one for one in stuck if not one.pod.deleting):
-        place = place_of(proxy)
-        others = [one.pod for one in view.on(proxy.on) if place_of(one) != place]
-        ends = any(o.pod.deleting and overlap(o.range, proxy.range) for o in view.on(proxy.on))
-        if place not in view.wanted or ends:
+    for proxy in view.observed.proxies:
+        place, there = place_of(proxy), view.on.get(proxy.on, ())
+        ends = any(one.pod.deleting and overlap(one.range, proxy.range) for one in there)
+        is_stuck = proxy.stuck is Stuck.PORTS and not proxy.pod.deleting
+        if not is_stuck or place not in view.wanted or ends:
             continue
-        before = served.get(place)
-        began = waiting.get(place, now)
+        before, began = served.get(place), waiting.pop(place, now)
         if before is not None and overlap(before, proxy.range) and now - began < RETRY_FOR:
             waiting[place] = began
             continue
-        waiting.pop(place, None)
+        others = (one.pod for one in there if place_of(one) != place)
         held = ports_held((*view.strangers.get(proxy.on, ()), *others))
-        hit = held.intersection(proxy.range.ports())
-        if not held & proxy.pod.host_ports:
-            hit = set(proxy.range.ports())
+        # Whoever holds them is seen, or all of them are avoided.
+        seen = held & proxy.pod.host_ports
+        hit = held.intersection(proxy.range.ports()) if seen else proxy.range.ports()
         taken |= {(proxy.on, port) for port in hit}
     return waiting, taken
+
+
+def _waits(view: View, place: ProxyPlace) -> bool:
+    """Whether the proxy of a place is wanted, but has not got its ports yet."""
+    proxy = view.current(place)
+    return place in view.wanted and (proxy is None or not has_ports(proxy))
 
 
 def ports_held(pods: Iterable[Pod]) -> set[int]:
     """The hostPorts of pods."""
     return {port for pod in pods for port in pod.host_ports}
-
-
-def _is_back(view: View, place: ProxyPlace) -> bool:
-    proxy: ProxyPod | None = view.current(place)
-    return place not in view.wanted or (proxy is not None and has_ports(proxy))
 
 
 def _left(
@@ -188,7 +181,7 @@ def _left(
     return {
         place: Move(ports, now)
         for place, ports in before.items()
-        if not _is_kept(ports, ranges[place])
+        if place in ranges and not _is_kept(ports, ranges[place])
     }
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests
-from rosproxy_operator.kubernetes.planner.actions import Action, Emit, PatchStatus
-from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
+from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
+from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
@@ -69,7 +69,7 @@ def pod(name: str = "talker", on: str = "one", ports: Iterable[int] = (), **chan
 
 def site(of: RosProxy, on: ClusterNode, ports: PortRange = RANGE, publish: int = 0) -> Site:
     host = on.advertise_host or on.addresses["InternalIP"]
-    return Site(of, on, host, ports, Upstream(of.spec.master.uri, of.spec.master.address), publish)
+    return Site(of, on, host, ports, replace(of.spec.master, publish=publish))
 
 
 def proxy(
@@ -119,6 +119,12 @@ def observed(
     )
 
 
+def scene(*more: Any, of: Any = None) -> ClusterSnapshot:
+    """A pod that wants a proxy, and other things."""
+    of = of or rosproxy()
+    return observed(of, service(of), pod(), *more)
+
+
 def complete(**changes: Any) -> ClusterSnapshot:
     """A pod, its proxy, and the Service."""
     return replace(observed(rosproxy(), pod(), proxy(), service()), **changes)
@@ -144,6 +150,16 @@ def written(seen: ClusterSnapshot, found: ClusterPlan | None = None) -> ClusterS
 def done(found: ClusterPlan) -> list[Action]:
     """What a plan does to pods and Services."""
     return [action for action in found.actions if not isinstance(action, Emit | PatchStatus)]
+
+
+def kinds(found: ClusterPlan) -> list[type]:
+    return [type(one) for one in done(found)]
+
+
+def creation(found: ClusterPlan) -> CreateProxy:
+    (action,) = done(found)
+    assert isinstance(action, CreateProxy), action
+    return action
 
 
 def status(found: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:

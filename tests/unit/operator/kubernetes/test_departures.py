@@ -50,6 +50,7 @@ def test_it_is_told_until_the_proxy_does_not_name_them_any_more() -> None:
     first = gone(seen(), KNOWN, 1.0)
     second = gone(seen(), first.state, 2.0)
     assert first.gone == second.gone == {PROXY: (TALKER,)}
+    assert TALKER in gone(seen(), first.state, 2 * REMEMBERED).state.addresses["one"]
     third = gone(seen(names=()), second.state, 3.0)
     assert third.gone == {}
     fourth = gone(seen(names=()), third.state, REMEMBERED)
@@ -104,7 +105,8 @@ def test_the_controller_looks_again_when_that_while_is_over() -> None:
 
 
 def test_what_is_outside_the_pod_network_is_left_alone() -> None:
-    stranger = seen(names=("192.0.2.99", "no address", "fd00::7"))
+    both = node(pod_networks=("10.244.1.0/24", "fd00::/64"))  # pods are listed with IPv4
+    stranger = seen(both, names=("192.0.2.99", "no address", "fd00::7"))
     first = gone(stranger, ClusterState(), 0.0)
     assert first.state.strange == {}
     assert gone(stranger, first.state, 100.0).gone == {}

@@ -103,6 +103,7 @@ def test_a_pod_of_which_one_container_sets_it_is_still_wired():
 
     assert env_of(found, place=1) == [MASTER, IP]
     assert found.annotations == {ANNOTATION: URI}
+    assert wire(admitted(container(own, MASTER, IP)), URI).annotations == {ANNOTATION: URI}
 
 
 def test_host_aliases_are_added_to_those_of_the_pod():
@@ -256,30 +257,16 @@ def test_a_pod_that_goes_around_its_proxy_is_told(master):
     assert found.about.id == pod().id
 
 
-def test_a_pod_that_was_there_before_the_webhook_is_told():
-    found = unwired(pod(), rosproxy(), CLUSTER_IP)
-
-    assert found is not None
-    assert "create the pod anew" in found.text
-
-
-def test_a_pod_that_is_selected_but_not_labelled_is_told_the_label():
-    found = unwired(pod(labels={"app": "x"}), rosproxy(), CLUSTER_IP)
-
-    assert found is not None
-    assert "rosproxy.io/inject=arm" in found.text
-
-
-def test_a_pod_that_is_wired_to_an_address_of_the_past_is_told():
-    found = unwired(pod(wired="http://10.96.0.1:11311"), rosproxy(), CLUSTER_IP)
-
-    assert found is not None
-    assert f"its proxy is at {URI} now" in found.text
-
-
 @pytest.mark.parametrize(
-    ("more", "address"),
-    [({}, ""), ({"phase": "Succeeded"}, CLUSTER_IP), ({"deleting": True}, CLUSTER_IP)],
+    ("there", "said"),
+    [
+        (pod(), "create the pod anew"),
+        (pod(labels={"app": "x"}), "rosproxy.io/inject=arm"),
+        (pod(wired="http://10.96.0.1:11311"), f"its proxy is at {URI} now"),
+    ],
 )
-def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(more, address):
-    assert unwired(pod(**more), rosproxy(), address) is None
+def test_a_pod_that_is_not_wired_is_told_what_to_do(there, said):
+    found = unwired(there, rosproxy(), CLUSTER_IP)
+
+    assert found is not None
+    assert said in found.text

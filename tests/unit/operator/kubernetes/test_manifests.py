@@ -7,7 +7,7 @@ import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests
-from rosproxy_operator.kubernetes.planner.manifests import Site, Upstream
+from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec
 from tests.run_options import settings_of
@@ -33,7 +33,8 @@ def env(place: Site | None = None, **changes: Any) -> dict[str, str]:
 def test_the_proxy_understands_all_of_its_variables() -> None:
     of = rosproxy(cleanup_after=0.5, slave_control="master")
     on = node(pod_networks=("10.244.1.0/24", "fd00::/64"))
-    place = Site(of, on, "192.0.2.1", RANGE, Upstream("http://roscore.ros.svc:1", "10.96.0.9"), 999)
+    master = MasterSpec("http://roscore.ros.svc:1", "10.96.0.9", publish=999)
+    place = Site(of, on, "192.0.2.1", RANGE, master)
     found = settings_of(env(place))
     assert found.master_uri == "http://roscore.ros.svc:1"
     assert found.master_address == "10.96.0.9"
@@ -64,8 +65,7 @@ def test_clean_up_can_be_switched_off() -> None:
 
 
 def test_each_port_is_the_same_on_the_node() -> None:
-    ports = container(site(rosproxy(), node(), publish=11500))["ports"]
-    assert ports == [
+    assert container(site(rosproxy(), node(), publish=11500))["ports"] == [
         {"containerPort": port, "hostPort": port, "protocol": "TCP"}
         for port in (11400, 11401, 11402, 11403, 11500)
     ]

@@ -27,13 +27,16 @@ from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,
     complete,
+    creation,
     done,
+    kinds,
     look,
     node,
     observed,
     pod,
     proxy,
     rosproxy,
+    scene,
     service,
     status,
     told,
@@ -67,7 +70,7 @@ def test_a_rosproxy_gets_a_service_and_a_proxy_on_each_node_with_selected_pods()
 
 
 def test_a_service_is_there_before_any_pod_is() -> None:
-    assert [type(one) for one in done(look(observed(rosproxy())))] == [CreateService]
+    assert kinds(look(observed(rosproxy()))) == [CreateService]
 
 
 def test_when_all_is_there_nothing_is_done() -> None:
@@ -97,13 +100,13 @@ def test_other_pods_get_no_proxy(other: Any) -> None:
 
 
 def test_a_cordoned_node_gets_its_proxy_nonetheless() -> None:
-    found = look(observed(rosproxy(), service(), node(cordoned=True), pod()))
-    assert [type(one) for one in done(found)] == [CreateProxy]
+    found = look(scene(node(cordoned=True)))
+    assert kinds(found) == [CreateProxy]
 
 
 def test_on_a_node_that_is_not_ready_nothing_is_created_nor_deleted() -> None:
     away = node(ready=False)
-    found = look(observed(rosproxy(), service(), away, pod()))
+    found = look(scene(away))
     assert done(found) == []
     (text,) = told(found, "NodeNotReady")
     assert text.startswith("node one: is not ready")
@@ -113,7 +116,7 @@ def test_on_a_node_that_is_not_ready_nothing_is_created_nor_deleted() -> None:
 
 
 def test_a_node_that_is_being_deleted_gets_no_proxy() -> None:
-    assert done(look(observed(rosproxy(), service(), node(deleting=True), pod()))) == []
+    assert done(look(scene(node(deleting=True)))) == []
 
 
 def test_a_proxy_that_no_pod_wants_stays_for_the_grace_and_is_retired() -> None:
@@ -170,11 +173,10 @@ def test_any_other_change_makes_the_pod_anew_once_the_old_one_is_gone(changes: d
     assert isinstance(deleted, DeleteProxy)
     assert deleted.retire == ("master" in changes)
     assert deleted.why.startswith("made anew: ")
-    ending = observed(of, pod(), service(of), proxy(deleting=True))
-    second = look(ending, first.state, 101.0)
+    second = look(scene(proxy(deleting=True), of=of), first.state, 101.0)
     assert done(second) == []
-    third = look(observed(of, pod(), service(of)), second.state, 102.0)
-    assert [type(one) for one in done(third)] == [CreateProxy]
+    third = look(scene(of=of), second.state, 102.0)
+    assert kinds(third) == [CreateProxy]
 
 
 @pytest.mark.parametrize(
@@ -210,9 +212,7 @@ def test_a_proxy_that_the_garbage_collector_deletes_is_retired_nonetheless() -> 
     found = look(complete(rosproxies=(), proxies=(proxy(deleting=True),)))
     assert [getattr(one, "retire", None) for one in done(found)] == [True, None]
     never = proxy(deleting=True, phase="Pending")
-    assert [type(one) for one in done(look(complete(rosproxies=(), proxies=(never,))))] == [
-        DeleteService
-    ]
+    assert kinds(look(complete(rosproxies=(), proxies=(never,)))) == [DeleteService]
 
 
 def test_a_rosproxy_that_is_being_deleted_counts_as_gone() -> None:
@@ -256,7 +256,7 @@ def test_ports_of_an_unreadable_rosproxy_are_not_given_to_others() -> None:
 
 def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
     namesake = pod(PROXY.name, labels={})
-    found = look(observed(rosproxy(), service(), pod(), namesake))
+    found = look(scene(namesake))
     assert done(found) == []
     (text,) = told(found, "NameTaken")
     assert f"a pod called {PROXY} is there already, and is not the operator's" in text
@@ -265,71 +265,87 @@ def test_a_pod_of_somebody_else_that_has_our_name_is_never_touched() -> None:
 
 def test_a_proxy_under_a_name_of_former_times_goes_first() -> None:
     old = replace(proxy(), pod=replace(proxy().pod, id=Name("ros", "rosproxy-old")))
-    first = look(observed(rosproxy(), service(), pod(), old))
+    first = look(scene(old))
     assert [getattr(one, "id", None) for one in done(first)] == [Name("ros", "rosproxy-old")]
-    second = look(observed(rosproxy(), service(), pod()), first.state, 101.0)
-    assert [type(one) for one in done(second)] == [CreateProxy]
+    second = look(scene(), first.state, 101.0)
+    assert kinds(second) == [CreateProxy]
 
 
 @pytest.mark.parametrize(
-    ("changes", "host"),
+    ("advertise", "annotated", "host"),
     [
-        ({"advertise": Advertise.INTERNAL_IP}, "192.0.2.1"),
-        ({"advertise": Advertise.HOSTNAME}, "one"),
+        (Advertise.INTERNAL_IP, "", "192.0.2.1"),
+        (Advertise.HOSTNAME, "", "one"),
+        (Advertise.INTERNAL_IP, "gate", "gate"),
     ],
 )
-def test_outside_is_told_the_address_that_spec_names(changes: dict, host: str) -> None:
-    (created,) = done(look(observed(rosproxy(**changes), service(), pod())))
-    assert env(created)["ROSPROXY_ADVERTISE_HOST"] == host
+def test_outside_is_told_the_address_that_spec_names_if_the_node_has_no_annotation(
+    advertise: Advertise, annotated: str, host: str
+) -> None:
+    seen = scene(node(advertise_host=annotated), of=rosproxy(advertise=advertise))
+    assert env(creation(look(seen)))["ROSPROXY_ADVERTISE_HOST"] == host
 
 
-def test_the_nodes_annotation_comes_first() -> None:
-    (created,) = done(look(observed(rosproxy(), service(), pod(), node(advertise_host="gate"))))
-    assert env(created)["ROSPROXY_ADVERTISE_HOST"] == "gate"
-
-
-def test_a_node_without_such_an_address_gets_no_proxy_and_it_is_told_why() -> None:
-    found = look(observed(rosproxy(advertise=Advertise.EXTERNAL_IP), service(), pod()))
+@pytest.mark.parametrize(
+    ("annotated", "why"),
+    [
+        ("a b", ["node one: its annotation rosproxy.io/advertise-host"]),
+        ("", ["node one: it has no address of type ExternalIP (it has: Hostname, InternalIP)",
+              "kubectl annotate node one rosproxy.io/advertise-host=HOST"]),
+    ],
+)  # fmt: skip
+def test_a_node_that_outside_does_not_reach_gets_no_proxy_and_it_is_told_why(
+    annotated: str, why: list[str]
+) -> None:
+    of = rosproxy(advertise=Advertise.EXTERNAL_IP)
+    found = look(scene(node(advertise_host=annotated), of=of))
     assert done(found) == []
     (text,) = told(found, "NoAdvertiseHost")
-    assert "node one: it has no address of type ExternalIP (it has: Hostname, InternalIP)" in text
-    assert "kubectl annotate node one rosproxy.io/advertise-host=HOST" in text
-
-
-def test_an_annotation_that_is_no_host_is_told() -> None:
-    found = look(observed(rosproxy(), service(), pod(), node(advertise_host="a b")))
-    assert done(found) == []
-    (text,) = told(found, "NoAdvertiseHost")
-    assert "node one: its annotation rosproxy.io/advertise-host" in text
+    assert all(part in text for part in why)
 
 
 def test_a_master_in_the_cluster_is_given_by_name_and_address() -> None:
-    there = {MASTER: ("10.96.0.9", "")}
-    (created,) = done(look(observed(rosproxy(master=INSIDE), service(), pod(), masters=there)))
-    assert env(created)["ROS_MASTER_URI"] == "http://roscore.ros.svc:11311"
-    assert env(created)["ROSPROXY_MASTER_ADDRESS"] == "10.96.0.9"
+    seen = replace(scene(of=rosproxy(master=INSIDE)), masters={MASTER: ("10.96.0.9", "")})
+    created = env(creation(look(seen)))
+    assert created["ROS_MASTER_URI"] == "http://roscore.ros.svc:11311"
+    assert created["ROSPROXY_MASTER_ADDRESS"] == "10.96.0.9"
 
 
 @pytest.mark.parametrize("masters", [{}, {MASTER: ("", "does not exist: create it")}])
 def test_while_the_masters_service_is_missing_everything_stays(masters: dict) -> None:
     of = rosproxy(master=INSIDE)
-    found = look(observed(of, service(of), pod(), proxy(), masters=masters))
+    found = look(replace(scene(proxy(), of=of), masters=masters))
     assert done(found) == []
     assert "spec.master.service: Service ros/roscore" in told(found, "MasterUnknown")[0]
 
 
 def test_pods_on_nodes_that_the_node_selector_leaves_out_are_named() -> None:
-    of = rosproxy(node_selector={"zone": "a"})
-    found = look(observed(of, service(of), pod("a"), pod("b")))
+    found = look(scene(pod("a"), of=rosproxy(node_selector={"zone": "a"})))
     assert done(found) == []
     (text,) = told(found, "NodeLeftOut")
     assert "node one, which spec.nodeSelector leaves out" in text
-    assert "ros/a, ros/b" in text
+    assert "ros/a, ros/talker" in text
 
 
 def test_a_pod_that_is_not_wired_is_told() -> None:
     found = look(complete(pods=(pod(wired=""),)))
     assert "create the pod anew" in told(found, "NotWired")[0]
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        complete(pods=(pod(wired="", phase="Succeeded"),)),
+        complete(pods=(pod(wired="", deleting=True),)),
+        complete(pods=(pod(wired=""),), services={}),
+        complete(pods=(pod(wired=""),), services={ROBOT: service(ip="")}),
+        complete(pods=(pod(wired=""),), services={ROBOT: service(owner="uid-old")}),
+    ],
+)
+def test_nothing_is_said_of_pods_that_end_or_before_there_is_a_service(
+    seen: ClusterSnapshot,
+) -> None:
+    assert told(look(seen), "NotWired") == []
 
 
 # Services

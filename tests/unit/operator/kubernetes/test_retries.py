@@ -10,13 +10,14 @@ from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     complete,
     done,
+    kinds,
     look,
     node,
     observed,
     pod,
     proxy,
     rosproxy,
-    service,
+    scene,
     told,
     written,
 )
@@ -29,9 +30,9 @@ def refusing(name: Name = PROXY, text: str = "violates PodSecurity baseline") ->
 
 
 def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
-    seen = observed(rosproxy(), service(), pod(), failures=refusing())
+    seen = replace(scene(), failures=refusing())
     found, now, pauses = look(replace(seen, failures={})), 100.0, []
-    assert [type(one) for one in done(found)] == [CreateProxy]
+    assert kinds(found) == [CreateProxy]
     for _ in range(8):
         seen = written(seen, look(seen, found.state, now))
         found = look(seen, found.state, now)
@@ -41,12 +42,12 @@ def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
         pauses.append(found.again_in)
         now += found.again_in
         found = look(seen, found.state, now)
-        assert [type(one) for one in done(found)] == [CreateProxy]
+        assert kinds(found) == [CreateProxy]
     assert pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
 
 
 def test_a_refusal_stays_told_until_the_object_is_there() -> None:
-    seen = observed(rosproxy(), service(), pod())
+    seen = scene()
     memory = look(seen).state
     memory = look(replace(seen, failures=refusing()), memory, 100.5).state
     found = look(seen, memory, 101.0)
@@ -60,7 +61,7 @@ def test_what_was_created_and_is_not_listed_yet_is_not_created_again_at_once() -
     second = look(seen, first.state, 101.0)
     assert (done(second), second.again_in) == ([], 2.0)
     third = look(seen, second.state, 103.0)
-    assert [type(one) for one in done(third)] == [CreateService, CreateProxy]
+    assert kinds(third) == [CreateService, CreateProxy]
 
 
 def test_what_was_deleted_and_is_still_listed_is_not_deleted_again_at_once() -> None:
@@ -71,8 +72,8 @@ def test_what_was_deleted_and_is_still_listed_is_not_deleted_again_at_once() -> 
 
 
 def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
-    without = observed(rosproxy(), service(), pod())
-    evicted = observed(rosproxy(), service(), pod(), proxy(phase="Failed"))
+    without = scene()
+    evicted = scene(proxy(phase="Failed"))
     memory, now, created = ClusterState(), 100.0, 0
     for _ in range(100):
         found = look(without, memory, now)
@@ -84,10 +85,10 @@ def test_a_proxy_that_ends_is_made_anew_and_not_in_a_tight_loop() -> None:
 
 
 def test_a_proxy_that_was_well_is_made_anew_at_once_when_it_is_gone() -> None:
-    without, memory = observed(rosproxy(), service(), pod()), ClusterState()
+    without, memory = scene(), ClusterState()
     for now in range(100, 200, 10):
         found = look(without, memory, now)
-        assert [type(one) for one in done(found)] == [CreateProxy]
+        assert kinds(found) == [CreateProxy]
         memory = look(complete(), found.state, now + 1).state
 
 

@@ -110,11 +110,19 @@ def test_the_api_server_gives_exactly_the_pods_that_are_taken(selector, labels):
     assert asked is (chosen(pod(labels=labels), [one]).rosproxy is one)
 
 
-@pytest.mark.parametrize(("label", "taken"), [("true", True), ("arm", True), ("leg", False)])
-def test_a_pod_is_taken_by_its_label(label, taken):
+@pytest.mark.parametrize(
+    ("more", "taken"),
+    [
+        ({"labels": {INJECT: "true"}}, True),
+        ({"labels": {INJECT: "arm"}}, True),
+        ({"labels": {INJECT: "leg"}}, False),
+        ({"namespace": "other"}, False),
+    ],
+)
+def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
     one = rosproxy()
 
-    assert chosen(pod(labels={INJECT: label}), [one]).rosproxy is (one if taken else None)
+    assert chosen(pod(**more), [one]).rosproxy is (one if taken else None)
 
 
 @pytest.mark.parametrize(
@@ -129,10 +137,6 @@ def test_a_pod_is_taken_by_its_label(label, taken):
 )
 def test_pods_that_no_selector_takes(labels):
     assert chosen(pod(labels=labels), [rosproxy(selector=ALL)]) == chosen(pod(), [])
-
-
-def test_a_pod_of_another_namespace_is_not_taken():
-    assert chosen(pod(namespace="other"), [rosproxy()]).rosproxy is None
 
 
 def test_a_rosproxy_that_is_being_deleted_takes_no_pod():
