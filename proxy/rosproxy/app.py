@@ -16,7 +16,7 @@ from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
 from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.leases.leases import RANGE_OPTION, Leases, PortBank
+from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net import limits, sockets
 from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
@@ -62,9 +62,9 @@ class App:
         self._resubscriber = Resubscriber(context, registrar, updates, self.tcpros, plane)
         self.leases = leases = Leases(
             context.registry,
-            PortBank(settings.bind),
-            plane,
-            self._resubscriber,
+            settings.bind,
+            plane.syncer,
+            self._resubscriber.watch,
             context.tasks,
             context.problems,
         )

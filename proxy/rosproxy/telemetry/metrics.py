@@ -1,8 +1,7 @@
 """Prometheus metrics: the counters that the proxy keeps; its state is in `admin.state_metrics`."""
 
 import time
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
 
@@ -31,14 +30,11 @@ class Traffic:
         self.sent[key] = self.sent.get(key, 0) + sent
         self.received[key] = self.received.get(key, 0) + received
 
-
-@dataclass(frozen=True, slots=True)
-class KernelTally:
-    """What the kernel forwards: whether it does, how many connections, bytes by node."""
-
-    usable: bool
-    connections: int
-    traffic: Traffic
+    def totals(self) -> Iterator[tuple[list[str], int]]:
+        """Kind, name and direction with the bytes."""
+        for direction, sums in (("outward", self.sent), ("inward", self.received)):
+            for key, size in sums.items():
+                yield [*key, direction], size
 
 
 class Metrics:

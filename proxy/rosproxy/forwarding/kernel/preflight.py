@@ -29,7 +29,7 @@ async def why_not(mode: DataPlane, tools: Tools) -> str | None:
     for reason in _reasons(mode):
         return reason
     try:
-        chains = dropping_chains(await tools.nft("list", "chains"))
+        chains = dropping_chains(await tools.nft("-j", "list", "chains"))
     except (ToolError, NftError) as error:
         return str(error)
     if chains:
