@@ -50,29 +50,19 @@ class Metrics:
         ProcessCollector(registry=self.registry)
         build = Info("rosproxy_build", "The proxy's version.", registry=self.registry)
         build.info({"version": __version__})
-        self.calls = Counter(
-            "rosproxy_xmlrpc_calls",
-            "XML-RPC calls by API (master, slave), method and outcome.",
-            ["api", "method", "outcome"],
-            registry=self.registry,
-        )
+
+        def counter(name: str, text: str, *labels: str) -> Counter:
+            return Counter(f"rosproxy_{name}", text, labels, registry=self.registry)
+
+        calls = "XML-RPC calls by API (master, slave), method and outcome."
+        self.calls = counter("xmlrpc_calls", calls, "api", "method", "outcome")
         self._counters: dict[tuple[str, str, str], Counter] = {}
-        self.relay_errors = Counter(
-            "rosproxy_relay_errors",
-            "TCPROS connections that could not be relayed.",
-            ["reason"],
-            registry=self.registry,
-        )
-        self.cleanups = Counter(
-            "rosproxy_cleanups",
-            "Nodes unregistered at the master because they were gone.",
-            registry=self.registry,
-        )
-        self.exhausted = Counter(
-            "rosproxy_range_exhausted",
-            "Registrations refused because no port was left.",
-            registry=self.registry,
-        )
+        errors = "TCPROS connections that could not be relayed."
+        self.relay_errors = counter("relay_errors", errors, "reason")
+        gone = "Nodes unregistered at the master because they were gone."
+        self.cleanups = counter("cleanups", gone)
+        refused = "Registrations refused because no port was left."
+        self.exhausted = counter("range_exhausted", refused)
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
             "Time for a call of the proxy's own to the master.",
