@@ -3,8 +3,6 @@
 Commands import what they need when they run, so that a health check starts fast.
 """
 
-import asyncio
-import json
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -222,6 +220,9 @@ def doctor(
     is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
     something is.
     """
+    import asyncio
+    import json
+
     from rosproxy.cli import terminal
     from rosproxy.doctor import findings, rules
     from rosproxy.doctor.collect import DoctorOptions, collect

@@ -39,10 +39,6 @@ class Holder(Protocol):
         """The TCPROS ports that the node itself has named."""
 
     @property
-    def answers(self) -> bool:
-        """Whether the node is known to be there."""
-
-    @property
     def trusted(self) -> bool:
         """Whether the node has been heard since the proxy started."""
 

@@ -52,7 +52,11 @@ class Acceptor:
         except BlockingIOError:
             return
         except OSError as error:
-            self._wait(error)
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
+            # The socket would stay readable: look again later.
+            self._loop.remove_reader(self.sock)
+            self._pause = self._loop.call_later(0.1, self._listen)
 
     async def _serve(self, conn: socket.socket, peer: str) -> None:
         try:
@@ -64,13 +68,6 @@ class Acceptor:
         except BaseException:
             conn.close()
             raise
-
-    def _wait(self, error: OSError) -> None:
-        """Without a file descriptor left the socket would stay readable: look again later."""
-        if error.errno in (errno.EMFILE, errno.ENFILE):
-            log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
-        self._loop.remove_reader(self.sock)
-        self._pause = self._loop.call_later(0.1, self._listen)
 
 
 def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:

@@ -36,7 +36,7 @@ def destination(endpoint: Holder, host: HostForwarding) -> HostPort | str:
     named: a forged registration can't make the kernel forward to another host.
     """
     ports, address = endpoint.tcpros_ports, endpoint.address
-    if not endpoint.answers:
+    if endpoint.is_down or not endpoint.trusted:
         return "the node does not answer"
     if not ports:
         return "nobody outside has asked for a topic of it yet"

@@ -18,17 +18,11 @@ import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
+from rosproxy.forwarding.kernel import policy
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.forwarding.kernel.nft import Counters, NftError
-from rosproxy.forwarding.kernel.policy import (
-    Changes,
-    HostForwarding,
-    Pauses,
-    destination,
-    kept,
-    unchanged,
-)
+from rosproxy.forwarding.kernel.policy import Changes, HostForwarding
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
@@ -72,7 +66,7 @@ class ForwardSyncer:
         self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
         self._changed: set[Holder] = set()
         self._all = True
-        self._host, self._pauses = HostForwarding(), Pauses()
+        self._host, self._pauses = HostForwarding(), policy.Pauses()
         self._own: dict[str, bool] = {}
         self._own_until, self._retry_at = 0.0, float("inf")
         self._logged: dict[Holder, str] = {}
@@ -161,10 +155,7 @@ class ForwardSyncer:
         await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
     async def read_kernel(self) -> tuple[Counters, list[Flow]] | None:
-        """The kernel's counters and connections.
-
-        None if they can't be read; the table is then made again.
-        """
+        """The kernel's counters and connections; None if the table had to be made again."""
         async with self._lock:
             self._accounts.note_owners(self._endpoints)
             ipv6 = any(":" in endpoint.address for endpoint in self._accounts.owners.values())
@@ -202,7 +193,7 @@ class ForwardSyncer:
         if address not in self._own:
             self._own[address] = address_towards(address) == address
         own = {address} if self._own[address] else ()
-        where = destination(endpoint, replace(self._host, own=own))
+        where = policy.destination(endpoint, replace(self._host, own=own))
         if isinstance(where, str) or endpoint.fast_port is None:
             return where
         return self._pauses.why(endpoint.fast_port, where, self._clock()) or where
@@ -236,24 +227,21 @@ class ForwardSyncer:
         try:
             await self._table.make(wanted)
         except ToolError as error:
-            self._lose(str(error))
-
-    def _lose(self, why: str) -> None:
-        self._all, self.why_not = True, why
-        self._retry_at = self._clock() + RETRY_LOST
-        self._accounts.note_peers([])
-        text = f"topics are no longer forwarded by the kernel: {why}"
-        log.error("%s", text)
-        self._problems.add(OPTION, text)
+            self._all, self.why_not = True, str(error)
+            self._retry_at = self._clock() + RETRY_LOST
+            self._accounts.note_peers([])
+            text = f"topics are no longer forwarded by the kernel: {error}"
+            log.error("%s", text)
+            self._problems.add(OPTION, text)
 
     def _wanted(self) -> dict[int, HostPort]:
         now = self._table.forwards
         changed, self._changed = self._changed, set()
         if self._all or not self.recovered:
             self._all, changed = False, set(self._endpoints)
-            wanted = kept(now, changed, self.recovered)
+            wanted = policy.kept(now, changed, self.recovered)
         else:
-            wanted = unchanged(now, self._accounts.owners, changed)
+            wanted = policy.unchanged(now, self._accounts.owners, changed)
         for endpoint in changed:
             where = self._target(endpoint) if endpoint.fast_port else ""
             held = self._endpoints.by_port.get(endpoint.port) is endpoint
