@@ -22,8 +22,8 @@ from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net import sockets
-from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import make_context

@@ -16,8 +16,7 @@ from typing import Generic, Protocol, TypeVar
 
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import Holder, Holders
-from rosproxy.net.acceptor import Acceptor, Handler
-from rosproxy.net.sockets import BACKLOG, bind
+from rosproxy.net.sockets import BACKLOG, Acceptor, Handler, bind
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.problems import Problems
 
