@@ -20,7 +20,7 @@ from string import Template
 from typing import Any
 
 from rosproxy.forwarding.kernel.policy import Changes, Forwards
-from rosproxy.net.addresses import HostPort, parse_address
+from rosproxy.net.addresses import HostPort, is_address, parse_address
 
 Json = Any
 Counters = Mapping[int, tuple[int, int]]
@@ -158,7 +158,7 @@ class Table:
         pairs: dict[str, list[str]] = {name: [] for name in _MAPS}
         for port, where in forwards.items():
             # A host that is no address, which can't be, makes no sense to nft: it refuses all.
-            host = parse_address(where.host) or "?"
+            host = where.host if is_address(where.host) and "%" not in where.host else "?"
             pairs["marks"].append(f"{port} : {self.marks.of(port)}")
             pairs["hosts6" if ":" in host else "hosts4"].append(f"{port} : {host}")
             pairs["ports"].append(f"{port} : {where.port}")
