@@ -130,18 +130,6 @@ def run(check: bool, log_format: str, log_level: str, **values: Any) -> None:
             app.run(settings)
 
 
-def _admin_option(command: Command) -> Command:
-    return click.option(
-        "--admin",
-        envvar="ROSPROXY_ADMIN",
-        show_envvar=True,
-        callback=_admin_client,
-        metavar="URL",
-        help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
-        "http://127.0.0.1:11312.",
-    )(command)
-
-
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
     from rosproxy.admin.client import AdminClient, default_url
 
@@ -149,6 +137,17 @@ def _admin_client(context: click.Context, option: click.Parameter, url: str | No
         return AdminClient(url or default_url())
     except ValueError as error:
         raise click.BadParameter(str(error)) from None
+
+
+_admin_option = click.option(
+    "--admin",
+    envvar="ROSPROXY_ADMIN",
+    show_envvar=True,
+    callback=_admin_client,
+    metavar="URL",
+    help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
+    "http://127.0.0.1:11312.",
+)
 
 
 @main.command()

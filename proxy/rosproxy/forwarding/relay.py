@@ -108,14 +108,19 @@ class Relay:
             self.rates = (self.sent - sent) / passed, (self.received - received) / passed
 
     def _start_direction(self, index: int, finished: Finished) -> bool:
-        """Whether the direction could be started; if not, the relay ends."""
+        """Whether the direction could be started; if not, both sides are reset."""
         thread = threading.Thread(
             target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
         )
         try:
             thread.start()
         except RuntimeError as error:
-            self._give_up(error, index, finished)
+            log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
+            self.failed = True
+            if index:  # the one before runs
+                self._pass_reset_on(index)
+            for left in range(index, 2):
+                self._finish(left, finished)
             return False
         return True
 
@@ -130,15 +135,6 @@ class Relay:
             log.debug("relay of %s: %s", self.name, error)
             self._pass_reset_on(index)
         self._finish(index, finished)
-
-    def _give_up(self, error: RuntimeError, index: int, finished: Finished) -> None:
-        """Reset both sides: direction ``index`` can't be started, those before it run."""
-        log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
-        self.failed = True
-        if index:
-            self._pass_reset_on(index)
-        for left in range(index, 2):
-            self._finish(left, finished)
 
     def _count_sent(self, size: int) -> None:
         self.sent += size

@@ -56,6 +56,9 @@ class KernelPlane:
         self.syncer = ForwardSyncer(endpoints, self._table, self._accounts, problems, clock)
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
         self.traffic = Traffic()
+        self._wanted = settings.data_plane in ("auto", "kernel")
+        copies = settings.data_plane == "copy" or not hasattr(os, "splice")
+        self._user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
         """Make the table if that is possible; to be called before any port listens.
@@ -136,15 +139,6 @@ class KernelPlane:
             "sent_rate": round(account.rates[0], 1),
             "received_rate": round(account.rates[1], 1),
         }
-
-    @property
-    def _wanted(self) -> bool:
-        return self._settings.data_plane in ("auto", "kernel")
-
-    @property
-    def _user_plane(self) -> str:
-        copies = self._settings.data_plane == "copy" or not hasattr(os, "splice")
-        return "copy" if copies else "splice"
 
     async def _look(self) -> None:
         seen = await self.syncer.read_kernel()
