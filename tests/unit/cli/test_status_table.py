@@ -137,13 +137,12 @@ def test_problems_stand_at_the_end() -> None:
 def test_names_cannot_reach_the_terminal() -> None:
     evil = "\x1b]0;owned\x07\n\u202e"
     connection = make_connection(**dict.fromkeys(("caller_id", "name", "kind", "peer"), evil))
-    lists = dict.fromkeys(
-        ("nodes", "publishes", "subscribes", "services", "parameters"), [evil] * 2
-    )
-    texts = dict.fromkeys(("state", "advertised_uri", "address"), evil)
+    said: dict[str, Any] = dict.fromkeys(("state", "advertised_uri", "address"), evil)
+    for name in ("nodes", "publishes", "subscribes", "services", "parameters"):
+        said[name] = [evil, evil]
     text = shown(
         make_status(
-            make_node(connections=[connection], **lists, **texts),
+            make_node(connections=[connection], **said),
             problems=[{"age": 1.0, "subject": evil, "text": evil}],
             master={"uri": evil, "error": evil, "up": False},
         ),
