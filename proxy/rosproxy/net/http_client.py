@@ -99,9 +99,10 @@ class HttpClient:
 
     async def _connect(self, where: HostPort) -> ResponseHandler:
         """A new connection; never redirected or led elsewhere than to ``where``."""
-        loop, failure = asyncio.get_running_loop(), OSError(None, "can't be resolved")
         if self._closed:
             raise ConnectionAbortedError("the proxy is stopping")
+        loop = asyncio.get_running_loop()
+        failure = OSError(None, f"host name {where.host} can't be resolved")
         for address in await resolver.resolve(where.host):
             try:
                 sock = await dial(HostPort(address, where.port), CONNECT_TIMEOUT)
@@ -111,8 +112,6 @@ class HttpClient:
             _, handler = await loop.create_connection(lambda: ResponseHandler(loop), sock=sock)
             self.last = address
             return handler
-        if failure.errno is None and not isinstance(failure, TimeoutError):
-            raise OSError(None, f"host name {where.host} can't be resolved")
         raise failure
 
     def _take(self, where: HostPort) -> ResponseHandler | None:
