@@ -6,7 +6,11 @@ in turn may close the port (``leases.server``).
 """
 
 import asyncio
+import contextlib
 import logging
+import resource
+import signal
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
@@ -16,10 +20,10 @@ from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
 from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.leases.leases import RANGE_OPTION, Leases, PortBank
-from rosproxy.net import limits, sockets
-from rosproxy.net.acceptor import Acceptor
+from rosproxy.leases.leases import RANGE_OPTION, Leases
+from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import make_context
@@ -41,6 +45,12 @@ from rosproxy.settings import SettingError, Settings
 
 log = logging.getLogger(__name__)
 
+new_event_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
+with contextlib.suppress(ImportError):
+    from uvloop import new_event_loop
+
+SPARE_FILES = 64
+"""Open files that the proxy needs besides its ports and connections."""
 RETRY_BLOCKED = 30.0
 """Seconds between looks whether ports that other programs held have become free."""
 
@@ -62,9 +72,9 @@ class App:
         self._resubscriber = Resubscriber(context, registrar, updates, self.tcpros, plane)
         self.leases = leases = Leases(
             context.registry,
-            PortBank(settings.bind),
-            plane,
-            self._resubscriber,
+            settings.bind,
+            plane.syncer,
+            self._resubscriber.watch,
             context.tasks,
             context.problems,
         )
@@ -82,30 +92,38 @@ class App:
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
-        self._check_bind()
+        settings, context = self.settings, self.context
+        with _binding("--bind", settings.bind):
+            sockets.bind(settings.bind, 0).close()
         self._reserve_range()
         await self.plane.start()
-        settings = self.settings
-        master = MasterApi(self.context, self._admission, self.alias, self._recovery, self._adopter)
+        master = MasterApi(context, self._admission, self.alias, self._recovery, self._adopter)
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
-            published = PublishedMaster(self.context, str(where))
+            published = PublishedMaster(context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
-        self.context.metrics.registry.register(
-            StateCollector(
-                self.context.registry, self.tcpros, self.alias, self.master_monitor, self.plane
-            )
+        state = StateCollector(
+            context.registry, self.tcpros, self.alias, self.master_monitor, self.plane
         )
-        await self._start_admin()
-        repeat = self.context.tasks.repeat
+        context.metrics.registry.register(state)
+        with _binding("--admin-bind", settings.admin):
+            await self._admin.start(settings.admin)
+        repeat = context.tasks.repeat
         repeat(self.master_monitor.look, settings.master_interval, "watching the master")
         repeat(self.prober.look, PROBE_TICK, "looking after nodes")
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
         repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
-        self._log_start()
+        log.info(
+            "ready: nodes use http://<this host>:%d as ROS_MASTER_URI; master %s; outside sees "
+            "%s:%s",
+            settings.master_port,
+            settings.master_uri,
+            settings.advertise_host,
+            settings.ports.advertise,
+        )
 
     async def stop(self) -> None:
         """End everything; registrations stay at the master, for the next start to find."""
@@ -122,9 +140,8 @@ class App:
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        return to_json(
-            describe(self.context, self.master_monitor, self.tcpros, self.alias, self.plane)
-        )
+        monitor = self.master_monitor
+        return to_json(describe(self.context, monitor, self.tcpros, self.alias, self.plane))
 
     def _make_admin(self, nodes: NodeClient) -> AdminServer:
         containers = ContainerEvents(
@@ -143,13 +160,8 @@ class App:
             "/master-address": self._set_master_address,
             "/retire": containers.retire,
         }
-        return AdminServer(
-            self.context.metrics.registry,
-            self.status,
-            self._unready,
-            actions,
-            self.settings.admin_token,
-        )
+        metrics, token = self.context.metrics.registry, self.settings.admin_token
+        return AdminServer(metrics, self.status, self._unready, actions, token)
 
     def _unready(self) -> str | None:
         if self.context.retired:
@@ -170,16 +182,10 @@ class App:
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
 
-    def _check_bind(self) -> None:
-        try:
-            sockets.bind(self.settings.bind, 0).close()
-        except OSError as error:
-            text = f"{self.settings.bind} can't be bound: {error.strerror}"
-            raise SettingError("--bind", text) from None
-
     def _reserve_range(self) -> None:
         ports = self.settings.ports.listen
-        if not limits.files_for(len(ports)):
+        files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        if files != resource.RLIM_INFINITY and files < len(ports) + SPARE_FILES:
             text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
             raise SettingError(RANGE_OPTION, text)
         taken = self.leases.reserve_range()
@@ -191,42 +197,47 @@ class App:
             self.context.problems.add(RANGE_OPTION, text)
 
     def _listen(self, option: str, port: int, service: XmlRpcService, what: str) -> None:
-        try:
+        with _binding(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
-        except OSError as error:
-            raise SettingError(option, f"port {port} can't be bound: {error.strerror}") from None
         server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
         self._servers.append(server)
         self._acceptors.append(
             Acceptor(self.context.tasks, sock, lambda conn, peer: dispatch(conn, server))
         )
 
-    async def _start_admin(self) -> None:
-        try:
-            await self._admin.start(self.settings.admin)
-        except OSError as error:
-            raise SettingError(
-                "--admin-bind", f"{self.settings.admin} can't be bound: {error.strerror}"
-            ) from None
 
-    def _log_start(self) -> None:
-        settings = self.settings
-        log.info(
-            "ready: nodes use http://<this host>:%d as ROS_MASTER_URI; master %s; outside sees "
-            "%s:%s",
-            settings.master_port,
-            settings.master_uri,
-            settings.advertise_host,
-            settings.ports.advertise,
-        )
+@contextlib.contextmanager
+def _binding(option: str, what: object) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise SettingError(option, f"{what} can't be bound: {error.strerror}") from None
 
 
-async def serve(settings: Settings, stopped: asyncio.Event) -> None:
-    """Run a proxy until ``stopped`` is set. Raises SettingError if a port is taken."""
-    limits.raise_file_limit()
+def run(settings: Settings) -> None:
+    """Run a proxy until a signal ends it. Raises SettingError if a port is taken."""
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        runner.run(_run_until_signal(settings))
+
+
+async def _run_until_signal(settings: Settings) -> None:
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    _raise_file_limit()
     app = App(settings)
     try:
         await app.start()
         await stopped.wait()
     finally:
         await app.stop()
+
+
+def _raise_file_limit() -> None:
+    """Have as many open files as the system lets this process have at most (``ulimit -Hn``).
+
+    Each relayed connection takes up to six: two sockets and two pipes.
+    """
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -12,13 +12,8 @@ from ipaddress import ip_address, ip_network
 from typing import Any, Literal, TypeVar
 
 from rosproxy.leases.ports import PortMap, PortRange
-from rosproxy.net.addresses import (
-    HostPort,
-    Network,
-    parse_address,
-    parse_authority,
-    parse_host_port,
-)
+from rosproxy.net import addresses
+from rosproxy.net.addresses import HostPort, Network, parse_host_port
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
@@ -130,7 +125,7 @@ def read_host(text: str) -> str:
 
 def read_address(text: str) -> str | None:
     """An IP address in its plain form; None for no text. Raises ValueError."""
-    address = parse_address(text)
+    address = addresses.parse_address(text)
     if text and address is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not an IP address such as 192.0.2.7")
     return address
@@ -164,7 +159,7 @@ def read_network(text: str) -> Network:
 
 def read_master_uri(text: str) -> str:
     """The URI of a ROS master. Raises ValueError."""
-    if not text.startswith("http://") or parse_authority(text) is None:
+    if not text.startswith("http://") or addresses.parse_authority(text) is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not of the form http://host:11311")
     return text
 

@@ -25,15 +25,13 @@ class FakeTools(Tools):
         self.forgotten: list[tuple[str, bool, str]] = []
 
     async def nft(self, *words: str, document: str = "") -> str:
-        """What ``nft -j`` prints."""
+        """What nft prints."""
         self._maybe_fail()
-        if words[0] == "list":
+        if "list" in words:
             return self._listed()
         self.documents.append(document)
-        for command in json.loads(document)["nftables"]:
-            for verb, rest in command.items():
-                for kind, body in rest.items():
-                    self._apply(verb, kind, body)
+        for line in document.splitlines():
+            self._apply(line.split(maxsplit=5))
         return ""
 
     async def list_flows(self, mark: str, ipv6: bool) -> str:
@@ -59,21 +57,20 @@ class FakeTools(Tools):
             self.failing -= 1
             raise ToolError("nft: Operation not permitted")
 
-    def _apply(self, verb: str, kind: str, body: Any) -> None:
-        if kind == "table":
-            self.name = body["name"]
-            self.table = None if verb == "delete" else self.table or {}
-        elif self.table is None:
-            raise ToolError("nft: No such file or directory")
-        elif kind in ("map", "set"):
-            self.table[body["name"]] = []
-        elif kind == "element":
-            held = self.table[body["name"]]
-            for item in body["elem"]:
-                if verb == "delete":
-                    held.remove(item)
-                elif item not in held:
-                    held.append(item)
+    def _apply(self, words: list[str]) -> None:
+        match words:
+            case ["table", _, name, "{"]:
+                self.name, self.table = name, {}
+            case ["delete", "table", *_]:
+                self.table = None
+            case ["map" | "set", name, *_] if self.table is not None:
+                self.table[name] = []
+            case ["add" | "delete" as verb, "element", _, _, name, elements]:
+                if self.table is None:
+                    raise ToolError("nft: No such file or directory")
+                these = [*map(_element, elements.strip("{ }").split(", "))]
+                left = [item for item in self.table[name] if item not in these]
+                self.table[name] = left + these * (verb == "add")
 
     def _listed(self) -> str:
         if self.table is None:
@@ -84,6 +81,14 @@ class FakeTools(Tools):
             elements = held if kind == "map" else [_counter(mark) for mark in held]
             objects.append({kind: {"name": name, "table": self.name, "elem": elements}})
         return json.dumps({"nftables": objects})
+
+
+def _element(text: str) -> Any:
+    """An element as nft prints it: a mark, or a pair."""
+    key, _, value = text.partition(" : ")
+    if not value:
+        return int(key)
+    return [int(key), int(value) if value.isdigit() else value]
 
 
 def _counter(mark: int) -> Any:

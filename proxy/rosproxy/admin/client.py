@@ -66,7 +66,12 @@ class AdminClient:
             reply = connection.getresponse()
             text = reply.read(MAX_REPLY).decode("utf-8", "replace")
         except (OSError, http.client.HTTPException) as error:
-            raise self._no_answer(error) from None
+            why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise AdminError(
+                f"no rosproxy answers at {self.url} ({why.lower()}). Run this where the proxy runs "
+                "(docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
+                "http://HOST:PORT or ROSPROXY_ADMIN"
+            ) from None
         finally:
             connection.close()
         if reply.status != 200:
@@ -81,14 +86,6 @@ class AdminClient:
         if not isinstance(found, dict) or key not in found:
             raise AdminError(f"what answers at {self.url} is not the admin endpoint of a rosproxy")
         return found
-
-    def _no_answer(self, error: Exception) -> AdminError:
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        return AdminError(
-            f"no rosproxy answers at {self.url} ({reason.lower()}). Run this where the proxy runs "
-            "(docker exec CONTAINER rosproxy ...), or name its admin endpoint: --admin "
-            "http://HOST:PORT or ROSPROXY_ADMIN"
-        )
 
 
 def _authorization() -> dict[str, str]:

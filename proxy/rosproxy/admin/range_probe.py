@@ -15,8 +15,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from rosproxy.admin.requests import PortProbe, RangeProbe
-from rosproxy.leases.leases import Leases, PortBank
-from rosproxy.net.acceptor import Acceptor
+from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
@@ -35,13 +34,8 @@ MAX_REQUEST = 65536
 
 @dataclass(slots=True, eq=False)
 class _Trial:
-    """One port under test.
+    """A port under test: the secrets by which its two callers are told from strangers."""
 
-    ``mine`` and ``masters`` are the secrets by which the two callers are told from strangers.
-    """
-
-    port: int
-    where: HostPort
     mine: str = field(default_factory=lambda: secrets.token_hex(16))
     masters: str = field(default_factory=lambda: secrets.token_hex(16))
     reached: asyncio.Event = field(default_factory=asyncio.Event)
@@ -56,7 +50,9 @@ class _Trial:
                     break
                 seen += part
             if self._known(seen):
-                await loop.sock_sendall(conn, _reply(self.mine))
+                body = xmlrpc.dump_reply([1, self.mine, 0])
+                head = "HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length:"
+                await loop.sock_sendall(conn, f"{head} {len(body)}\r\n\r\n".encode() + body)
         conn.close()
 
     def _known(self, seen: bytes) -> bool:
@@ -74,35 +70,28 @@ async def probe_range(context: Context, leases: Leases[Endpoint]) -> RangeProbe:
     pool, ports = context.registry.pool, context.settings.ports.listen.ports()
     probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
-        async with leases.lent(order) as port:
+        trial = _Trial()
+        async with leases.lent(order, trial.greet) as port:
             if port is None:
                 break
-            probes.append(
-                await _try(context, leases.bank, _Trial(port, context.addressing.outside(port)))
+            where = context.addressing.outside(port)
+            mine, masters = await asyncio.gather(
+                _dial(context, trial, where), _ask_master(context, trial, where)
             )
+        probes.append(PortProbe(port, str(where), mine, masters))
         if probes[0].from_master == "missed" or pool.free == 1:
             break
     return RangeProbe(tuple(probes))
 
 
-async def _try(context: Context, bank: PortBank, trial: _Trial) -> PortProbe:
-    acceptor = Acceptor(context.tasks, bank.open(trial.port), trial.greet)
-    try:
-        mine, masters = await asyncio.gather(_dial(context, trial), _ask_master(context, trial))
-    finally:
-        acceptor.stop()
-        bank.close(trial.port, acceptor.sock)
-    return PortProbe(trial.port, str(trial.where), mine, masters)
-
-
-async def _dial(context: Context, trial: _Trial) -> str:
+async def _dial(context: Context, trial: _Trial, where: HostPort) -> str:
     """Connect through the advertised address and see who answers."""
-    addresses = await resolve(context.upstream.reach(trial.where).host)
+    addresses = await resolve(context.upstream.reach(where).host)
     if not addresses:
         return "unresolvable"
     try:
         async with asyncio.timeout(TIMEOUT):
-            reader, writer = await asyncio.open_connection(addresses[0], trial.where.port)
+            reader, writer = await asyncio.open_connection(addresses[0], where.port)
     except TimeoutError:
         return "silent"
     except ConnectionRefusedError:
@@ -124,7 +113,7 @@ async def _greeted(
     except TimeoutError:
         return "stranger"
     except OSError as error:
-        log.debug("%s ended the connection: %s", trial.where, error)
+        log.debug("the port under test ended the connection: %s", error)
     finally:
         writer.close()
     if trial.mine.encode() in answer:
@@ -132,24 +121,23 @@ async def _greeted(
     return "stranger" if answer else "closed"
 
 
-async def _ask_master(context: Context, trial: _Trial) -> str:
+async def _ask_master(context: Context, trial: _Trial, where: HostPort) -> str:
     """Have the master call the port, as it calls a node whose parameter has changed."""
     try:
-        async with _subscribed(context, trial):
-            async with asyncio.timeout(MASTER_WAIT):
-                await trial.reached.wait()
+        async with _subscribed(context, trial, where), asyncio.timeout(MASTER_WAIT):
+            await trial.reached.wait()
     except TimeoutError:
         return "missed"
     except Unreachable as error:
-        log.debug("the master can't try port %d: %s", trial.port, error)
+        log.debug("the master can't try %s: %s", where, error)
         return "unknown"
     return "ok"
 
 
 @asynccontextmanager
-async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
+async def _subscribed(context: Context, trial: _Trial, where: HostPort) -> AsyncIterator[None]:
     """A parameter with the port under test as its subscriber, for as long as it takes."""
-    name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(trial.where)
+    name, uri = f"{CALLER_ID}_probe_{trial.masters}", slave_uri(where)
     multicall = context.upstream.multicall
     try:
         done = await multicall(
@@ -162,9 +150,3 @@ async def _subscribed(context: Context, trial: _Trial) -> AsyncIterator[None]:
         await multicall(
             [("unsubscribeParam", [name, uri, name]), ("deleteParam", [CALLER_ID, name])]
         )
-
-
-def _reply(secret: str) -> bytes:
-    body = xmlrpc.dump_reply([1, secret, 0])
-    head = f"HTTP/1.0 200 OK\r\nContent-Type: text/xml\r\nContent-Length: {len(body)}\r\n\r\n"
-    return head.encode() + body

@@ -59,16 +59,21 @@ class AdminServer:
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
         app = web.Application(client_max_size=MAX_BODY)
-        app.add_routes(
-            [
-                web.get("/", self._get_index),
-                web.get("/healthz", self._get_health),
-                web.get("/readyz", self._get_readiness),
-                web.get("/metrics", self._get_metrics),
-                web.get("/status", self._get_status),
-                *(web.post(path, self._post) for path in self._actions),
-            ]
-        )
+        answers: dict[str, Callable[[], web.Response]] = {
+            "/": lambda: web.Response(text=INDEX),
+            "/healthz": lambda: web.Response(text="ok\n"),
+            "/readyz": self._readiness,
+            "/metrics": lambda: web.Response(
+                body=generate_latest(self._metrics), headers={"Content-Type": CONTENT_TYPE_LATEST}
+            ),
+            "/status": lambda: web.json_response(self._status()),
+        }
+
+        async def get(request: web.Request) -> web.Response:
+            return answers[request.path]()
+
+        app.add_routes([web.get(path, get) for path in answers])
+        app.add_routes([web.post(path, self._post) for path in self._actions])
         self._runner = web.AppRunner(app, access_log=None)
         await self._runner.setup()
         await web.TCPSite(self._runner, where.host, where.port).start()
@@ -78,29 +83,16 @@ class AdminServer:
         if self._runner is not None:
             await self._runner.cleanup()
 
-    async def _get_index(self, request: web.Request) -> web.Response:
-        return web.Response(text=INDEX)
-
-    async def _get_health(self, request: web.Request) -> web.Response:
-        return web.Response(text="ok\n")
-
-    async def _get_readiness(self, request: web.Request) -> web.Response:
+    def _readiness(self) -> web.Response:
         reason = self._unready()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
-
-    async def _get_metrics(self, request: web.Request) -> web.Response:
-        body = generate_latest(self._metrics)
-        return web.Response(body=body, headers={"Content-Type": CONTENT_TYPE_LATEST})
-
-    async def _get_status(self, request: web.Request) -> web.Response:
-        return web.json_response(self._status())
 
     async def _post(self, request: web.Request) -> web.Response:
         if not self._may_post(request):
             hint = "" if self._token else "; this proxy has none"
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
-            body = _parse_json(await request.read())
+            body = _read_json(await request.read())
             async with self._locks[request.path]:
                 return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
@@ -121,7 +113,7 @@ class AdminServer:
         return is_loopback(request.remote or "") and "Origin" not in request.headers
 
 
-def _parse_json(body: bytes) -> Any:
+def _read_json(body: bytes) -> Any:
     """A body as JSON; an empty object if there is none. Raises BodyError."""
     try:
         return json.loads(body) if body.strip() else {}

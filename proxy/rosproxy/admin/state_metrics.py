@@ -30,61 +30,50 @@ class StateCollector(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """All state metrics."""
-        pool = self._registry.pool
-        left, fast = fast_ports.left(pool, self._registry), fast_ports.held(self._registry)
-        yield _gauge("leases_used", "Ports held by inside nodes.", len(self._registry))
-        yield _gauge("leases_free", "Ports left for inside nodes.", left)
-        yield _gauge("fast_ports", "Of the ports left, those that serve topics meanwhile.", fast)
-        yield _gauge("leases_blocked", "Ports of the range held by other programs.", pool.blocked)
-        yield _gauge("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays))
-        yield _gauge(
-            "alias_ports",
-            "Ports that stand in for nodes on the master's host.",
-            len(self._alias),
+        endpoints, pool = self._registry, self._registry.pool
+        forwarded = sum(endpoint.fast_connections for endpoint in endpoints)
+        for name, text, value in (
+            ("leases_used", "Ports held by inside nodes.", len(endpoints)),
+            ("leases_free", "Ports left for inside nodes.", fast_ports.left(pool, endpoints)),
+            (
+                "fast_ports",
+                "Of the ports left, those that serve topics meanwhile.",
+                fast_ports.held(endpoints),
+            ),
+            ("leases_blocked", "Ports of the range held by other programs.", pool.blocked),
+            ("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)),
+            (
+                "alias_ports",
+                "Ports that stand in for nodes on the master's host.",
+                len(self._alias),
+            ),
+            ("master_up", "Whether the master answers.", bool(self._monitor.up)),
+            ("kernel_plane", "Whether the kernel forwards topics.", self._plane.syncer.usable),
+            ("kernel_connections", "TCPROS connections that the kernel forwards.", forwarded),
+        ):
+            yield GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
+        states = [endpoint.state for endpoint in endpoints]
+        by_state = GaugeMetricFamily(
+            "rosproxy_endpoints", "Inside nodes by state.", labels=["state"]
         )
-        yield _gauge("master_up", "Whether the master answers.", int(bool(self._monitor.up)))
-        yield self._endpoints()
-        yield self._bytes()
-        yield from self._forwarded()
-
-    def _endpoints(self) -> Metric:
-        family = GaugeMetricFamily("rosproxy_endpoints", "Inside nodes by state.", labels=["state"])
-        states = [endpoint.state for endpoint in self._registry]
         for state in STATES:
-            family.add_metric([state], states.count(state))
-        return family
+            by_state.add_metric([state], states.count(state))
+        yield by_state
+        yield from self._bytes()
 
-    def _bytes(self) -> Metric:
-        family = CounterMetricFamily(
+    def _bytes(self) -> Iterable[Metric]:
+        relayed = CounterMetricFamily(
             "rosproxy_relayed_bytes",
             "Bytes relayed by topic or service and direction.",
             labels=["kind", "name", "direction"],
         )
-        totals = self._tcpros.traffic()
-        for direction, sums in (("outward", totals.sent), ("inward", totals.received)):
-            for (kind, name), size in sums.items():
-                family.add_metric([kind, name, direction], size)
-        return family
-
-    def _forwarded(self) -> Iterable[Metric]:
-        tally = self._plane.tally()
-        yield _gauge("kernel_plane", "Whether the kernel forwards topics.", int(tally.usable))
-        yield _gauge(
-            "kernel_connections", "TCPROS connections that the kernel forwards.", tally.connections
-        )
-        family = CounterMetricFamily(
+        for labels, size in self._tcpros.traffic().totals():
+            relayed.add_metric(labels, size)
+        forwarded = CounterMetricFamily(
             "rosproxy_kernel_bytes",
             "Bytes of IP packets, headers included, that the kernel forwarded, by node.",
             labels=["node", "direction"],
         )
-        for direction, sums in (
-            ("outward", tally.traffic.sent),
-            ("inward", tally.traffic.received),
-        ):
-            for (_, name), size in sums.items():
-                family.add_metric([name, direction], size)
-        yield family
-
-
-def _gauge(name: str, text: str, value: float) -> Metric:
-    return GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
+        for labels, size in self._plane.traffic.totals():
+            forwarded.add_metric(labels[1:], size)
+        return relayed, forwarded

@@ -6,18 +6,7 @@ import time
 import msgspec
 
 from rosproxy import __version__
-from rosproxy.admin.status_document import (
-    AliasPortStatus,
-    ConnectionStatus,
-    DataPlaneStatus,
-    EndpointStatus,
-    MasterStatus,
-    NodePlaneStatus,
-    PortsStatus,
-    ProblemStatus,
-    ProxyStatus,
-    StatusSettings,
-)
+from rosproxy.admin import status_document as document
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
@@ -30,18 +19,14 @@ from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
 
 def describe(
-    context: Context,
-    monitor: MasterMonitor,
-    tcpros: TcprosServer,
-    alias: Alias,
-    plane: KernelPlane,
-) -> ProxyStatus:
+    context: Context, monitor: MasterMonitor, tcpros: TcprosServer, alias: Alias, plane: KernelPlane
+) -> document.ProxyStatus:
     """Everything that ``rosproxy status`` and ``rosproxy doctor`` show."""
     relays: dict[int, list[Relay]] = {}
     for relay in tcpros.relays:
         relays.setdefault(relay.port, []).append(relay)
     endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
-    return ProxyStatus(
+    return document.ProxyStatus(
         version=__version__,
         pid=os.getpid(),
         instance=context.instance,
@@ -50,19 +35,19 @@ def describe(
         settings=_settings(context),
         master=_master(context, monitor),
         ports=_ports(context),
-        data_plane=msgspec.convert(plane.status(), DataPlaneStatus),
-        alias_ports=msgspec.convert(alias.status(), tuple[AliasPortStatus, ...]),
+        data_plane=msgspec.convert(plane.status(), document.DataPlaneStatus),
+        alias_ports=msgspec.convert(alias.status(), tuple[document.AliasPortStatus, ...]),
         nodes=tuple(_node(context, e, relays.get(e.port, []), plane) for e in endpoints),
         problems=tuple(
-            ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
+            document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
             for p in context.problems.all()
         ),
     )
 
 
-def _settings(context: Context) -> StatusSettings:
+def _settings(context: Context) -> document.StatusSettings:
     settings = context.settings
-    return StatusSettings(
+    return document.StatusSettings(
         master_port=settings.master_port,
         publish_master=settings.publish_master,
         advertise_host=settings.advertise_host,
@@ -73,8 +58,8 @@ def _settings(context: Context) -> StatusSettings:
     )
 
 
-def _master(context: Context, monitor: MasterMonitor) -> MasterStatus:
-    return MasterStatus(
+def _master(context: Context, monitor: MasterMonitor) -> document.MasterStatus:
+    return document.MasterStatus(
         uri=context.settings.master_uri,
         address=context.upstream.reached_at,
         pinned=context.upstream.master_address is not None,
@@ -86,9 +71,9 @@ def _master(context: Context, monitor: MasterMonitor) -> MasterStatus:
     )
 
 
-def _ports(context: Context) -> PortsStatus:
+def _ports(context: Context) -> document.PortsStatus:
     ports, pool = context.settings.ports, context.registry.pool
-    return PortsStatus(
+    return document.PortsStatus(
         listen=str(ports.listen),
         advertise=str(ports.advertise),
         used=len(context.registry),
@@ -99,8 +84,8 @@ def _ports(context: Context) -> PortsStatus:
 
 def _node(
     context: Context, endpoint: Endpoint, relays: list[Relay], plane: KernelPlane
-) -> EndpointStatus:
-    return EndpointStatus(
+) -> document.EndpointStatus:
+    return document.EndpointStatus(
         nodes=tuple(endpoint.caller_ids),
         uri=endpoint.uri,
         address=str(endpoint.slave),
@@ -113,12 +98,12 @@ def _node(
         parameters=tuple(endpoint.names(Kind.PARAM)),
         connections=tuple(map(_connection, relays)),
         problems=tuple(problem.text for problem in context.problems.at(endpoint.port)),
-        data_plane=msgspec.convert(plane.status_of(endpoint), NodePlaneStatus),
+        data_plane=msgspec.convert(plane.status_of(endpoint), document.NodePlaneStatus),
     )
 
 
-def _connection(relay: Relay) -> ConnectionStatus:
-    return ConnectionStatus(
+def _connection(relay: Relay) -> document.ConnectionStatus:
+    return document.ConnectionStatus(
         kind=relay.kind,
         name=relay.name,
         caller_id=relay.caller_id,

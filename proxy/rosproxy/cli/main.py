@@ -10,138 +10,95 @@ from typing import Any
 import click
 
 from rosproxy import __version__
-from rosproxy.cli.options import (
-    ADDRESS,
-    BIND_ADDRESS,
-    GROUP_SETTINGS,
-    HOST,
-    HOST_PORT,
-    MASTER_URI,
-    NETWORK,
-    PORT,
-    PORT_RANGE,
-    TOKEN,
-    Command,
-    Commands,
-    Seconds,
-    log_options,
-    setting_errors,
-)
+from rosproxy.cli import options
+from rosproxy.cli.options import Command
 
 
-@click.group(cls=Commands, context_settings=GROUP_SETTINGS)
+@click.group(cls=options.Commands, context_settings=options.GROUP_SETTINGS)
 @click.version_option(__version__, prog_name="rosproxy")
 def main() -> None:
     """Transparent proxy for ROS 1: nodes behind it and nodes outside talk both ways."""
 
 
-@main.command(
-    context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
-)
+def _time(name: str, least: float, default: float, text: str) -> Callable[..., Command]:
+    return click.option(name, type=options.Seconds(least), default=default, help=text)
+
+
+@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
 @click.option(
     "--master-uri",
-    type=MASTER_URI,
+    type=options.MASTER_URI,
     required=True,
     envvar="ROS_MASTER_URI",
-    metavar="URI",
     help="The real ROS master, e.g. http://robot:11311.",
 )
 @click.option(
     "--master-address",
-    type=ADDRESS,
-    metavar="ADDRESS",
+    type=options.ADDRESS,
     help="IP address of the master's host, to use instead of resolving its name.",
 )
 @click.option(
     "--advertise-host",
-    type=HOST,
+    type=options.HOST,
     required=True,
-    metavar="HOST",
     help="Name or address under which outside nodes and the master reach this host.",
 )
 @click.option(
-    "--master-port", type=PORT, default=11311, help="Where inside nodes find their master."
+    "--master-port", type=options.PORT, default=11311, help="Where inside nodes find their master."
 )
 @click.option(
     "--port-range",
-    type=PORT_RANGE,
+    type=options.PORT_RANGE,
     default="11000-11099",
-    metavar="A-B",
     help="Ports to listen on, one per inside node.",
 )
 @click.option(
     "--advertise-port-range",
-    type=PORT_RANGE,
-    metavar="A-B",
+    type=options.PORT_RANGE,
     help="The same ports as outside sees them, if it differs; as many as in --port-range.",
 )
 @click.option(
     "--publish-master",
-    type=PORT,
-    metavar="PORT",
+    type=options.PORT,
     help="Also offer the master itself to outside on this port (where it runs inside).",
 )
 @click.option(
-    "--bind", type=BIND_ADDRESS, default="0.0.0.0", metavar="ADDRESS", help="Address to listen on."
+    "--bind",
+    type=options.BIND_ADDRESS,
+    default="0.0.0.0",
+    metavar="ADDRESS",
+    help="Address to listen on.",
 )
 @click.option(
     "--admin-bind",
-    type=HOST_PORT,
+    type=options.HOST_PORT,
     default="127.0.0.1:11312",
-    metavar="ADDRESS:PORT",
     help="Where /healthz, /readyz, /metrics and /status are served.",
 )
 @click.option(
     "--admin-token",
-    type=TOKEN,
-    metavar="TOKEN",
+    type=options.TOKEN,
     help="Lets callers that know it change things at --admin-bind, not only those on loopback. "
     "Better given as a variable: command lines can be seen by everybody.",
 )
 @click.option(
     "--inside-network",
-    type=NETWORK,
+    type=options.NETWORK,
     envvar="ROSPROXY_INSIDE_NETWORKS",
     multiple=True,
-    metavar="CIDR",
     help="A network inside which nodes reach each other directly (repeatable). Default: the "
     "networks of the proxy's own interfaces.",
 )
-@click.option(
-    "--probe-interval",
-    type=Seconds(0.05),
-    default=5.0,
-    metavar="S",
-    help="Time between probes of a node.",
-)
-@click.option(
-    "--probe-timeout",
-    type=Seconds(0.05),
-    default=3.0,
-    metavar="S",
-    help="Time that a node has to answer.",
-)
-@click.option(
+@_time("--probe-interval", 0.05, 5.0, "Time between probes of a node.")
+@_time("--probe-timeout", 0.05, 3.0, "Time that a node has to answer.")
+@_time(
     "--cleanup-after",
-    type=Seconds(0),
-    default=30.0,
-    metavar="S",
-    help="Time after which a node that is gone is unregistered at the master (0: never).",
+    0,
+    30.0,
+    "Time after which a node that is gone is unregistered at the master (0: never).",
 )
-@click.option(
-    "--linger",
-    type=Seconds(0),
-    default=30.0,
-    metavar="S",
-    help="Time for which a port is kept after its node has ended.",
-)
-@click.option(
-    "--master-interval",
-    type=Seconds(0.05),
-    default=2.0,
-    metavar="S",
-    help="Time between looks at the master.",
-)
+@_time("--linger", 0, 30.0, "Time for which a port is kept after its node has ended.")
+@_time("--master-interval", 0.05, 2.0, "Time between looks at the master.")
 @click.option(
     "--slave-control",
     type=click.Choice(["any", "master"]),
@@ -154,35 +111,23 @@ def main() -> None:
     default="auto",
     help="How topics' bytes are forwarded: by the kernel, where the proxy may; spliced; or copied.",
 )
-@log_options
+@options.log_options
 @click.option("--check", is_flag=True, help="Validate the options and exit.")
-def run(check: bool, log_format: str, log_level: str, **options: Any) -> None:
+def run(check: bool, log_format: str, log_level: str, **values: Any) -> None:
     """Run the proxy.
 
     Every option has an environment variable: ROSPROXY_ and its name (ROSPROXY_PORT_RANGE); the
     master's is ROS_MASTER_URI, the inside networks' ROSPROXY_INSIDE_NETWORKS.
     """
-    from rosproxy.cli.run import run as run_proxy
+    from rosproxy import app
     from rosproxy.settings import make_settings
     from rosproxy.telemetry import logs
 
-    with setting_errors():
-        settings = make_settings(**options)
+    with options.setting_errors():
+        settings = make_settings(**values)
         logs.set_up(log_format, log_level)
         if not check:
-            run_proxy(settings)
-
-
-def _admin_option(command: Command) -> Command:
-    return click.option(
-        "--admin",
-        envvar="ROSPROXY_ADMIN",
-        show_envvar=True,
-        callback=_admin_client,
-        metavar="URL",
-        help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
-        "http://127.0.0.1:11312.",
-    )(command)
+            app.run(settings)
 
 
 def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
@@ -192,6 +137,17 @@ def _admin_client(context: click.Context, option: click.Parameter, url: str | No
         return AdminClient(url or default_url())
     except ValueError as error:
         raise click.BadParameter(str(error)) from None
+
+
+_admin_option = click.option(
+    "--admin",
+    envvar="ROSPROXY_ADMIN",
+    show_envvar=True,
+    callback=_admin_client,
+    metavar="URL",
+    help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
+    "http://127.0.0.1:11312.",
+)
 
 
 @main.command()
@@ -222,23 +178,20 @@ def health(admin: Any) -> None:
 @_admin_option
 @click.option(
     "--master-uri",
-    type=MASTER_URI,
+    type=options.MASTER_URI,
     envvar="ROS_MASTER_URI",
-    metavar="URI",
     help="The master to look at if the proxy can't be asked for its own.",
 )
 @click.option(
     "--advertise-host",
-    type=HOST,
+    type=options.HOST,
     envvar="ROSPROXY_ADVERTISE_HOST",
-    metavar="HOST",
     help="The advertised host if the proxy can't be asked for it.",
 )
 @click.option(
     "--master-address",
-    type=ADDRESS,
+    type=options.ADDRESS,
     envvar="ROSPROXY_MASTER_ADDRESS",
-    metavar="ADDRESS",
     help="The IP address of the master's host if the proxy can't be asked for it.",
 )
 @click.option(
@@ -266,19 +219,28 @@ def doctor(
     is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
     something is.
     """
-    from rosproxy.cli.doctor import examine
-    from rosproxy.doctor.collect import DoctorOptions
+    import asyncio
+    import json
+
+    from rosproxy.cli import terminal
+    from rosproxy.doctor import findings, rules
+    from rosproxy.doctor.collect import DoctorOptions, collect
 
     if outside and not master_uri:
         raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
-    options = DoctorOptions(
+    what = DoctorOptions(
         None if outside else admin,
         master_uri or "",
         advertise_host or "",
         tuple(f"/{name.strip('/')}" for name in names),
         master_address,
     )
-    sys.exit(examine(options, as_json))
+    found = rules.diagnose(asyncio.run(collect(what)))
+    if as_json:
+        terminal.write(json.dumps(findings.as_json(found), indent=2))
+    else:
+        terminal.write(findings.render(found, terminal.size()[0]))
+    sys.exit(1 if findings.failed(found) else 0)
 
 
 def _or_exit(ask: Callable[[], object]) -> None:

@@ -19,7 +19,7 @@ GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 10
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type before click 8.4
-    """A kind of value that a pure function reads from text.
+    """A kind of value that a pure function reads from text; help shows its name in capitals.
 
     ``read`` raises ValueError, whose message says what is wrong with the text and gives an example.
     """
@@ -38,6 +38,8 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
 class Seconds(click.FloatRange):
     """A time of at most a day."""
 
+    name = "s"
+
     def __init__(self, least: float) -> None:
         super().__init__(least, 86400)
 
@@ -52,13 +54,14 @@ class Seconds(click.FloatRange):
 
 
 PORT = click.IntRange(1, 65535)
-PORT_RANGE = Parsed("range of ports", settings.read_range)
+PORT.name = "port"
+PORT_RANGE = Parsed("A-B", settings.read_range)
 HOST = Parsed("host", settings.read_host)
-ADDRESS = Parsed("IP address", settings.read_address)
-BIND_ADDRESS = Parsed("IP address of this host", settings.read_bind_address)
-HOST_PORT = Parsed("host:port", settings.read_host_port)
-NETWORK = Parsed("network", settings.read_network)
-MASTER_URI = Parsed("URI of a master", settings.read_master_uri)
+ADDRESS = Parsed("address", settings.read_address)
+BIND_ADDRESS = Parsed("address", settings.read_bind_address)
+HOST_PORT = Parsed("address:port", settings.read_host_port)
+NETWORK = Parsed("CIDR", settings.read_network)
+MASTER_URI = Parsed("URI", settings.read_master_uri)
 TOKEN = Parsed("token", settings.read_token)
 
 

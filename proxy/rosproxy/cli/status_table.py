@@ -7,15 +7,7 @@ nodes say of themselves passes through `clean`.
 
 from collections.abc import Iterator, Sequence
 
-from rosproxy.admin.status_document import (
-    AliasPortStatus,
-    ConnectionStatus,
-    DataPlaneStatus,
-    EndpointStatus,
-    MasterStatus,
-    NodePlaneStatus,
-    ProxyStatus,
-)
+from rosproxy.admin import status_document as document
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import (
     GAP,
@@ -38,7 +30,7 @@ MOST_CONNECTIONS = 8
 INDENT = "    "
 
 
-def render(status: ProxyStatus, columns: int, lines: int | None = None) -> str:
+def render(status: document.ProxyStatus, columns: int, lines: int | None = None) -> str:
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
@@ -51,18 +43,16 @@ def render(status: ProxyStatus, columns: int, lines: int | None = None) -> str:
     return "\n".join(short)
 
 
-def _head(status: ProxyStatus) -> Iterator[str]:
+def _head(status: document.ProxyStatus) -> Iterator[str]:
     settings = status.settings
-    up = duration(status.uptime)
-    yield f"rosproxy {clean(status.version)}, pid {status.pid}, up {up}"
+    yield f"rosproxy {clean(status.version)}, pid {status.pid}, up {duration(status.uptime)}"
     yield f"master   {_master(status.master)}"
     yield f"ports    {_ports(status)}"
     if plane := status.data_plane:
         yield f"topics   {_plane(plane)}"
     networks = listed(map(clean, settings.inside_networks)) or "none"
-    yield (
-        f"inside   ROS_MASTER_URI=http://<this host>:{settings.master_port}, networks {networks}"
-    )
+    inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
+    yield f"inside   {inside}, networks {networks}"
     if ports := status.alias_ports:
         yield f"alias    {_alias_ports(ports)}"
     if settings.publish_master:
@@ -70,7 +60,7 @@ def _head(status: ProxyStatus) -> Iterator[str]:
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
 
 
-def _master(master: MasterStatus) -> str:
+def _master(master: document.MasterStatus) -> str:
     uri, since = clean(master.uri), duration(master.since)
     if master.up:
         trip = f", round trip {master.round_trip * 1000:.1f} ms" if master.round_trip else ""
@@ -80,7 +70,7 @@ def _master(master: MasterStatus) -> str:
     return f"{uri} DOWN for {since}: {clean(master.error).removeprefix(f'master {uri}: ')}"
 
 
-def _ports(status: ProxyStatus) -> str:
+def _ports(status: document.ProxyStatus) -> str:
     ports, host = status.ports, clean(status.settings.advertise_host)
     listen, advertise = clean(ports.listen), clean(ports.advertise)
     mapped = "" if advertise == listen else f", here {listen}"
@@ -88,19 +78,19 @@ def _ports(status: ProxyStatus) -> str:
     return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
 
 
-def _plane(plane: DataPlaneStatus) -> str:
+def _plane(plane: document.DataPlaneStatus) -> str:
     if plane.plane == "kernel":
         return f"forwarded by the kernel (--data-plane {clean(plane.mode)})"
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _alias_ports(ports: Sequence[AliasPortStatus]) -> str:
+def _alias_ports(ports: Sequence[document.AliasPortStatus]) -> str:
     open_ones = plural(sum(port.connections for port in ports), "connection")
     numbers = listed(str(port.port) for port in ports)
     return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
 
 
-def _nodes(status: ProxyStatus, columns: int, details: bool) -> Iterator[str]:
+def _nodes(status: document.ProxyStatus, columns: int, details: bool) -> Iterator[str]:
     nodes = status.nodes
     if not nodes:
         yield "No node has registered through the proxy yet."
@@ -117,13 +107,12 @@ def _nodes(status: ProxyStatus, columns: int, details: bool) -> Iterator[str]:
         if narrow:
             yield from _detail("at", f"{clean(node.address)}, outside {_outside(node)}", columns)
         if details:
-            yield from _details(node, columns)
-            yield from _detail("kernel", _kernel(node, status.data_plane), columns)
+            yield from _details(node, status.data_plane, columns)
 
 
-def _row(node: EndpointStatus) -> tuple[str, ...]:
+def _row(node: document.EndpointStatus) -> tuple[str, ...]:
     names = [clean(name) for name in node.nodes] or ["(unnamed)"]
-    plane = node.data_plane or NodePlaneStatus()
+    plane = node.data_plane or document.NodePlaneStatus()
     connections = [*node.connections, plane]
     count = len(node.connections) + plane.connections
     out, into = (
@@ -142,11 +131,13 @@ def _row(node: EndpointStatus) -> tuple[str, ...]:
     )
 
 
-def _outside(node: EndpointStatus) -> str:
+def _outside(node: document.EndpointStatus) -> str:
     return clean(parse_slave_uri(node.advertised_uri) or node.advertised_uri)
 
 
-def _details(node: EndpointStatus, columns: int) -> Iterator[str]:
+def _details(
+    node: document.EndpointStatus, whole: document.DataPlaneStatus | None, columns: int
+) -> Iterator[str]:
     for word, names in (
         ("also", node.nodes[1:]),
         ("publishes", node.publishes),
@@ -160,9 +151,10 @@ def _details(node: EndpointStatus, columns: int) -> Iterator[str]:
         yield from _detail("connected", _connection(connection), columns)
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
+    yield from _detail("kernel", _kernel(node, whole), columns)
 
 
-def _kernel(node: EndpointStatus, whole: DataPlaneStatus | None) -> str:
+def _kernel(node: document.EndpointStatus, whole: document.DataPlaneStatus | None) -> str:
     """What the kernel forwards for a node; why nothing, where it does for others."""
     plane = node.data_plane
     if plane is None or whole is None or whole.plane != "kernel":
@@ -179,13 +171,13 @@ def _detail(word: str, text: str, columns: int) -> list[str]:
     return wrap(text, columns, " " * len(lead), lead, MOST_LINES)
 
 
-def _connection(connection: ConnectionStatus) -> str:
+def _connection(connection: document.ConnectionStatus) -> str:
     what = f"{clean(connection.kind)} {clean(connection.name)}"
     who = f"{clean(connection.caller_id) or '?'} at {clean(connection.peer)}"
     return f"{what} with {who}: {size(connection.sent)} out, {size(connection.received)} in"
 
 
-def _problems(status: ProxyStatus, columns: int) -> Iterator[str]:
+def _problems(status: document.ProxyStatus, columns: int) -> Iterator[str]:
     """All problems but the master's, which its own line tells."""
     problems = [problem for problem in status.problems if problem.subject != "master"]
     if problems:

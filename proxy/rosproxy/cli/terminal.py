@@ -16,8 +16,6 @@ from contextlib import nullcontext, suppress
 from rich.console import Console
 from rich.highlighter import RegexHighlighter
 from rich.live import Live
-from rich.text import Text
-from rich.theme import Theme
 
 from rosproxy.admin.client import AdminClient, AdminError
 from rosproxy.cli.status_table import render
@@ -28,25 +26,14 @@ WIDTH_WITHOUT_TERMINAL = 120
 
 
 class _Words(RegexHighlighter):
-    """The words of our own that say how things are."""
+    """The words of our own that say how things are; groups are named for their looks."""
 
-    base_style = "rosproxy."
     highlights = (
-        r"(?m)^(?P<heading>(NODE|PROXY|CONTAINER) .*)$",
-        r"(?m)^(?P<good>ok)   ",
-        r"(?m)(?P<bad>^ERROR\b|\bDOWN\b|^problems\b.*$)",
-        r"(?m)^(?P<warning>WARNING)\b",
+        r"(?m)^(?P<bold>(NODE|PROXY|CONTAINER) .*)$",
+        r"(?m)^(?P<green>ok)   ",
+        r"(?m)(?P<bold>(?P<red>^ERROR\b|\bDOWN\b|^problems\b.*$))",
+        r"(?m)^(?P<yellow>WARNING)\b",
     )
-
-
-_THEME = Theme(
-    {
-        "rosproxy.heading": "bold",
-        "rosproxy.good": "green",
-        "rosproxy.bad": "bold red",
-        "rosproxy.warning": "yellow",
-    }
-)
 
 
 def show_status(admin: AdminClient, as_json: bool) -> None:
@@ -75,7 +62,7 @@ def watch(draw: Callable[[int, int | None], str]) -> None:
     live = Live(console=console, screen=True, auto_refresh=False)
     with suppress(KeyboardInterrupt), live if console.is_terminal else nullcontext():
         while True:
-            text = _coloured(draw(*size()))
+            text = draw(*size())
             if console.is_terminal:
                 live.update(text, refresh=True)
             else:
@@ -85,7 +72,7 @@ def watch(draw: Callable[[int, int | None], str]) -> None:
 
 def write(text: str) -> None:
     """Print a text; lines that are too long stay whole."""
-    _console().print(_coloured(text), soft_wrap=True)
+    _console().print(text, soft_wrap=True)
 
 
 def size() -> tuple[int, int | None]:
@@ -94,11 +81,7 @@ def size() -> tuple[int, int | None]:
     return columns, lines if sys.stdout.isatty() and lines > 5 else None
 
 
-def _coloured(text: str) -> Text:
-    return _Words()(Text(text))
-
-
 def _console() -> Console:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    return Console(theme=_THEME, markup=False, highlight=False, emoji=False)
+    return Console(highlighter=_Words(), markup=False, emoji=False)

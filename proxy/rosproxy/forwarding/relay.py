@@ -108,14 +108,19 @@ class Relay:
             self.rates = (self.sent - sent) / passed, (self.received - received) / passed
 
     def _start_direction(self, index: int, finished: Finished) -> bool:
-        """Whether the direction could be started; if not, the relay ends."""
+        """Whether the direction could be started; if not, both sides are reset."""
         thread = threading.Thread(
             target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
         )
         try:
             thread.start()
         except RuntimeError as error:
-            self._give_up(error, index, finished)
+            log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
+            self.failed = True
+            if index:  # the one before runs
+                self._pass_reset_on(index)
+            for left in range(index, 2):
+                self._finish(left, finished)
             return False
         return True
 
@@ -124,30 +129,18 @@ class Relay:
         count = self._count_sent if index == 0 else self._count_received
         try:
             _Pump(*pair, count, self.splice).run()
-            self._pass_end_on(pair[1])
+            if not self.failed:
+                pair[1].shutdown(socket.SHUT_WR)
         except OSError as error:
             log.debug("relay of %s: %s", self.name, error)
             self._pass_reset_on(index)
         self._finish(index, finished)
-
-    def _give_up(self, error: RuntimeError, index: int, finished: Finished) -> None:
-        """Reset both sides: direction ``index`` can't be started, those before it run."""
-        log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
-        self.failed = True
-        if index:
-            self._pass_reset_on(index)
-        for left in range(index, 2):
-            self._finish(left, finished)
 
     def _count_sent(self, size: int) -> None:
         self.sent += size
 
     def _count_received(self, size: int) -> None:
         self.received += size
-
-    def _pass_end_on(self, target: socket.socket) -> None:
-        if not self.failed:
-            target.shutdown(socket.SHUT_WR)
 
     def _pass_reset_on(self, index: int) -> None:
         """Wake the other direction without a FIN on the wire, so that closing sends a reset."""
@@ -160,20 +153,17 @@ class Relay:
                 return
 
     def _finish(self, index: int, finished: Finished) -> None:
+        """Note that a direction has ended; the first thread to see both ended closes."""
         self._done[index].set()
-        if not self._done[1 - index].is_set() or not self._claim_end():
-            return
+        with _END:
+            if self._ended or not self._done[1 - index].is_set():
+                return
+            self._ended = True
         for sock in (self.outside, self.inside):
             if self.failed:
                 reset_on_close(sock)
             sock.close()
         finished(self)
-
-    def _claim_end(self) -> bool:
-        """Whether this thread is the one to close: the first to ask."""
-        with _END:
-            first, self._ended = not self._ended, True
-        return first
 
 
 _END = threading.Lock()
@@ -292,7 +282,8 @@ class _Crowd:
         with self._lock:
             self._pumps.add(pump)
             size = len(self._pumps)
-            sharing = self._sharing(pump)
+            # All have to share when the crowd comes about, then each new one.
+            sharing = list(self._pumps) if size == CROWD + 1 else [pump] * (size > CROWD)
         try:
             for one in sharing:
                 one.share_memory()
@@ -300,12 +291,6 @@ class _Crowd:
         finally:
             with self._lock:
                 self._pumps.discard(pump)
-
-    def _sharing(self, new: _Pump) -> list[_Pump]:
-        """Who has to share from now on: all when the crowd comes about, then each new one."""
-        if len(self._pumps) <= CROWD:
-            return []
-        return list(self._pumps) if len(self._pumps) == CROWD + 1 else [new]
 
 
 _CROWD = _Crowd()

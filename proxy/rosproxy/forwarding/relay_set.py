@@ -41,10 +41,14 @@ class OpenRelays:
             self._quiet = _Quiet(loop)
         self._open.add(relay)
         self._none.clear()
-        relay.start(
-            lambda done: _call_in(loop, lambda: self._finish(done, ended)),
-            self._quiet.when_readable,
-        )
+
+        def finished(done: Relay) -> None:
+            try:
+                loop.call_soon_threadsafe(self._finish, done, ended)
+            except RuntimeError:
+                log.debug("the event loop has ended before a relay")
+
+        relay.start(finished, self._quiet.when_readable)
 
     async def stop(self) -> None:
         """End all of them."""
@@ -64,14 +68,6 @@ class OpenRelays:
         ended(relay)
 
 
-def _call_in(loop: asyncio.AbstractEventLoop, function: Callable[[], None]) -> None:
-    """Run a function in the loop from a thread; not at all if the loop has ended."""
-    try:
-        loop.call_soon_threadsafe(function)
-    except RuntimeError:
-        log.debug("the event loop has ended before a relay")
-
-
 class _Quiet:
     """Sockets that have nothing to say yet.
 
@@ -81,21 +77,16 @@ class _Quiet:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._selector = loop, selectors.DefaultSelector()
-        loop.add_reader(self._number(), self._look)
+        loop.add_reader(self._selector.fileno(), self._look)
 
     def when_readable(self, sock: socket.socket, function: Callable[[], object]) -> None:
-        """Call a function in the loop, once, when a socket has bytes, has ended or has failed."""
         self._selector.register(sock, selectors.EVENT_READ, function)
 
     def close(self) -> None:
-        """Forget all of them."""
-        self._loop.remove_reader(self._number())
+        self._loop.remove_reader(self._selector.fileno())
         self._selector.close()
 
     def _look(self) -> None:
         for key, _ in self._selector.select(0)[:STARTS_PER_TURN]:
             self._selector.unregister(key.fileobj)
             key.data()
-
-    def _number(self) -> int:
-        return self._selector.fileno()

@@ -5,16 +5,18 @@ memory gives every recovered endpoint the port that its subscribers are connecte
 is only an acceleration: it is given back before a node is refused a lease.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Protocol, TypeVar
 
 from rosproxy.leases.ports import PortPool, PortRange
 
 
 class Holder(Protocol):
-    """An endpoint as its ports need it."""
+    """An endpoint as its ports and the kernel plane need it; `rosproxy.ros1.registry` has them."""
 
     fast_port: int | None
+    fast_peers: Mapping[str, int]
+    """How many connections the kernel forwards now, by the peer's address."""
 
     @property
     def port(self) -> int:
@@ -28,8 +30,44 @@ class Holder(Protocol):
     def label(self) -> str:
         """How messages name it."""
 
+    @property
+    def address(self) -> str:
+        """The IP address at which the proxy reaches the node."""
+
+    @property
+    def tcpros_ports(self) -> Collection[int]:
+        """The TCPROS ports that the node itself has named."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the node has been heard since the proxy started."""
+
+    @property
+    def is_down(self) -> bool:
+        """Whether the node is known not to answer."""
+
+    @property
+    def caller_ids(self) -> list[str]:
+        """The names of the nodes there; one, as a rule."""
+
 
 _H = TypeVar("_H", bound=Holder)
+_H_co = TypeVar("_H_co", bound=Holder, covariant=True)
+
+
+class Holders(Protocol[_H_co]):
+    """All endpoints, and the range that their ports are of."""
+
+    @property
+    def pool(self) -> PortPool:
+        """The ports of the range."""
+
+    @property
+    def by_port(self) -> Mapping[int, _H_co]:
+        """The endpoints by their leases."""
+
+    def __iter__(self) -> Iterator[_H_co]:
+        """All endpoints; safe against changes while iterating."""
 
 
 def partner(ports: PortRange, port: int) -> int | None:

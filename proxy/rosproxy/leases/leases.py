@@ -10,15 +10,13 @@ What an endpoint is, who serves it and how the kernel forwards is left to the pr
 
 import logging
 import socket
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from typing import Generic, Protocol, TypeVar
 
 from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import Holder
-from rosproxy.leases.ports import PortPool
-from rosproxy.net.acceptor import Acceptor
-from rosproxy.net.sockets import BACKLOG, bind
+from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.net.sockets import BACKLOG, Acceptor, Handler, bind
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.problems import Problems
 
@@ -29,19 +27,8 @@ _H = TypeVar("_H", bound=Holder)
 _H_contra = TypeVar("_H_contra", bound=Holder, contravariant=True)
 
 
-class Holders(Protocol[_H]):
-    """All endpoints, and the range that their ports are of."""
-
-    @property
-    def pool(self) -> PortPool:
-        """The ports of the range."""
-
-    @property
-    def by_port(self) -> Mapping[int, _H]:
-        """The endpoints by their leases."""
-
-    def __iter__(self) -> Iterator[_H]:
-        """All endpoints; safe against changes while iterating."""
+class LeaseBook(Holders[_H], Protocol[_H]):
+    """All endpoints, to be kept in step with what listens."""
 
     def remove(self, endpoint: _H, /) -> None:
         """Forget an endpoint and give its lease back."""
@@ -60,99 +47,52 @@ class HolderServer(Protocol[_H_contra]):
         """Let what is kept open through a port end: it refuses from now on."""
 
 
-class KernelPorts(Protocol[_H_contra]):
-    """What the kernel forwards; see `rosproxy.forwarding.kernel`."""
+class KernelPorts(Protocol):
+    """What the kernel forwards; see `rosproxy.forwarding.kernel.syncer`."""
 
-    def note_change(self, endpoint: _H_contra, /) -> None:
+    def note_change(self, endpoint: Holder, /) -> None:
         """Note that an endpoint's ports or its node have changed."""
 
-    def may_forward(self, endpoint: _H_contra, /) -> bool:
+    def may_forward(self, endpoint: Holder, /) -> bool:
         """Whether an endpoint's topics could be forwarded if it had a fast port."""
 
-    async def forwards(self, endpoint: _H_contra, tcpros_port: int, /) -> bool:
+    async def forwards(self, endpoint: Holder, tcpros_port: int, /) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port; waits a moment."""
 
     async def cleared(self, port: int, /) -> None:
         """Wait a moment until a port is not forwarded any more."""
 
-    def log_reason(self, endpoint: _H_contra, /) -> None:
+    def log_reason(self, endpoint: Holder, /) -> None:
         """Log why an endpoint's topics are not forwarded."""
 
 
-class Watcher(Protocol[_H_contra]):
-    """Looks after subscribers whose connections may be lost."""
-
-    def watch(self, endpoints: Iterable[_H_contra], /) -> None:
-        """Look after the subscribers of some endpoints for a while."""
-
-
-class PortBank:
-    """Sockets bound to the ports of a range."""
-
-    def __init__(self, address: str) -> None:
-        self._address = address
-        self._bound: dict[int, socket.socket] = {}
-
-    def reserve(self, ports: Iterable[int]) -> list[int]:
-        """Bind all ports; returns those that another program holds."""
-        return [port for port in ports if not self._reserve(port)]
-
-    def open(self, port: int) -> socket.socket:
-        """Let a reserved port listen. Raises OSError if another program took it meanwhile."""
-        sock = self._bound.pop(port, None) or bind(self._address, port)
-        try:
-            sock.listen(BACKLOG)
-        except OSError:
-            sock.close()
-            raise
-        return sock
-
-    def close(self, port: int, sock: socket.socket) -> None:
-        """Stop listening and keep the port reserved."""
-        sock.close()
-        self._reserve(port)
-
-    def close_all(self) -> None:
-        """Give all reserved ports back."""
-        for sock in self._bound.values():
-            sock.close()
-        self._bound.clear()
-
-    def _reserve(self, port: int) -> bool:
-        try:
-            self._bound[port] = bind(self._address, port)
-        except OSError as error:
-            log.debug("port %d can't be reserved: %s", port, error)
-            return False
-        return True
-
-
 class Leases(Generic[_H]):
-    """Opens, closes and lends the ports of the range.
+    """Opens, closes and lends the ports of the range, which are bound at ``address``.
 
     ``server`` answers what comes in. It needs the leases itself (a node that is found dead has its
-    port closed), so that it is set once both are there, before the first port opens.
+    port closed), so that it is set once both are there, before the first port opens. ``watch``
+    looks after subscribers of endpoints, whose connections may be lost.
     """
 
     server: HolderServer[_H]
 
     def __init__(
         self,
-        holders: Holders[_H],
-        bank: PortBank,
-        kernel: KernelPorts[_H],
-        watcher: Watcher[_H],
+        holders: LeaseBook[_H],
+        address: str,
+        kernel: KernelPorts,
+        watch: Callable[[Iterable[_H]], None],
         tasks: Tasks,
         problems: Problems,
     ) -> None:
-        self.bank = bank
-        self._holders, self._kernel, self._watcher = holders, kernel, watcher
+        self._holders, self._address, self._kernel, self._watch = holders, address, kernel, watch
         self._tasks, self._problems = tasks, problems
+        self._reserved: dict[int, socket.socket] = {}
         self._acceptors: dict[int, Acceptor] = {}
 
     def reserve_range(self) -> list[int]:
         """Bind all ports of the range; returns those that other programs hold."""
-        taken = self.bank.reserve(self._holders.pool.range.ports())
+        taken = [port for port in self._holders.pool.range.ports() if not self._reserve(port)]
         for port in taken:
             self._holders.pool.block(port)
         return taken
@@ -161,11 +101,10 @@ class Leases(Generic[_H]):
         """Take in ports of the range that other programs have let go."""
         pool = self._holders.pool
         before = pool.blocked_ports
-        still = self.bank.reserve(before)
-        for port in set(before) - set(still):
+        for port in filter(self._reserve, before):
             pool.unblock(port)
             log.info("port %d of the range is free now", port)
-        if before and not still:
+        if before and not pool.blocked:
             self._problems.solved(RANGE_OPTION)
 
     def is_open(self, endpoint: _H) -> bool:
@@ -202,7 +141,9 @@ class Leases(Generic[_H]):
         """Close all ports and give the range back; endpoints and registrations stay."""
         for endpoint in self._holders:
             self.close(endpoint)
-        self.bank.close_all()
+        for sock in self._reserved.values():
+            sock.close()
+        self._reserved.clear()
 
     def make_room(self) -> bool:
         """Take a port back that is needed least, if there is one: a fast port, or an idle lease."""
@@ -231,44 +172,64 @@ class Leases(Generic[_H]):
         return None
 
     @asynccontextmanager
-    async def lent(self, order: Iterable[int]) -> AsyncIterator[int | None]:
-        """A port that no node needs meanwhile; None if there is none.
+    async def lent(self, order: Iterable[int], handler: Handler) -> AsyncIterator[int | None]:
+        """A port that no node needs meanwhile, on which a handler serves; None if there is none.
 
         It is the first in an order that is free, else a fast port: whose that was gets it again
-        when a subscriber next asks.
+        when a subscriber next asks. Raises OSError if another program took it meanwhile.
         """
         pool = self._holders.pool
         port = next(filter(pool.claim, order), None)
         if port is None:
             spare = self._give_fast_port_back()
             port = spare if spare is not None and pool.claim(spare) else None
+        if port is None:
+            yield None
+            return
         try:
-            if port is not None:
-                await self._kernel.cleared(port)
+            await self._kernel.cleared(port)
+            self._accept(port, handler)
             yield port
         finally:
-            if port is not None:
-                pool.give_back(port)
+            self._refuse(port)
+            pool.give_back(port)
+
+    def _reserve(self, port: int) -> bool:
+        """Bind a port, which then refuses; False if another program holds it."""
+        try:
+            self._reserved[port] = bind(self._address, port)
+        except OSError as error:
+            log.debug("port %d can't be reserved: %s", port, error)
+            return False
+        return True
+
+    def _accept(self, port: int, handler: Handler) -> None:
+        """Let a port listen. Raises OSError if another program took it meanwhile."""
+        sock = self._reserved.pop(port, None) or bind(self._address, port)
+        try:
+            sock.listen(BACKLOG)
+        except OSError:
+            sock.close()
+            raise
+        self._acceptors[port] = Acceptor(self._tasks, sock, handler)
 
     def _listen(self, endpoint: _H, port: int) -> OSError | None:
         """Let a port listen for an endpoint; the error if another program has it."""
-        if port in self._acceptors:
-            return None
-        try:
-            sock = self.bank.open(port)
-        except OSError as error:
-            return error
-        self._acceptors[port] = Acceptor(
-            self._tasks, sock, lambda conn, peer: self.server.serve(endpoint, conn, peer)
-        )
+        if port not in self._acceptors:
+            try:
+                self._accept(port, lambda conn, peer: self.server.serve(endpoint, conn, peer))
+            except OSError as error:
+                return error
         return None
 
     def _refuse(self, port: int | None) -> None:
+        """Stop listening and keep the port reserved."""
         acceptor = self._acceptors.pop(port, None) if port is not None else None
         if acceptor is not None and port is not None:
             acceptor.stop()
             self.server.end_calls(port)
-            self.bank.close(port, acceptor.sock)
+            acceptor.sock.close()
+            self._reserve(port)
 
     def _give_fast_port_back(self) -> int | None:
         """Give back the fast port that is needed least, and tell which it was; None: none left."""
@@ -280,5 +241,5 @@ class Leases(Generic[_H]):
         log.info("%s: port %s is needed otherwise", holder.label, port)
         fast_ports.give_back(self._holders.pool, holder)
         self._kernel.note_change(holder)
-        self._watcher.watch([holder])
+        self._watch([holder])
         return port

@@ -84,7 +84,10 @@ class HttpClient:
         self._used.add(handler)
         try:
             handler.set_response_params(read_until_eof=True)
-            _send(handler, head, body)
+            if handler.transport is None:
+                raise aiohttp.ServerDisconnectedError
+            for piece in pieces(head, body):
+                handler.transport.write(piece)
             reply = await _answer(handler)
         except BaseException:
             handler.close()
@@ -96,9 +99,10 @@ class HttpClient:
 
     async def _connect(self, where: HostPort) -> ResponseHandler:
         """A new connection; never redirected or led elsewhere than to ``where``."""
-        loop, failure = asyncio.get_running_loop(), OSError(None, "can't be resolved")
         if self._closed:
             raise ConnectionAbortedError("the proxy is stopping")
+        loop = asyncio.get_running_loop()
+        failure = OSError(None, f"host name {where.host} can't be resolved")
         for address in await resolver.resolve(where.host):
             try:
                 sock = await dial(HostPort(address, where.port), CONNECT_TIMEOUT)
@@ -108,8 +112,6 @@ class HttpClient:
             _, handler = await loop.create_connection(lambda: ResponseHandler(loop), sock=sock)
             self.last = address
             return handler
-        if failure.errno is None and not isinstance(failure, TimeoutError):
-            raise OSError(None, f"host name {where.host} can't be resolved")
         raise failure
 
     def _take(self, where: HostPort) -> ResponseHandler | None:
@@ -134,22 +136,14 @@ class HttpClient:
     def _sweep(self) -> None:
         """Close what was not used for long."""
         before, self._sweeper = time.monotonic() - self._keepalive, None
-        for where, idle in list(self._idle.items()):
+        for where, idle in self._idle.items():
             for _, handler in (old for old in idle if old[0] <= before):
                 handler.close()
             self._idle[where] = [one for one in idle if one[0] > before]
-            if not self._idle[where]:
-                del self._idle[where]
+        self._idle = {where: idle for where, idle in self._idle.items() if idle}
         if self._idle:
             loop = asyncio.get_running_loop()
             self._sweeper = loop.call_later(self._keepalive / 2, self._sweep)
-
-
-def _send(handler: ResponseHandler, head: bytes, body: bytes) -> None:
-    if handler.transport is None:
-        raise aiohttp.ServerDisconnectedError
-    for piece in pieces(head, body):
-        handler.transport.write(piece)
 
 
 def pieces(head: bytes, body: bytes) -> tuple[bytes, ...]:

@@ -23,26 +23,17 @@ def address_towards(address: str) -> str:
 
 def interface_networks() -> tuple[Network, ...]:
     """The networks that this machine's own interfaces are in, without loopback."""
-    return (*_ipv4_networks(), *_ipv6_networks())
-
-
-def _ipv4_networks() -> list[Network]:
     networks: list[Network] = []
     for line in _lines("/proc/net/route")[1:]:
         interface, target, gateway, *_, mask = line.split()[:8]
         if interface != "lo" and gateway == "00000000" and target != "00000000":
             networks.append(ip_network(f"{_quad(target)}/{_quad(mask)}", strict=False))
-    return networks
-
-
-def _ipv6_networks() -> list[Network]:
-    networks: list[Network] = []
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
         address = ip_address(bytes.fromhex(digits))
         if interface != "lo" and not address.is_link_local:
             networks.append(ip_network(f"{address}/{int(prefix, 16)}", strict=False))
-    return networks
+    return tuple(networks)
 
 
 def _quad(digits: str) -> str:

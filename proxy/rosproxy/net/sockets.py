@@ -1,4 +1,4 @@
-"""TCP sockets: bound, listening, connected, looked into and closed.
+"""TCP sockets: bound, listening, accepted, connected, looked into and closed.
 
 Everything here is non-blocking and belongs to one event loop. A bound socket that does not listen
 refuses connections and keeps its port from everybody else; `leases` builds on that.
@@ -6,16 +6,27 @@ refuses connections and keeps its port from everybody else; `leases` builds on t
 
 import asyncio
 import contextlib
+import errno
+import logging
 import socket
 import struct
+from collections.abc import Awaitable, Callable
+from functools import partial
 
-from rosproxy.net.addresses import HostPort
+from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.net.tasks import Tasks
+
+log = logging.getLogger(__name__)
 
 BACKLOG = 256
+ACCEPTS_PER_TURN = 64
 CONNECT_TIMEOUT = 5.0
 """Seconds that a peer has to accept a connection."""
 SILENCE_TIMEOUT = 30.0
 """Seconds in which a client has to send what is waited for before its connection is closed."""
+
+Handler = Callable[[socket.socket, str], Awaitable[None]]
+"""Takes over an accepted socket; the second argument is the peer's address."""
 
 _LINGER_RESET = struct.pack("ii", 1, 0)
 
@@ -41,6 +52,63 @@ def listen(address: str, port: int) -> socket.socket:
     sock = bind(address, port)
     sock.listen(BACKLOG)
     return sock
+
+
+class Acceptor:
+    """Accepts on a listening socket until it is stopped; each connection has a task of its own.
+
+    The handler takes it over; an exception that ends the handler closes it.
+    """
+
+    def __init__(self, tasks: Tasks, sock: socket.socket, handler: Handler) -> None:
+        self.sock = sock
+        self._tasks, self._handler = tasks, handler
+        self._loop = asyncio.get_running_loop()
+        self._pause: asyncio.TimerHandle | None = None
+        self._listen()
+
+    def stop(self) -> None:
+        """Stop accepting; the socket stays open."""
+        self._loop.remove_reader(self.sock)
+        if self._pause is not None:
+            self._pause.cancel()
+
+    def _listen(self) -> None:
+        self._loop.add_reader(self.sock, self._accept)
+
+    def _accept(self) -> None:
+        try:
+            for _ in range(ACCEPTS_PER_TURN):
+                conn, peer = self.sock.accept()
+                conn.setblocking(False)
+                source = plain_address(peer[0])
+                task = self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
+                task.add_done_callback(partial(_close_if_cancelled, conn))
+        except BlockingIOError:
+            return
+        except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
+            # The socket would stay readable: look again later.
+            self._loop.remove_reader(self.sock)
+            self._pause = self._loop.call_later(0.1, self._listen)
+
+    async def _serve(self, conn: socket.socket, peer: str) -> None:
+        try:
+            conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            await self._handler(conn, peer)
+        except (OSError, EOFError, TimeoutError) as error:
+            log.debug("connection from %s ended: %s", peer, error)
+            conn.close()
+        except BaseException:
+            conn.close()
+            raise
+
+
+def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:
+    """A task that is cancelled before it has begun never gets to close its connection."""
+    if task.cancelled():
+        conn.close()
 
 
 async def dial(where: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:

@@ -1,8 +1,7 @@
 """Prometheus metrics: the counters that the proxy keeps; its state is in `admin.state_metrics`."""
 
 import time
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
 
@@ -31,14 +30,11 @@ class Traffic:
         self.sent[key] = self.sent.get(key, 0) + sent
         self.received[key] = self.received.get(key, 0) + received
 
-
-@dataclass(frozen=True, slots=True)
-class KernelTally:
-    """What the kernel forwards: whether it does, how many connections, bytes by node."""
-
-    usable: bool
-    connections: int
-    traffic: Traffic
+    def totals(self) -> Iterator[tuple[list[str], int]]:
+        """Kind, name and direction with the bytes."""
+        for direction, sums in (("outward", self.sent), ("inward", self.received)):
+            for key, size in sums.items():
+                yield [*key, direction], size
 
 
 class Metrics:
@@ -54,29 +50,19 @@ class Metrics:
         ProcessCollector(registry=self.registry)
         build = Info("rosproxy_build", "The proxy's version.", registry=self.registry)
         build.info({"version": __version__})
-        self.calls = Counter(
-            "rosproxy_xmlrpc_calls",
-            "XML-RPC calls by API (master, slave), method and outcome.",
-            ["api", "method", "outcome"],
-            registry=self.registry,
-        )
+
+        def counter(name: str, text: str, *labels: str) -> Counter:
+            return Counter(f"rosproxy_{name}", text, labels, registry=self.registry)
+
+        calls = "XML-RPC calls by API (master, slave), method and outcome."
+        self.calls = counter("xmlrpc_calls", calls, "api", "method", "outcome")
         self._counters: dict[tuple[str, str, str], Counter] = {}
-        self.relay_errors = Counter(
-            "rosproxy_relay_errors",
-            "TCPROS connections that could not be relayed.",
-            ["reason"],
-            registry=self.registry,
-        )
-        self.cleanups = Counter(
-            "rosproxy_cleanups",
-            "Nodes unregistered at the master because they were gone.",
-            registry=self.registry,
-        )
-        self.exhausted = Counter(
-            "rosproxy_range_exhausted",
-            "Registrations refused because no port was left.",
-            registry=self.registry,
-        )
+        errors = "TCPROS connections that could not be relayed."
+        self.relay_errors = counter("relay_errors", errors, "reason")
+        gone = "Nodes unregistered at the master because they were gone."
+        self.cleanups = counter("cleanups", gone)
+        refused = "Registrations refused because no port was left."
+        self.exhausted = counter("range_exhausted", refused)
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
             "Time for a call of the proxy's own to the master.",

@@ -28,7 +28,7 @@ def clean(text: object) -> str:
 
     Node and topic names are whatever a node says they are.
     """
-    return "".join(c if c.isprintable() else _escaped(c) for c in str(text))
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
 def width(text: str) -> int:
@@ -116,10 +116,6 @@ def listed(items: Iterable[str], most: int = 5) -> str:
     every = list(items)
     more = len(every) - most
     return ", ".join(every[:most]) + (f" and {more} more" if more > 0 else "")
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
 
 
 def _head(text: str, room: int) -> str:

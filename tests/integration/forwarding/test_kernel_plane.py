@@ -70,7 +70,7 @@ class Bench:
     async def forwarded(self, number: int = 0) -> Endpoint:
         endpoint = self.node(number)
         assert fast_ports.claim(self.context.registry.pool, endpoint)
-        assert await self.plane.forwards(endpoint, 50000)
+        assert await self.plane.syncer.forwards(endpoint, 50000)
         return endpoint
 
     def flow(self, port: int, state: str = "ESTABLISHED") -> str:
@@ -115,21 +115,21 @@ async def test_an_endpoint_is_forwarded_when_it_is_asked_for(bench: Bench) -> No
 async def test_another_tcpros_port_is_followed(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     endpoint.tcpros_port = 50009
-    assert await bench.plane.forwards(endpoint, 50009)
+    assert await bench.plane.syncer.forwards(endpoint, 50009)
     assert bench.tools.forwards == {45002: (NODE, 50009)}
-    assert not await bench.plane.forwards(endpoint, 50000)
+    assert not await bench.plane.syncer.forwards(endpoint, 50000)
 
 
 async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> None:
     endpoint, other = await bench.forwarded(), await bench.forwarded(1)
     endpoint.health.end(1.0)
-    bench.plane.note_change(endpoint)
-    await bench.plane.cleared(45002)
+    bench.plane.syncer.note_change(endpoint)
+    await bench.plane.syncer.cleared(45002)
     assert set(bench.tools.forwards) == {45003}
     fast_ports.give_back(bench.context.registry.pool, other)
     bench.context.registry.remove(other)
-    bench.plane.note_change(other)
-    await bench.plane.cleared(45003)
+    bench.plane.syncer.note_change(other)
+    await bench.plane.syncer.cleared(45003)
     assert bench.tools.forwards == {}
     assert bench.plane.status_of(endpoint)["reason"] == "the node does not answer"
 
@@ -137,7 +137,7 @@ async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> Non
 async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
     first, second = await bench.forwarded(), await bench.forwarded(1)
     first.tcpros_port = second.tcpros_port = 50001
-    assert await bench.plane.forwards(second, 50001)
+    assert await bench.plane.syncer.forwards(second, 50001)
     assert bench.tools.forwards == {45002: (NODE, 50000), 45003: (NODE, 50001)}
     await bench.plane.look()
     await until(lambda: bench.tools.forwards[45002] == (NODE, 50001))
@@ -146,8 +146,8 @@ async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
 async def test_a_node_on_the_proxys_own_machine_is_not_forwarded(bench: Bench) -> None:
     endpoint = bench.node()
     endpoint.place = Place("127.0.0.1", True)
-    assert not bench.plane.may_forward(endpoint)
-    assert not await bench.plane.forwards(endpoint, 50000)
+    assert not bench.plane.syncer.may_forward(endpoint)
+    assert not await bench.plane.syncer.forwards(endpoint, 50000)
     assert "the proxy itself" in bench.plane.status_of(endpoint)["reason"]
 
 
@@ -158,9 +158,8 @@ async def test_connections_and_bytes_are_taken_in(bench: Bench) -> None:
     assert endpoint.fast_peers == {"198.51.100.2": 1}
     told = bench.plane.status_of(endpoint)
     assert (told["connections"], told["sent"], told["received"]) == (1, 1000, 1000)
-    tally = bench.plane.tally()
-    assert (tally.usable, tally.connections) == (True, 1)
-    assert tally.traffic.sent == {("node", "unnamed"): 1000}
+    assert bench.plane.syncer.usable
+    assert bench.plane.traffic.sent == {("node", "unnamed"): 1000}
 
 
 async def test_a_table_that_is_gone_is_made_again(bench: Bench) -> None:
@@ -189,21 +188,21 @@ async def test_a_plane_that_is_lost_is_told_and_comes_back(
     endpoint = await bench.forwarded()
     endpoint.fast_peers = {"198.51.100.2": 1}
     bench.tools.failing, endpoint.tcpros_port = 2, 50001
-    assert not await bench.plane.forwards(endpoint, 50001)
-    assert not bench.plane.usable
+    assert not await bench.plane.syncer.forwards(endpoint, 50001)
+    assert not bench.plane.syncer.usable
     assert endpoint.fast_peers == {}
     assert bench.plane.status()["plane"] in ("splice", "copy")
     assert "not permitted" in bench.context.problems.all()[0].text
     await bench.plane.look()
     assert bench.plane.status()["plane"] == "kernel"
     assert bench.context.problems.all() == []
-    assert await bench.plane.forwards(endpoint, 50001)
+    assert await bench.plane.syncer.forwards(endpoint, 50001)
 
 
 async def test_a_plane_that_stays_lost_is_tried_again_later(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     bench.tools.failing, endpoint.tcpros_port = 10, 50001
-    assert not await bench.plane.forwards(endpoint, 50001)
+    assert not await bench.plane.syncer.forwards(endpoint, 50001)
     left = bench.tools.failing
     await bench.plane.look()
     assert bench.tools.failing == left
@@ -213,7 +212,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     endpoint = await bench.forwarded()
     bench.tools.flows = bench.flow(45002, "SYN_SENT")
     await bench.plane.look()
-    assert bench.plane.may_forward(endpoint)
+    assert bench.plane.syncer.may_forward(endpoint)
     bench.later = kernel_plane.UNANSWERED_PATIENCE
     await bench.plane.look()
     assert bench.tools.forwards == {}
@@ -221,7 +220,7 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
     bench.tools.flows = ""
     bench.later += 6
-    assert await bench.plane.forwards(endpoint, 50000)
+    assert await bench.plane.syncer.forwards(endpoint, 50000)
 
 
 async def test_cutting_forgets_the_connections(bench: Bench) -> None:
@@ -238,7 +237,7 @@ async def test_stopping_leaves_nothing(bench: Bench) -> None:
         (Marks(11311).all, False),
         (Marks(11311).all, True),
     }
-    assert not await bench.plane.forwards(endpoint, 50001)
+    assert not await bench.plane.syncer.forwards(endpoint, 50001)
 
 
 async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
@@ -247,7 +246,7 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     await bench.forwarded()
     later = Bench(tools=bench.tools)
     await later.plane.start()
-    later.plane.note_change()
+    later.plane.syncer.note_change()
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
     node = HostPort(NODE, 40000)
@@ -258,7 +257,7 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
     endpoint.tcpros_port, endpoint.trusted = 50001, True
-    assert await later.plane.forwards(endpoint, 50001)
+    assert await later.plane.syncer.forwards(endpoint, 50001)
     assert later.tools.forwards == {45002: (NODE, 50001)}
     assert later.plane.status_of(endpoint)["plane"] == "kernel"
     await later.context.tasks.cancel()
@@ -283,7 +282,7 @@ async def test_what_is_missing_is_said(
     bench = Bench(mode)
     bench.tools.failing = 2
     await bench.plane.start()
-    assert not bench.plane.usable
+    assert not bench.plane.syncer.usable
     assert caplog.records[-1].levelname == level
     assert "not permitted" in caplog.text
     found = bench.context.problems.all()
@@ -291,7 +290,7 @@ async def test_what_is_missing_is_said(
     endpoint = bench.node()
     bench.plane.recovered([endpoint])
     assert endpoint.fast_port == 45002
-    assert not await bench.plane.forwards(endpoint, 50000)
+    assert not await bench.plane.syncer.forwards(endpoint, 50000)
     assert bench.plane.status_of(endpoint)["port"] == 45002
 
 

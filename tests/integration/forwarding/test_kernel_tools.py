@@ -37,7 +37,7 @@ class ChainTools(FakeTools):
 
     async def nft(self, *words: str, document: str = "") -> str:
         """The chains."""
-        assert words == ("list", "chains")
+        assert words == ("-j", "list", "chains")
         return self.chains
 
 
@@ -98,7 +98,7 @@ def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 async def test_programs_get_their_words_and_document(programs: Path) -> None:
     program(programs, "nft", 'echo "$@"; /bin/cat')
     program(programs, "conntrack", 'echo "$@"')
-    assert await Tools().nft("-f", "-", document="{}") == "-j -f -\n{}"
+    assert await Tools().nft("-f", "-", document="{}") == "-f -\n{}"
     assert await Tools().list_flows("1/2", True) == "-L -f ipv6 -p tcp --mark 1/2\n"
     await Tools().forget_flows("1/2", False, "SYN_SENT")
 

@@ -136,20 +136,13 @@ def test_problems_stand_at_the_end() -> None:
 
 def test_names_cannot_reach_the_terminal() -> None:
     evil = "\x1b]0;owned\x07\n\u202e"
-    node = make_node(
-        nodes=[evil, evil],
-        state=evil,
-        publishes=[evil],
-        subscribes=[evil],
-        services=[evil],
-        parameters=[evil],
-        advertised_uri=evil,
-        connections=[make_connection(caller_id=evil, name=evil, kind=evil, peer=evil)],
-        address=evil,
-    )
+    connection = make_connection(**dict.fromkeys(("caller_id", "name", "kind", "peer"), evil))
+    said: dict[str, Any] = dict.fromkeys(("state", "advertised_uri", "address"), evil)
+    for name in ("nodes", "publishes", "subscribes", "services", "parameters"):
+        said[name] = [evil, evil]
     text = shown(
         make_status(
-            node,
+            make_node(connections=[connection], **said),
             problems=[{"age": 1.0, "subject": evil, "text": evil}],
             master={"uri": evil, "error": evil, "up": False},
         ),

@@ -3,12 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.forwarding.kernel.accounting import (
-    Account,
-    CounterDeltas,
-    KernelAccounts,
-    UnansweredPorts,
-)
+from rosproxy.forwarding.kernel import accounting
+from rosproxy.forwarding.kernel.accounting import Account, CounterDeltas, KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
@@ -24,6 +20,13 @@ def holder(registry: Registry, number: int) -> Endpoint:
     registry.register(endpoint, Registration(Kind.PUBLISHER, "/t", f"/node{number}"))
     assert fast_ports.claim(registry.pool, endpoint)
     return endpoint
+
+
+def a_book(holders: int) -> tuple[Registry, KernelAccounts, list[Endpoint]]:
+    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
+    endpoints = [holder(registry, number) for number in range(1, holders + 1)]
+    book.note_owners(registry)
+    return registry, book, endpoints
 
 
 def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
@@ -49,9 +52,7 @@ def test_counters_that_begin_anew_are_added() -> None:
 
 
 def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
-    endpoint = holder(registry, 1)
-    book.note_owners(registry)
+    _, book, (endpoint,) = a_book(1)
     assert book.count({1002: (400, 40), 1003: (5, 6)}, 10.0) == [
         ("/node1", 400, 40),
         ("unnamed", 5, 6),
@@ -63,9 +64,7 @@ def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
 
 
 def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
-    first = holder(registry, 1)
-    book.note_owners(registry)
+    registry, book, (first,) = a_book(1)
     fast_ports.give_back(registry.pool, first)
     book.note_owners(registry)
     assert book.ports_of(first) == [1002]
@@ -78,9 +77,7 @@ def test_a_port_given_back_stays_its_holders_until_somebody_else_has_it() -> Non
 
 
 def test_peers_are_those_of_the_nodes_own_address() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
-    first, second = holder(registry, 1), holder(registry, 2)
-    book.note_owners(registry)
+    _, book, (first, second) = a_book(2)
     flows = [open_flow(first, 1002), open_flow(first, 1003), open_flow(second, 1003, "192.0.2.2")]
     book.note_peers(flows)
     assert first.fast_peers == {"192.0.2.1": 1}
@@ -94,7 +91,7 @@ def test_peers_are_those_of_the_nodes_own_address() -> None:
 
 
 def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
-    silence = UnansweredPorts()
+    silence = accounting.UnansweredPorts()
     assert silence.look({1: (0, 60), 2: (0, 60), 3: (5, 60)}, 10.0) == []
     assert silence.look({1: (0, 60), 2: (40, 60), 3: (0, 60)}, 13.0) == [1]
     assert silence.look({3: (0, 60), 1: (0, 0)}, 16.0) == [3]
@@ -103,7 +100,7 @@ def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
 
 
 def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
-    silence = UnansweredPorts()
+    silence = accounting.UnansweredPorts()
     assert silence.look({1: (0, 60), 2: (0, 60)}, 10.0) == []
     assert silence.look({1: (0, 60), 2: (0, 60)}, 10.1) == []
     assert silence.look({1: (40, 0)}, 11.9) == []
@@ -111,9 +108,7 @@ def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
 
 
 def test_silent_ports_are_noted_with_the_bytes() -> None:
-    registry, book = Registry(PortRange(1000, 1003)), KernelAccounts()
-    holder(registry, 1)
-    book.note_owners(registry)
+    _, book, _ = a_book(1)
     for size in (60, 120):
         book.count({1002: (0, size)}, float(size))
     assert book.unanswered == [1002]

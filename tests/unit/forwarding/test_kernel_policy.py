@@ -20,7 +20,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
 
 NODE = "10.0.0.5"
-THERE = HostPort(NODE, 50000)
+THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)
 
 
 def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
@@ -32,28 +32,26 @@ def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
     return made
 
 
-def test_a_node_that_named_its_port_is_forwarded_to() -> None:
-    assert destination(an_endpoint(), HostForwarding()) == THERE
-    assert destination(an_endpoint(topic_ports={"/a": 50000}), HostForwarding()) == THERE
-    assert (
-        destination(an_endpoint(tcpros_port=None, topic_ports={"/a": 50000}), HostForwarding())
-        == THERE
-    )
-    assert destination(an_endpoint("fd00::5"), HostForwarding()) == HostPort("fd00::5", 50000)
+@pytest.mark.parametrize(
+    "named",
+    [{}, {"topic_ports": {"/a": 50000}}, {"tcpros_port": None, "topic_ports": {"/a": 50000}}],
+)
+def test_a_node_that_named_its_port_is_forwarded_to(named: dict[str, Any]) -> None:
+    assert destination(an_endpoint(**named), HostForwarding()) == THERE
+    assert destination(an_endpoint("fd00::5", **named), HostForwarding()) == THERE_SIX
+
+
+BOTH = HostForwarding()
 
 
 @pytest.mark.parametrize(
     ("endpoint", "world", "why"),
     [
-        (an_endpoint(trusted=False), HostForwarding(), "does not answer"),
-        (an_endpoint(tcpros_port=None), HostForwarding(), "nobody outside has asked"),
-        (an_endpoint(topic_ports={"/a": 50001}), HostForwarding(), "several TCPROS ports"),
-        (
-            an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None),
-            HostForwarding(),
-            "several",
-        ),
-        (an_endpoint("127.0.0.1"), HostForwarding(), "namespace of the proxy itself"),
+        (an_endpoint(trusted=False), BOTH, "does not answer"),
+        (an_endpoint(tcpros_port=None), BOTH, "nobody outside has asked"),
+        (an_endpoint(topic_ports={"/a": 50001}), BOTH, "several TCPROS ports"),
+        (an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None), BOTH, "several"),
+        (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(own={NODE}), "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),
         (an_endpoint("fd00::5"), HostForwarding(ipv6=False), "net.ipv6.conf.all.forwarding"),

@@ -1,7 +1,8 @@
-"""nftables' JSON: documents as nft takes them, output as nft 1.0.6 printed it."""
+"""nftables: documents as nft takes them, its JSON output as nft 1.0.6 printed it."""
 
 import contextlib
 import json
+import re
 from typing import Any
 
 import pytest
@@ -16,32 +17,21 @@ TABLE = Table(11311)
 FOUR, SIX = HostPort("10.0.0.5", 50000), HostPort("fd00::5", 50001)
 
 
-def commands(document: str) -> list[tuple[str, str, Any]]:
-    return [
-        (verb, kind, body)
-        for command in json.loads(document)["nftables"]
-        for verb, rest in command.items()
-        for kind, body in rest.items()
-    ]
-
-
-def elements(document: str, verb: str) -> dict[str, Any]:
-    return {
-        body["name"]: body["elem"]
-        for said, kind, body in commands(document)
-        if (said, kind) == (verb, "element")
-    }
+def elements(document: str, verb: str) -> dict[str, list[str]]:
+    """The elements that a document adds or deletes, by map and set."""
+    found = re.findall(rf"^{verb} element inet rosproxy-11311 (\w+) {{ (.*) }}$", document, re.M)
+    return {name: text.split(", ") for name, text in found}
 
 
 def listing(document: str) -> str:
     """What ``nft -j list table`` prints after a document that makes the whole table."""
     held = elements(document, "add")
-    objects = [
-        {kind: body | ({"elem": held[body["name"]]} if body["name"] in held else {})}
-        for verb, kind, body in commands(document)
-        if verb == "add" and kind in ("map", "set")
-    ]
-    return json.dumps({"nftables": [{"metainfo": {"version": "1.0.6"}}, *objects]})
+    objects: list[Any] = [{"metainfo": {"version": "1.0.6"}}]
+    for kind, name in re.findall(r"^  (map|set) (\w+) ", document, re.M):
+        pairs = [text.split(" : ") for text in held.get(name, []) if kind == "map"]
+        shown = [[int(key), int(v) if v.isdigit() else v] for key, v in pairs]
+        objects.append({kind: {"name": name, "table": "rosproxy-11311", "elem": shown}})
+    return json.dumps({"nftables": objects})
 
 
 @given(st.integers(1, 65535), st.integers(1, 65535), st.integers(1, 65535))
@@ -57,41 +47,47 @@ def test_marks_name_their_proxy_and_port(master: int, other: int, port: int) -> 
 
 
 def test_the_whole_table_takes_the_place_of_an_old_one() -> None:
-    said = commands(TABLE.made({}))
-    table = {"family": "inet", "name": "rosproxy-11311"}
-    assert said[:3] == [("add", "table", table), ("delete", "table", table), said[0]]
-    assert {kind for _, kind, _ in said[3:]} == {"map", "set", "chain", "rule"}
-    chains = {b["name"]: (b["type"], b["prio"]) for _, kind, b in said if kind == "chain"}
-    assert chains == {
-        "prerouting": ("nat", -100),
-        "postrouting": ("nat", 100),
-        "forward": ("filter", -300),
-    }
-    assert all(b["policy"] == "accept" for _, kind, b in said if kind == "chain")
+    document = TABLE.made({})
+    name = "table inet rosproxy-11311"
+    assert document.splitlines()[:3] == [f"add {name}", f"delete {name}", f"{name} {{"]
+    assert re.findall(r"chain (\w+) {\n *type (\w+) hook \1 priority (\S+);", document) == [
+        ("prerouting", "nat", "-100"),
+        ("postrouting", "nat", "100"),
+        ("forward", "filter", "-300"),
+    ]
+    assert document.count("policy accept;") == document.count("policy") == 3
+    assert elements(document, "add") == {}
 
 
 def test_forwards_become_elements() -> None:
     document = TABLE.made({45050: FOUR, 45051: SIX}, counted=[45052])
-    marks = [TABLE.marks.of(port) for port in (45050, 45051, 45052)]
+    marks = [str(TABLE.marks.of(port)) for port in (45050, 45051, 45052)]
     assert elements(document, "add") == {
-        "marks": [[45050, marks[0]], [45051, marks[1]]],
-        "hosts4": [[45050, "10.0.0.5"]],
-        "hosts6": [[45051, "fd00::5"]],
-        "ports": [[45050, 50000], [45051, 50001]],
+        "marks": [f"45050 : {marks[0]}", f"45051 : {marks[1]}"],
+        "hosts4": ["45050 : 10.0.0.5"],
+        "hosts6": ["45051 : fd00::5"],
+        "ports": ["45050 : 50000", "45051 : 50001"],
         "sent": marks,
         "received": marks,
     }
 
 
+@pytest.mark.parametrize("host", ["robot", "10.0.0.5 }; flush ruleset", "fe80::1%}\nflush ruleset"])
+def test_nothing_but_addresses_gets_into_a_document(host: str) -> None:
+    document = TABLE.made({45050: HostPort(host, 50000)})
+    assert elements(document, "add")["hosts4"] == ["45050 : ?"]
+    assert "flush" not in document
+
+
 def test_a_change_takes_out_before_it_puts_in() -> None:
     document = TABLE.changed(Changes({45050: FOUR}, {45050: SIX}))
-    assert [verb for verb, _, _ in commands(document)] == ["delete"] * 3 + ["add"] * 5
+    assert [line.split()[0] for line in document.splitlines()] == ["delete"] * 3 + ["add"] * 5
     assert elements(document, "delete") == {
-        "marks": [[45050, TABLE.marks.of(45050)]],
-        "hosts4": [[45050, "10.0.0.5"]],
-        "ports": [[45050, 50000]],
+        "marks": [f"45050 : {TABLE.marks.of(45050)}"],
+        "hosts4": ["45050 : 10.0.0.5"],
+        "ports": ["45050 : 50000"],
     }
-    assert elements(document, "add")["hosts6"] == [[45050, "fd00::5"]]
+    assert elements(document, "add")["hosts6"] == ["45050 : fd00::5"]
 
 
 def test_what_is_no_longer_forwarded_is_still_counted() -> None:
@@ -100,17 +96,15 @@ def test_what_is_no_longer_forwarded_is_still_counted() -> None:
 
 
 def test_ending_forwards_nothing_new_and_resets_what_comes() -> None:
-    *flushed, (verb, kind, rule) = commands(TABLE.ended())
-    assert [(said[:2], said[2]["name"]) for said in flushed] == [
-        (("flush", "map"), name) for name in ("marks", "hosts4", "hosts6", "ports")
-    ]
-    assert (verb, kind, rule["chain"]) == ("add", "rule", "forward")
-    assert rule["expr"][-1] == {"reject": {"type": "tcp reset"}}
+    *flushed, rule = TABLE.ended().splitlines()
+    maps = ("marks", "hosts4", "hosts6", "ports")
+    assert flushed == [f"flush map inet rosproxy-11311 {name}" for name in maps]
+    assert rule.startswith("add rule inet rosproxy-11311 forward ct status dnat")
+    assert rule.endswith(" reject with tcp reset")
 
 
 def test_removing() -> None:
-    body = {"family": "inet", "name": "rosproxy-11311"}
-    assert commands(TABLE.removed()) == [("delete", "table", body)]
+    assert TABLE.removed() == "delete table inet rosproxy-11311\n"
 
 
 PORTS = st.integers(1, 65535)

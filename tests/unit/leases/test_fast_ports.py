@@ -15,6 +15,11 @@ def admitted(registry: Registry, number: int) -> Endpoint:
     return registry.admit(f"http://{node}/", node, Place(node.host, True), node.host)
 
 
+def one_admitted(ports: int) -> tuple[Registry, Endpoint]:
+    registry = Registry(PortRange(1000, 999 + ports))
+    return registry, admitted(registry, 1)
+
+
 @given(st.integers(1, 60000), st.integers(1, 500))
 def test_partners_are_mutual_and_nobody_shares_one(first: int, count: int) -> None:
     ports = PortRange(first, first + count - 1)
@@ -41,8 +46,7 @@ def test_a_port_outside_the_range_has_no_partner() -> None:
 
 
 def test_an_endpoint_gets_the_partner_of_its_lease_and_keeps_it() -> None:
-    registry = Registry(PortRange(1000, 1003))
-    endpoint = admitted(registry, 1)
+    registry, endpoint = one_admitted(4)
     assert fast_ports.claim(registry.pool, endpoint)
     assert fast_ports.claim(registry.pool, endpoint)
     assert (endpoint.port, endpoint.fast_port) == (1000, 1002)
@@ -61,15 +65,13 @@ def test_a_partner_that_is_a_lease_is_not_to_be_had() -> None:
 
 
 def test_the_odd_last_port_has_none() -> None:
-    registry = Registry(PortRange(1000, 1000))
-    endpoint = admitted(registry, 1)
+    registry, endpoint = one_admitted(1)
     assert not fast_ports.claim(registry.pool, endpoint)
     assert "goes with port 1000" in fast_ports.why_none(registry.pool, endpoint)
 
 
 def test_a_fast_port_is_given_back_once() -> None:
-    registry = Registry(PortRange(1000, 1003))
-    endpoint = admitted(registry, 1)
+    registry, endpoint = one_admitted(4)
     fast_ports.claim(registry.pool, endpoint)
     for _ in range(2):
         fast_ports.give_back(registry.pool, endpoint)
@@ -79,8 +81,7 @@ def test_a_fast_port_is_given_back_once() -> None:
 
 
 def test_a_fast_port_that_another_program_holds_is_blocked() -> None:
-    registry = Registry(PortRange(1000, 1003))
-    endpoint = admitted(registry, 1)
+    registry, endpoint = one_admitted(4)
     fast_ports.claim(registry.pool, endpoint)
     fast_ports.give_back(registry.pool, endpoint, blocked=True)
     assert registry.pool.blocked_ports == [1002]
@@ -104,8 +105,7 @@ def test_the_least_used_fast_port_goes_first() -> None:
 
 
 def test_whoever_is_connected_through_the_kernel_is_not_idle() -> None:
-    registry = Registry(PortRange(1000, 1003))
-    endpoint = admitted(registry, 1)
+    registry, endpoint = one_admitted(4)
     endpoint.idle_since = 1.0
     assert [endpoint.idle, endpoint.connected] == [True, False]
     assert registry.reclaimable() is endpoint

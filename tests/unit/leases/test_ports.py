@@ -19,21 +19,11 @@ def test_a_range_holds_both_ends() -> None:
     assert len(PortRange(5, 5)) == 1
 
 
-@pytest.mark.parametrize(
-    ("listen", "advertise", "pairs"),
-    [
-        (RANGE, RANGE, {45000: 45000, 45003: 45003}),
-        (RANGE, PortRange(30000, 30003), {45000: 30000, 45003: 30003}),
-        (RANGE, PortRange(45002, 45005), {45000: 45002, 45003: 45005}),
-    ],
-)
-def test_advertised_ports_are_an_offset_away(
-    listen: PortRange, advertise: PortRange, pairs: dict[int, int]
-) -> None:
-    ports = PortMap(listen, advertise)
-    for port, outside in pairs.items():
-        assert ports.advertised(port) == outside
-        assert ports.listening(outside) == port
+@pytest.mark.parametrize("advertise", [RANGE, PortRange(30000, 30003), PortRange(45002, 45005)])
+def test_advertised_ports_are_an_offset_away(advertise: PortRange) -> None:
+    ports = PortMap(RANGE, advertise)
+    assert [*map(ports.advertised, RANGE.ports())] == [*advertise.ports()]
+    assert [*map(ports.listening, advertise.ports())] == [*RANGE.ports()]
     assert ports.listening(advertise.first - 1) is None
     assert ports.listening(advertise.last + 1) is None
 

@@ -5,8 +5,11 @@ from dataclasses import dataclass
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint, ForwardedEndpoints
 from rosproxy.forwarding.kernel.nft import Counters
+from rosproxy.leases.fast_ports import Holder, Holders
+
+SILENCE_WINDOW = 2.0
+"""Seconds at least over which it is told whether anything goes back through a port."""
 
 
 @dataclass(slots=True)
@@ -25,23 +28,18 @@ class CounterDeltas:
     """Bytes by port, from counters that begin anew whenever their table is made again."""
 
     def __init__(self) -> None:
-        self._last: dict[int, tuple[int, int]] = {}
+        self._last: Counters = {}
 
     def take(self, counters: Counters) -> dict[int, tuple[int, int]]:
         """What has been counted since the last time, by port; ports without anything left out."""
-        grown = {port: self._grown(port, *counted) for port, counted in counters.items()}
-        self._last = dict(counters)
+        grown = {}
+        for port, (sent, received) in counters.items():
+            before = self._last.get(port, (0, 0))
+            if sent < before[0] or received < before[1]:
+                before = 0, 0
+            grown[port] = sent - before[0], received - before[1]
+        self._last = counters
         return {port: more for port, more in grown.items() if any(more)}
-
-    def _grown(self, port: int, sent: int, received: int) -> tuple[int, int]:
-        before = self._last.get(port, (0, 0))
-        if sent < before[0] or received < before[1]:
-            return sent, received
-        return sent - before[0], received - before[1]
-
-
-SILENCE_WINDOW = 2.0
-"""Seconds at least over which it is told whether anything goes back through a port."""
 
 
 class UnansweredPorts:
@@ -78,13 +76,13 @@ class KernelAccounts:
     """
 
     def __init__(self) -> None:
-        self.owners: Mapping[int, ForwardedEndpoint] = {}
-        self._accounts: dict[ForwardedEndpoint, Account] = {}
-        self._deltas, self._unanswered = CounterDeltas(), UnansweredPorts()
+        self.owners: Mapping[int, Holder] = {}
+        self._accounts: dict[Holder, Account] = {}
+        self._deltas, self._silence = CounterDeltas(), UnansweredPorts()
         self.unanswered: list[int] = []
         self._counted_at = 0.0
 
-    def note_owners(self, endpoints: ForwardedEndpoints) -> None:
+    def note_owners(self, endpoints: Holders[Holder]) -> None:
         """Take in who holds which fast port now."""
         there = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
         self.owners = there | {e.fast_port: e for e in endpoints if e.fast_port is not None}
@@ -97,7 +95,7 @@ class KernelAccounts:
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
         grown, by_port = [], self._deltas.take(counters)
-        self.unanswered = self._unanswered.look(by_port, now)
+        self.unanswered = self._silence.look(by_port, now)
         for port, (sent, received) in by_port.items():
             endpoint = self.owners.get(port)
             if endpoint is not None:
@@ -106,34 +104,32 @@ class KernelAccounts:
             grown.append((names[0] if names else "unnamed", sent, received))
         return grown
 
-    def _add(self, endpoint: ForwardedEndpoint, sent: int, received: int, passed: float) -> None:
-        account = self._accounts.setdefault(endpoint, Account())
-        account.sent += sent
-        account.received += received
-        out, into = account.rates
-        if passed > 0:
-            account.rates = out + sent / passed, into + received / passed
-
     def note_peers(self, flows: Sequence[Flow]) -> None:
         """Take in all connections that the kernel tracks now.
 
         Those to a node that is down don't count: if its host vanished without a word, the kernel
         takes them for open for days.
         """
-        by_port: dict[int, list[Flow]] = {}
+        found: dict[Holder, list[Flow]] = {endpoint: [] for endpoint in self.owners.values()}
         for flow in flows:
-            by_port.setdefault(flow.port, []).append(flow)
-        found: dict[ForwardedEndpoint, list[Flow]] = {}
-        for port, endpoint in self.owners.items():
-            found.setdefault(endpoint, []).extend(by_port.get(port, []))
+            owner = self.owners.get(flow.port)
+            if owner is not None and not owner.is_down:
+                found[owner].append(flow)
         for endpoint, mine in found.items():
-            there = [] if endpoint.is_down else mine
-            endpoint.fast_peers = conntrack.peers(there, endpoint.address)
+            endpoint.fast_peers = conntrack.peers(mine, endpoint.address)
 
-    def account(self, endpoint: ForwardedEndpoint) -> Account:
+    def account(self, endpoint: Holder) -> Account:
         """What went through an endpoint's fast ports so far."""
         return self._accounts.get(endpoint, Account())
 
-    def ports_of(self, endpoint: ForwardedEndpoint) -> list[int]:
+    def ports_of(self, endpoint: Holder) -> list[int]:
         """The fast ports that connections to an endpoint may go through."""
         return [port for port, owner in self.owners.items() if owner is endpoint]
+
+    def _add(self, endpoint: Holder, sent: int, received: int, passed: float) -> None:
+        account = self._accounts.setdefault(endpoint, Account())
+        account.sent += sent
+        account.received += received
+        out, into = account.rates
+        if passed > 0:
+            account.rates = out + sent / passed, into + received / passed

@@ -6,7 +6,7 @@
 The first four addresses are of the connection as it came, the others of what answers it.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -36,7 +36,7 @@ class Flow:
 
 def read(text: str, marks: Marks) -> list[Flow]:
     """The connections of one proxy, by its marks. Lines that make no sense are left out."""
-    flows = (_flow(line, marks) for line in text.splitlines())
+    flows = (_flow(line.split(), marks) for line in text.splitlines())
     return [flow for flow in flows if flow]
 
 
@@ -58,25 +58,15 @@ class Watch:
         return [flow for flow, since in self._since.items() if now - since >= self._patience]
 
 
-def _flow(line: str, marks: Marks) -> Flow | None:
-    words = line.split()
-    if not words or words[0] != "tcp":
-        return None
-    said: dict[str, list[str]] = {}
-    for word in words:
-        key, equals, value = word.partition("=")
+def _flow(words: list[str], marks: Marks) -> Flow | None:
+    said: defaultdict[str, list[str]] = defaultdict(list)
+    for key, equals, value in (word.partition("=") for word in words):
         if equals:
-            said.setdefault(key, []).append(value)
+            said[key].append(value)
     state = next((word for word in words[1:] if word.isupper() and word[0].isalpha()), "")
     try:
         port = marks.port(int(said["mark"][0]))
-        if port is None:
-            return None
-        return Flow(
-            state,
-            HostPort(said["src"][0], int(said["sport"][0])),
-            port,
-            HostPort(said["src"][1], int(said["sport"][1])),
-        )
-    except (KeyError, IndexError, ValueError):
+        there, node = (HostPort(said["src"][i], int(said["sport"][i])) for i in range(2))
+    except (IndexError, ValueError):
         return None
+    return Flow(state, there, port, node) if words[0] == "tcp" and port is not None else None

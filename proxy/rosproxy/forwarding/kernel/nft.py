@@ -1,4 +1,4 @@
-"""nftables in libnftables' JSON (libnftables-json(5)): the proxy's table, its changes, its state.
+"""nftables: the proxy's table and its changes as nft takes them, its state as nft prints it.
 
 One table per proxy, named after its master port, so that two of them in one network namespace
 leave each other alone. It holds maps from fast port to mark, address and port; sets that count
@@ -7,26 +7,61 @@ bytes by mark; and three chains, which stay as they are however many forwards th
 - prerouting: what comes in for an address of this machine gets its port's mark (on the
   connection) and is sent on to the node;
 - postrouting: it leaves with this machine's address, so that the node's replies come back;
-- forward: bytes of IP packets are counted, in each direction.
+- forward: bytes of IP packets are counted, in each direction, before any filter: what one drops
+  is counted as well, so that it is known to have come.
+
+Documents are in nft's own language (nft(8)), output is JSON (libnftables-json(5)).
 """
 
 import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from string import Template
 from typing import Any
 
 from rosproxy.forwarding.kernel.policy import Changes, Forwards
-from rosproxy.net.addresses import HostPort, parse_address
+from rosproxy.net.addresses import HostPort, is_address, parse_address
 
 Json = Any
 Counters = Mapping[int, tuple[int, int]]
 """Bytes of IP packets by port: sent outside, received from there."""
 
-_DPORT = {"payload": {"protocol": "tcp", "field": "dport"}}
-_MAPS = {"marks": "mark", "hosts4": "ipv4_addr", "hosts6": "ipv6_addr", "ports": "inet_service"}
+_MAPS = ("marks", "hosts4", "hosts6", "ports")
 _SETS = ("sent", "received")
-_BEFORE_FILTERS = -300
-"""A priority: what a filter drops is counted as well, so that it is known to have come."""
+_MADE = Template("""\
+add table inet $name
+delete table inet $name
+table inet $name {
+  map marks { type inet_service : mark; }
+  map hosts4 { type inet_service : ipv4_addr; }
+  map hosts6 { type inet_service : ipv6_addr; }
+  map ports { type inet_service : inet_service; }
+  set sent { type mark; counter; }
+  set received { type mark; counter; }
+  chain prerouting {
+    type nat hook prerouting priority -100; policy accept;
+    fib daddr type local ct mark set tcp dport map @marks
+    fib daddr type local dnat ip to tcp dport map @hosts4 : tcp dport map @ports
+    fib daddr type local dnat ip6 to tcp dport map @hosts6 : tcp dport map @ports
+  }
+  chain postrouting {
+    type nat hook postrouting priority 100; policy accept;
+    ct status dnat ct mark @sent masquerade
+  }
+  chain forward {
+    type filter hook forward priority -300; policy accept;
+    ct status dnat ct direction reply ct mark @sent
+    ct status dnat ct direction original ct mark @received
+  }
+}
+""")
+_ENDED = Template("""\
+flush map inet $name marks
+flush map inet $name hosts4
+flush map inet $name hosts6
+flush map inet $name ports
+add rule inet $name forward ct status dnat ct direction original ct mark @sent reject with tcp reset
+""")
 
 
 class NftError(ValueError):
@@ -35,7 +70,7 @@ class NftError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class TableState:
-    """What the kernel has in a proxy's table; bytes by port as sent outside and received."""
+    """What the kernel has in a proxy's table."""
 
     forwards: Forwards = field(default_factory=dict)
     counters: Counters = field(default_factory=dict)
@@ -65,62 +100,40 @@ class Marks:
         return f"{self.of(port):#x}/0xffffffff"
 
 
-@dataclass(frozen=True, slots=True)
 class Table:
     """The table of the proxy with a master port."""
 
-    master_port: int
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-        return f"rosproxy-{self.master_port}"
-
-    @property
-    def marks(self) -> Marks:
-        """The connection marks in it."""
-        return Marks(self.master_port)
+    def __init__(self, master_port: int) -> None:
+        self.name, self.marks = f"rosproxy-{master_port}", Marks(master_port)
 
     def made(self, forwards: Forwards, counted: Collection[int] = ()) -> str:
         """The whole table, in place of one that may be there.
 
         ``counted`` are further ports whose connections are counted, though no new ones come.
         """
-        table = {"family": "inet", "name": self.name}
-        commands = [_add("table", table), _delete("table", table), _add("table", table)]
-        commands += [self._map(name, data) for name, data in _MAPS.items()]
-        commands += [self._set(name) for name in _SETS]
-        commands += self._chains()
-        commands += self._counting({*counted, *forwards})
-        return _document(commands + self._elements("add", forwards))
+        made = _MADE.substitute(name=self.name)
+        return made + self._counting({*counted, *forwards}) + self._forwarding("add", forwards)
 
     def changed(self, change: Changes) -> str:
         """Forwards taken out and put in."""
-        return _document(
-            [
-                *self._elements("delete", change.removed),
-                *self._counting(change.added),
-                *self._elements("add", change.added),
-            ]
-        )
+        removed = self._forwarding("delete", change.removed)
+        return removed + self._counting(change.added) + self._forwarding("add", change.added)
 
     def ended(self) -> str:
         """No forwards any more, and whoever sends something from outside gets a reset.
 
         Some clients (rospy) try again only when they see their connection end.
         """
-        flushed = [{"flush": {"map": self._named(name)}} for name in _MAPS]
-        reset = {"reject": {"type": "tcp reset"}}
-        return _document([*flushed, self._rule("forward", *_INWARD, _ct("mark", "@sent"), reset)])
+        return _ENDED.substitute(name=self.name)
 
     def removed(self) -> str:
         """No table."""
-        return _document([_delete("table", {"family": "inet", "name": self.name})])
+        return f"delete table inet {self.name}\n"
 
     def read(self, text: str) -> TableState:
         """The table as ``nft -j list table`` prints it. Raises NftError."""
         elements = {
-            str(body.get("name")): _list(body.get("elem"))
+            str(body.get("name")): body.get("elem")
             for kind in ("map", "set")
             for body in _objects(text, kind)
             if body.get("table") == self.name
@@ -136,60 +149,27 @@ class Table:
             and parse_address(str(host))
             and marks.get(port) == self.marks.of(port)
         }
-        return TableState(forwards, self._counters(*(elements[name] for name in _SETS)))
+        out, into = _counted(elements["sent"]), _counted(elements["received"])
+        counted = {mark: self.marks.port(mark) for mark in out | into}
+        counters = {p: (out.get(m, 0), into.get(m, 0)) for m, p in counted.items() if p is not None}
+        return TableState(forwards, counters)
 
-    def _counters(self, sent: Json, received: Json) -> dict[int, tuple[int, int]]:
-        out, into = _counted(sent), _counted(received)
-        ports = {mark: self.marks.port(mark) for mark in out | into}
-        return {p: (out.get(m, 0), into.get(m, 0)) for m, p in ports.items() if p is not None}
-
-    def _elements(self, verb: str, forwards: Forwards) -> list[Json]:
-        wanted = {name: {} for name in _MAPS}  # type: dict[str, dict[int, Json]]
+    def _forwarding(self, verb: str, forwards: Forwards) -> str:
+        pairs: dict[str, list[str]] = {name: [] for name in _MAPS}
         for port, where in forwards.items():
-            wanted["marks"][port] = self.marks.of(port)
-            wanted["hosts6" if ":" in where.host else "hosts4"][port] = where.host
-            wanted["ports"][port] = where.port
-        return [
-            {verb: {"element": self._named(name, elem=[[k, v] for k, v in pairs.items()])}}
-            for name, pairs in wanted.items()
-            if pairs
-        ]
+            # A host that is no address, which can't be, makes no sense to nft: it refuses all.
+            host = where.host if is_address(where.host) and "%" not in where.host else "?"
+            pairs["marks"].append(f"{port} : {self.marks.of(port)}")
+            pairs["hosts6" if ":" in host else "hosts4"].append(f"{port} : {host}")
+            pairs["ports"].append(f"{port} : {where.port}")
+        return "".join(self._elements(verb, name, held) for name, held in pairs.items() if held)
 
-    def _counting(self, ports: Iterable[int]) -> list[Json]:
-        marks = sorted(self.marks.of(port) for port in ports)
-        if not marks:
-            return []
-        return [_add("element", self._named(name, elem=marks)) for name in _SETS]
+    def _counting(self, ports: Iterable[int]) -> str:
+        marks = [str(self.marks.of(port)) for port in sorted(ports)]
+        return "".join(self._elements("add", name, marks) for name in _SETS if marks)
 
-    def _named(self, name: str, **more: Json) -> Json:
-        return {"family": "inet", "table": self.name, "name": name, **more}
-
-    def _map(self, name: str, data: str) -> Json:
-        return _add("map", self._named(name, type="inet_service", map=data))
-
-    def _set(self, name: str) -> Json:
-        return _add("set", self._named(name, type="mark", stmt=[{"counter": None}]))
-
-    def _chains(self) -> list[Json]:
-        return [
-            self._chain("prerouting", "nat", -100),
-            self._chain("postrouting", "nat", 100),
-            self._chain("forward", "filter", _BEFORE_FILTERS),
-            self._rule("prerouting", _LOCAL, _mangle("marks")),
-            self._rule("prerouting", _LOCAL, _dnat("ip", "hosts4")),
-            self._rule("prerouting", _LOCAL, _dnat("ip6", "hosts6")),
-            self._rule("postrouting", _TRANSLATED, _ct("mark", "@sent"), {"masquerade": None}),
-            self._rule("forward", *_OUTWARD, _ct("mark", "@sent")),
-            self._rule("forward", *_INWARD, _ct("mark", "@received")),
-        ]
-
-    def _chain(self, hook: str, kind: str, priority: int) -> Json:
-        body = self._named(hook, type=kind, hook=hook, prio=priority, policy="accept")
-        return _add("chain", body)
-
-    def _rule(self, chain: str, *expressions: Json) -> Json:
-        body = {"family": "inet", "table": self.name, "chain": chain, "expr": list(expressions)}
-        return _add("rule", body)
+    def _elements(self, verb: str, name: str, elements: list[str]) -> str:
+        return f"{verb} element inet {self.name} {name} {{ {', '.join(elements)} }}\n"
 
 
 def dropping_chains(text: str) -> list[str]:
@@ -204,7 +184,7 @@ def dropping_chains(text: str) -> list[str]:
     ]
 
 
-def _objects(text: str, kind: str) -> list[Json]:
+def _objects(text: str, kind: str) -> list[dict[str, Json]]:
     try:
         listed = json.loads(text)["nftables"]
         found = [item[kind] for item in listed if kind in item]
@@ -213,22 +193,15 @@ def _objects(text: str, kind: str) -> list[Json]:
     return [body for body in found if isinstance(body, dict)]
 
 
-def _list(value: Json) -> list[Json]:
-    return value if isinstance(value, list) else []
-
-
-def _dict(value: Json) -> dict[str, Json]:
-    return value if isinstance(value, dict) else {}
-
-
-def _pairs(elements: list[Json]) -> dict[int, Json]:
-    pairs = (item for item in elements if isinstance(item, list) and len(item) == 2)
+def _pairs(elements: Json) -> dict[int, Json]:
+    items = elements if isinstance(elements, list) else []
+    pairs = (item for item in items if isinstance(item, list) and len(item) == 2)
     return {key: value for key, value in pairs if isinstance(key, int)}
 
 
-def _counted(elements: list[Json]) -> dict[int, int]:
+def _counted(elements: Json) -> dict[int, int]:
     counted = {}
-    for item in elements:
+    for item in elements if isinstance(elements, list) else []:
         body = _dict(_dict(item).get("elem"))
         mark, size = body.get("val"), _dict(body.get("counter")).get("bytes", 0)
         if isinstance(mark, int) and isinstance(size, int):
@@ -236,39 +209,5 @@ def _counted(elements: list[Json]) -> dict[int, int]:
     return counted
 
 
-def _document(commands: list[Json]) -> str:
-    return json.dumps({"nftables": commands})
-
-
-def _add(kind: str, body: Json) -> Json:
-    return {"add": {kind: body}}
-
-
-def _delete(kind: str, body: Json) -> Json:
-    return {"delete": {kind: body}}
-
-
-def _match(left: Json, right: Json, operator: str = "==") -> Json:
-    return {"match": {"op": operator, "left": left, "right": right}}
-
-
-def _ct(key: str, right: Json) -> Json:
-    return _match({"ct": {"key": key}}, right)
-
-
-def _mangle(name: str) -> Json:
-    return {"mangle": {"key": {"ct": {"key": "mark"}}, "value": _looked_up(name)}}
-
-
-def _dnat(family: str, hosts: str) -> Json:
-    return {"dnat": {"family": family, "addr": _looked_up(hosts), "port": _looked_up("ports")}}
-
-
-def _looked_up(name: str) -> Json:
-    return {"map": {"key": _DPORT, "data": f"@{name}"}}
-
-
-_LOCAL = _match({"fib": {"result": "type", "flags": ["daddr"]}}, "local")
-_TRANSLATED = _match({"ct": {"key": "status"}}, "dnat", "in")
-_OUTWARD = _TRANSLATED, _ct("direction", "reply")
-_INWARD = _TRANSLATED, _ct("direction", "original")
+def _dict(value: Json) -> dict[str, Json]:
+    return value if isinstance(value, dict) else {}

@@ -13,16 +13,16 @@ from typing import Any
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
-from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint, ForwardedEndpoints
 from rosproxy.forwarding.kernel.nft import Table
 from rosproxy.forwarding.kernel.preflight import why_not
 from rosproxy.forwarding.kernel.syncer import OPTION, Clock, ForwardSyncer
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases import fast_ports
+from rosproxy.leases.fast_ports import Holder, Holders
 from rosproxy.net.tasks import Tasks
 from rosproxy.settings import Settings
-from rosproxy.telemetry.metrics import KernelTally, Traffic
+from rosproxy.telemetry.metrics import Traffic
 from rosproxy.telemetry.problems import Problems
 
 log = logging.getLogger(__name__)
@@ -34,12 +34,15 @@ UNANSWERED_PATIENCE = 3.0
 
 
 class KernelPlane:
-    """What the kernel forwards for the endpoints, and why it doesn't."""
+    """What the kernel forwards for the endpoints, and why it doesn't.
+
+    ``traffic`` are the bytes of IP packets by node.
+    """
 
     def __init__(
         self,
         settings: Settings,
-        endpoints: ForwardedEndpoints,
+        endpoints: Holders[Holder],
         tasks: Tasks,
         problems: Problems,
         clock: Clock,
@@ -50,15 +53,12 @@ class KernelPlane:
         self._tools = tools or Tools()
         self._table = KernelTable(Table(settings.master_port), self._tools)
         self._accounts = KernelAccounts()
-        self._syncer = ForwardSyncer(endpoints, self._table, self._accounts, problems, clock)
+        self.syncer = ForwardSyncer(endpoints, self._table, self._accounts, problems, clock)
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
-        self._logged: dict[ForwardedEndpoint, str] = {}
-        self._traffic = Traffic()
-
-    @property
-    def usable(self) -> bool:
-        """Whether the kernel may forward at all."""
-        return self._syncer.usable
+        self.traffic = Traffic()
+        self._wanted = settings.data_plane in ("auto", "kernel")
+        copies = settings.data_plane == "copy" or not hasattr(os, "splice")
+        self._user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
         """Make the table if that is possible; to be called before any port listens.
@@ -67,17 +67,17 @@ class KernelPlane:
         former process left stay until it is known whose they are.
         """
         mode = self._settings.data_plane
-        self._syncer.read_host()
+        self.syncer.look_around()
         if not self._wanted:
-            self._syncer.refuse(f"{OPTION} {mode}")
+            self.syncer.why_not = f"{OPTION} {mode}"
             return
         if why := await why_not(mode, self._tools):
-            self._syncer.refuse(why)
+            self.syncer.why_not = why
         else:
-            await self._syncer.begin()
+            await self.syncer.begin()
         self._report()
-        if self.usable:
-            self._tasks.repeat(self._syncer.run_once, 0, "forwarding in the kernel")
+        if self.syncer.usable:
+            self._tasks.repeat(self.syncer.run_once, 0, "forwarding in the kernel")
             self._tasks.repeat(self.look, LOOK_INTERVAL, "looking at the kernel's counters")
 
     async def stop(self) -> None:
@@ -85,17 +85,13 @@ class KernelPlane:
 
         To be called when no task runs any more.
         """
-        was = self.usable
-        self._syncer.refuse("the proxy has stopped")
+        was = self.syncer.usable
+        self.syncer.why_not = "the proxy has stopped"
         await self._tools.settled()
         if was:
             await self._table.remove()
 
-    def note_change(self, endpoint: ForwardedEndpoint | None = None) -> None:
-        """Note that an endpoint has changed, or any."""
-        self._syncer.note_change(endpoint)
-
-    def recovered(self, endpoints: Sequence[ForwardedEndpoint]) -> None:
+    def recovered(self, endpoints: Sequence[Holder]) -> None:
         """Note that the registry is rebuilt; what it holds gets the fast ports that it had.
 
         Also where the kernel may not forward now: subscribers may be connected to them.
@@ -103,62 +99,36 @@ class KernelPlane:
         if self._wanted:
             for endpoint in endpoints:
                 fast_ports.claim(self._endpoints.pool, endpoint)
-        self._syncer.recovered = True
-        self._syncer.note_change()
+        self.syncer.recovered = True
+        self.syncer.note_change()
 
-    def may_forward(self, endpoint: ForwardedEndpoint) -> bool:
-        """Whether an endpoint's topics could be forwarded if it had a fast port."""
-        return self._syncer.may_forward(endpoint)
-
-    async def forwards(self, endpoint: ForwardedEndpoint, tcpros_port: int) -> bool:
-        """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
-        return await self._syncer.forwards(endpoint, tcpros_port)
-
-    async def cleared(self, port: int) -> None:
-        """Wait a moment until a port is not forwarded any more."""
-        await self._syncer.cleared(port)
-
-    def log_reason(self, endpoint: ForwardedEndpoint) -> None:
-        """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
-        why = self._syncer.reason(endpoint)
-        if why and self.usable and self._logged.get(endpoint) != why:
-            self._logged[endpoint] = why
-            log.info("%s: the proxy forwards its topics: %s", endpoint.label, why)
-
-    def cut(self, endpoint: ForwardedEndpoint) -> None:
+    def cut(self, endpoint: Holder) -> None:
         """Have the kernel forget an endpoint's connections; who sends next gets a reset."""
         ports, ipv6 = self._accounts.ports_of(endpoint), ":" in endpoint.address
-        if self.usable and ports:
-            work = self._syncer.cut([(port, ipv6) for port in ports])
+        if self.syncer.usable and ports:
+            work = self.syncer.cut([(port, ipv6) for port in ports])
             self._tasks.spawn(work, f"cutting {endpoint.label}")
 
     async def look(self) -> None:
         """Take in the kernel's counters and connections, and put right what is not as wanted."""
-        self._syncer.read_host()
-        there = set(self._endpoints)
-        self._logged = {e: why for e, why in self._logged.items() if e in there}
-        if not self.usable:
-            if await self._syncer.regain():
+        self.syncer.look_around()
+        if not self.syncer.usable:
+            if await self.syncer.regain():
                 self._report()
         elif self._table.forwards or self._accounts.owners:
             await self._look()
-        self._syncer.note_change()
-
-    def tally(self) -> KernelTally:
-        """What the metrics say of it."""
-        connections = sum(endpoint.fast_connections for endpoint in self._endpoints)
-        return KernelTally(self.usable, connections, self._traffic)
+        self.syncer.note_change()
 
     def status(self) -> dict[str, Any]:
         """The plane as a whole, as JSON."""
-        plane = "kernel" if self.usable else self._user_plane
+        plane = "kernel" if self.syncer.usable else self._user_plane
         mode = self._settings.data_plane
-        return {"mode": mode, "plane": plane, "reason": self._syncer.why_not or ""}
+        return {"mode": mode, "plane": plane, "reason": self.syncer.why_not or ""}
 
-    def status_of(self, endpoint: ForwardedEndpoint) -> dict[str, Any]:
+    def status_of(self, endpoint: Holder) -> dict[str, Any]:
         """The plane of one endpoint's topics, as JSON; bytes of IP packets."""
         account = self._accounts.account(endpoint)
-        reason, port = self._syncer.reason(endpoint), endpoint.fast_port
+        reason, port = self.syncer.reason(endpoint), endpoint.fast_port
         return {
             "plane": self._user_plane if reason else "kernel",
             "port": None if port is None else self._settings.ports.advertised(port),
@@ -170,30 +140,21 @@ class KernelPlane:
             "received_rate": round(account.rates[1], 1),
         }
 
-    @property
-    def _wanted(self) -> bool:
-        return self._settings.data_plane in ("auto", "kernel")
-
-    @property
-    def _user_plane(self) -> str:
-        copies = self._settings.data_plane == "copy" or not hasattr(os, "splice")
-        return "copy" if copies else "splice"
-
     async def _look(self) -> None:
-        seen = await self._syncer.read_kernel()
+        seen = await self.syncer.read_kernel()
         if seen is None:
             return
         counters, flows = seen
         for name, sent, received in self._accounts.count(counters, self._clock()):
-            self._traffic.add("node", name, sent, received)
+            self.traffic.add("node", name, sent, received)
         self._accounts.note_peers(flows)
         unanswered = self._unanswered.look(flows, self._clock())
-        await self._syncer.take_back(
+        await self.syncer.take_back(
             {*self._accounts.unanswered, *(flow.port for flow in unanswered)}
         )
 
     def _report(self) -> None:
-        plane, why = self._user_plane, self._syncer.why_not
+        plane, why = self._user_plane, self.syncer.why_not
         if why is None:
             log.info("the kernel forwards topics: nftables table %s", self._table.table.name)
             self._problems.solved(OPTION)

@@ -1,14 +1,14 @@
 """The kernel plane: which ports the kernel forwards to where, and why it doesn't.
 
-Plain decisions; `syncer` reads and changes the kernel's table. A
-forward never sees a connection header. Should a policy ever need one (who may subscribe to what),
-`destination` is the place to answer why such an endpoint stays in user space.
+Plain decisions; `syncer` reads and changes the kernel's table. A forward never sees a connection
+header. Should a policy ever need one (who may subscribe to what), `destination` is the place to
+answer why such an endpoint stays in user space.
 """
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint
+from rosproxy.leases.fast_ports import Holder
 from rosproxy.net.addresses import HostPort, is_loopback
 
 Forwards = Mapping[int, HostPort]
@@ -29,14 +29,14 @@ class HostForwarding:
     own: Collection[str] = ()
 
 
-def destination(endpoint: ForwardedEndpoint, host: HostForwarding) -> HostPort | str:
+def destination(endpoint: Holder, host: HostForwarding) -> HostPort | str:
     """Where an endpoint's fast port may be forwarded to, or why it may not.
 
     The address is the one that the proxy found the node at, the port the one that the node itself
     named: a forged registration can't make the kernel forward to another host.
     """
     ports, address = endpoint.tcpros_ports, endpoint.address
-    if not endpoint.answers:
+    if endpoint.is_down or not endpoint.trusted:
         return "the node does not answer"
     if not ports:
         return "nobody outside has asked for a topic of it yet"
@@ -45,16 +45,12 @@ def destination(endpoint: ForwardedEndpoint, host: HostForwarding) -> HostPort |
     if is_loopback(address) or address in host.own:
         return "the node runs in the network namespace of the proxy itself"
     if not (host.ipv6 if ":" in address else host.ipv4):
-        return f"{_FORWARDING[':' in address]} is not 1 in the proxy's network namespace"
+        missing = "net.ipv6.conf.all.forwarding" if ":" in address else "net.ipv4.ip_forward"
+        return f"{missing} is not 1 in the proxy's network namespace"
     return HostPort(address, next(iter(ports)))
 
 
-_FORWARDING = ("net.ipv4.ip_forward", "net.ipv6.conf.all.forwarding")
-
-
-def kept(
-    now: Forwards, endpoints: Iterable[ForwardedEndpoint], recovered: bool
-) -> dict[int, HostPort]:
+def kept(now: Forwards, endpoints: Iterable[Holder], recovered: bool) -> dict[int, HostPort]:
     """The forwards from before a restart that nothing is known against yet.
 
     Until the registry is rebuilt these are all; after that those of endpoints whose node has not
@@ -67,7 +63,7 @@ def kept(
 
 
 def unchanged(
-    now: Forwards, owners: Mapping[int, ForwardedEndpoint], changed: Collection[ForwardedEndpoint]
+    now: Forwards, owners: Mapping[int, Holder], changed: Collection[Holder]
 ) -> dict[int, HostPort]:
     """The forwards of all endpoints that still have them, without those that have changed."""
     found = ((port, where, owners.get(port)) for port, where in now.items())

@@ -17,7 +17,7 @@ _IPV6 = Path("/proc/sys/net/ipv6/conf/all/forwarding")
 
 def read_forwarding() -> HostForwarding:
     """What this network namespace forwards."""
-    return HostForwarding(ipv4=_says_one(_IPV4), ipv6=_says_one(_IPV6))
+    return HostForwarding(ipv4=_read(_IPV4) == "1", ipv6=_read(_IPV6) == "1")
 
 
 async def why_not(mode: DataPlane, tools: Tools) -> str | None:
@@ -29,7 +29,7 @@ async def why_not(mode: DataPlane, tools: Tools) -> str | None:
     for reason in _reasons(mode):
         return reason
     try:
-        chains = dropping_chains(await tools.nft("list", "chains"))
+        chains = dropping_chains(await tools.nft("-j", "list", "chains"))
     except (ToolError, NftError) as error:
         return str(error)
     if chains:
@@ -71,13 +71,9 @@ def _hardware() -> str | None:
     return next((path.name for path in names if (path / "device").exists()), None)
 
 
-def _says_one(path: Path) -> bool:
-    return _read(path).strip() == "1"
-
-
 def _read(path: Path) -> str:
     """A file's text; nothing if there is none, or it is not for this user."""
     try:
-        return path.read_text(encoding="ascii")
+        return path.read_text(encoding="ascii").strip()
     except OSError:
         return ""

@@ -7,8 +7,8 @@ so that a thousand that come one by one don't make a million.
 
 Where an endpoint may be forwarded to is decided in `policy`. What that depends on is kept here:
 what this network namespace forwards, which addresses are the proxy's own, forwards that failed of
-late, and why the kernel may forward nothing at all (``why_not``). That is changed by `begin`,
-`refuse` and a table that can't be made any more, and by nobody else.
+late, and why the kernel may forward nothing at all (``why_not``). That is changed by `begin`, by a
+table that can't be made any more, by `plane` when it starts and stops, and by nobody else.
 """
 
 import asyncio
@@ -18,22 +18,16 @@ import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 
+from rosproxy.forwarding.kernel import policy
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.endpoints import ForwardedEndpoint, ForwardedEndpoints
 from rosproxy.forwarding.kernel.nft import Counters, NftError
-from rosproxy.forwarding.kernel.policy import (
-    Changes,
-    HostForwarding,
-    Pauses,
-    destination,
-    kept,
-    unchanged,
-)
+from rosproxy.forwarding.kernel.policy import Changes, HostForwarding
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases import fast_ports
+from rosproxy.leases.fast_ports import Holder, Holders
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import address_towards
 from rosproxy.telemetry.problems import Problems
@@ -61,7 +55,7 @@ class ForwardSyncer:
 
     def __init__(
         self,
-        endpoints: ForwardedEndpoints,
+        endpoints: Holders[Holder],
         table: KernelTable,
         accounts: KernelAccounts,
         problems: Problems,
@@ -70,11 +64,12 @@ class ForwardSyncer:
         self._endpoints, self._table, self._accounts = endpoints, table, accounts
         self._problems, self._clock = problems, clock
         self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
-        self._changed: set[ForwardedEndpoint] = set()
+        self._changed: set[Holder] = set()
         self._all = True
-        self._host, self._pauses = HostForwarding(), Pauses()
+        self._host, self._pauses = HostForwarding(), policy.Pauses()
         self._own: dict[str, bool] = {}
         self._own_until, self._retry_at = 0.0, float("inf")
+        self._logged: dict[Holder, str] = {}
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 
@@ -101,17 +96,15 @@ class ForwardSyncer:
         self._retry_at = float("inf") if self.usable else self._clock() + RETRY_LOST
         return self.usable
 
-    def refuse(self, why: str) -> None:
-        """Forward nothing from now on, for a reason."""
-        self.why_not = why
-
-    def read_host(self) -> None:
-        """Take in what this network namespace forwards now, and at times its own addresses."""
+    def look_around(self) -> None:
+        """Take in who is left, what this network namespace forwards, at times its addresses."""
+        there = set(self._endpoints)
+        self._logged = {e: why for e, why in self._logged.items() if e in there}
         self._host = read_forwarding()
         if self._clock() > self._own_until:
             self._own, self._own_until = {}, self._clock() + OWN_TTL
 
-    def note_change(self, endpoint: ForwardedEndpoint | None = None) -> None:
+    def note_change(self, endpoint: Holder | None = None) -> None:
         """Note that an endpoint has changed, or any."""
         if endpoint is not None and self.usable:
             self._changed.add(endpoint)
@@ -124,11 +117,11 @@ class ForwardSyncer:
         await self._wake.wait()
         await self._sync()
 
-    def may_forward(self, endpoint: ForwardedEndpoint) -> bool:
+    def may_forward(self, endpoint: Holder) -> bool:
         """Whether an endpoint's topics could be forwarded if it had a fast port."""
         return isinstance(self._target(endpoint), HostPort)
 
-    def reason(self, endpoint: ForwardedEndpoint) -> str:
+    def reason(self, endpoint: Holder) -> str:
         """Why an endpoint's topics are not forwarded by the kernel; nothing if they are."""
         where = self._target(endpoint)
         if isinstance(where, str):
@@ -138,33 +131,36 @@ class ForwardSyncer:
         made = self._table.forwards.get(endpoint.fast_port) == where
         return "" if made else "about to be forwarded"
 
-    async def forwards(self, endpoint: ForwardedEndpoint, tcpros_port: int) -> bool:
+    def log_reason(self, endpoint: Holder) -> None:
+        """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
+        why = self.reason(endpoint)
+        if why and self.usable and self._logged.get(endpoint) != why:
+            self._logged[endpoint] = why
+            log.info("%s: the proxy forwards its topics: %s", endpoint.label, why)
+
+    async def forwards(self, endpoint: Holder, tcpros_port: int) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
-        if self._leads(endpoint, tcpros_port):
-            return True
-        self.note_change(endpoint)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SYNC_PATIENCE):
-                while self.may_forward(endpoint) and not self._leads(endpoint, tcpros_port):
-                    await self._done.wait()
-        return self._leads(endpoint, tcpros_port)
+
+        def leads() -> bool:
+            where, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
+            return self.usable and port is not None and self._table.forwards.get(port) == where
+
+        if not leads():
+            self.note_change(endpoint)
+            await self._wait_until(lambda: leads() or not self.may_forward(endpoint))
+        return leads()
 
     async def cleared(self, port: int) -> None:
         """Wait a moment until a port is not forwarded any more."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(SYNC_PATIENCE):
-                while self.usable and port in self._table.forwards:
-                    await self._done.wait()
+        await self._wait_until(lambda: not self.usable or port not in self._table.forwards)
 
     async def read_kernel(self) -> tuple[Counters, list[Flow]] | None:
-        """The kernel's counters and connections.
-
-        None if they can't be read; the table is then made again.
-        """
+        """The kernel's counters and connections; None if the table had to be made again."""
         async with self._lock:
             self._accounts.note_owners(self._endpoints)
+            ipv6 = any(":" in endpoint.address for endpoint in self._accounts.owners.values())
             try:
-                return await self._table.look(), await self._table.flows(self._has_ipv6())
+                return await self._table.look(), await self._table.flows(ipv6)
             except (ToolError, NftError) as error:
                 log.warning("%s; making the table again", error)
                 self._all = True
@@ -189,28 +185,25 @@ class ForwardSyncer:
         await self._sync()
         await self._table.forget(ports)
 
-    def _target(self, endpoint: ForwardedEndpoint) -> HostPort | str:
+    def _target(self, endpoint: Holder) -> HostPort | str:
         """Where an endpoint's topics may be forwarded to, or why they may not."""
         if self.why_not is not None:
             return self.why_not
         address = endpoint.address
-        own = {address} if self._is_own(address) else ()
-        where = destination(endpoint, replace(self._host, own=own))
+        if address not in self._own:
+            self._own[address] = address_towards(address) == address
+        own = {address} if self._own[address] else ()
+        where = policy.destination(endpoint, replace(self._host, own=own))
         if isinstance(where, str) or endpoint.fast_port is None:
             return where
         return self._pauses.why(endpoint.fast_port, where, self._clock()) or where
 
-    def _is_own(self, address: str) -> bool:
-        if address not in self._own:
-            self._own[address] = address_towards(address) == address
-        return self._own[address]
-
-    def _leads(self, endpoint: ForwardedEndpoint, tcpros_port: int) -> bool:
-        where, port = HostPort(endpoint.address, tcpros_port), endpoint.fast_port
-        return self.usable and port is not None and self._table.forwards.get(port) == where
-
-    def _has_ipv6(self) -> bool:
-        return any(":" in endpoint.address for endpoint in self._accounts.owners.values())
+    async def _wait_until(self, is_so: Callable[[], bool]) -> None:
+        """Wait a moment for the worker, which may make something so."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(SYNC_PATIENCE):
+                while not is_so():
+                    await self._done.wait()
 
     async def _sync(self) -> None:
         async with self._lock:
@@ -234,24 +227,21 @@ class ForwardSyncer:
         try:
             await self._table.make(wanted)
         except ToolError as error:
-            self._lose(str(error))
-
-    def _lose(self, why: str) -> None:
-        self._all, self.why_not = True, why
-        self._retry_at = self._clock() + RETRY_LOST
-        self._accounts.note_peers([])
-        text = f"topics are no longer forwarded by the kernel: {why}"
-        log.error("%s", text)
-        self._problems.add(OPTION, text)
+            self._all, self.why_not = True, str(error)
+            self._retry_at = self._clock() + RETRY_LOST
+            self._accounts.note_peers([])
+            text = f"topics are no longer forwarded by the kernel: {error}"
+            log.error("%s", text)
+            self._problems.add(OPTION, text)
 
     def _wanted(self) -> dict[int, HostPort]:
         now = self._table.forwards
         changed, self._changed = self._changed, set()
         if self._all or not self.recovered:
             self._all, changed = False, set(self._endpoints)
-            wanted = kept(now, changed, self.recovered)
+            wanted = policy.kept(now, changed, self.recovered)
         else:
-            wanted = unchanged(now, self._accounts.owners, changed)
+            wanted = policy.unchanged(now, self._accounts.owners, changed)
         for endpoint in changed:
             where = self._target(endpoint) if endpoint.fast_port else ""
             held = self._endpoints.by_port.get(endpoint.port) is endpoint

@@ -89,7 +89,8 @@ class KernelTable:
         self.counted |= set(forwards)
 
     async def _read(self) -> TableState:
-        return self.table.read(await self.tools.nft("list", "table", "inet", self.table.name))
+        listed = await self.tools.nft("-j", "list", "table", "inet", self.table.name)
+        return self.table.read(listed)
 
     async def _forget(self, mark: str, ipv6: bool, state: str = "") -> None:
         try:

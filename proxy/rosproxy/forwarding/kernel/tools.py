@@ -20,6 +20,7 @@ REMEDY = (
     "give the proxy's container the capability NET_ADMIN (cap_add: NET_ADMIN) and run it without "
     "no-new-privileges"
 )
+_PACKAGES = {"nft": "nftables", "conntrack": "conntrack"}
 
 
 class ToolError(Exception):
@@ -38,35 +39,25 @@ class Tools:
             await asyncio.wait(self._running)
 
     async def nft(self, *words: str, document: str = "") -> str:
-        """Run ``nft -j``, with a document on its standard input; what it prints.
-
-        Raises ToolError.
-        """
-        return await self._run("nft", "nftables", ["-j", *words], document)
+        """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
+        return await self._run("nft", *words, document=document)
 
     async def list_flows(self, mark: str, ipv6: bool) -> str:
         """The TCP connections with a mark (``value/mask``). Raises ToolError."""
-        return await self._conntrack("-L", mark, ipv6)
+        return await self._run("conntrack", "-L", *_selection(mark, ipv6))
 
     async def forget_flows(self, mark: str, ipv6: bool, state: str = "") -> None:
         """Delete the TCP connections with a mark, of one state if given. Raises ToolError."""
+        more = ["--state", state] if state else []
         try:
-            await self._conntrack("-D", mark, ipv6, *(["--state", state] if state else []))
+            await self._run("conntrack", "-D", *_selection(mark, ipv6), *more)
         except ToolError as error:
             if "0 flow entries" not in str(error):
                 raise
 
-    async def _conntrack(self, verb: str, mark: str, ipv6: bool, *more: str) -> str:
-        family = ["-f", "ipv6" if ipv6 else "ipv4"]
-        words = [verb, *family, "-p", "tcp", "--mark", mark, *more]
-        return await self._run("conntrack", "conntrack", words)
-
-    async def _run(self, name: str, package: str, words: list[str], document: str = "") -> str:
-        program = _find(name)
-        if program is None:
-            raise ToolError(f"{name} is not installed where the proxy runs: install {package}")
+    async def _run(self, name: str, *words: str, document: str = "") -> str:
         loop = asyncio.get_running_loop()
-        run = loop.run_in_executor(None, _run, [program, *words], document)
+        run = loop.run_in_executor(None, _run, [_find(name), *words], document)
         self._running.add(run)
         run.add_done_callback(self._ended)
         await asyncio.wait({run})
@@ -79,12 +70,17 @@ class Tools:
             run.exception()
 
 
-def _find(name: str) -> str | None:
-    own = IMAGE_FOLDER / name
-    if os.access(own, os.X_OK):
-        return str(own)
-    path = os.pathsep.join([os.environ.get("PATH", ""), *SYSTEM_FOLDERS])
-    return shutil.which(name, path=path)
+def _selection(mark: str, ipv6: bool) -> list[str]:
+    return ["-f", "ipv6" if ipv6 else "ipv4", "-p", "tcp", "--mark", mark]
+
+
+def _find(name: str) -> str:
+    folders = [str(IMAGE_FOLDER), os.environ.get("PATH", ""), *SYSTEM_FOLDERS]
+    program = shutil.which(name, path=os.pathsep.join(folders))
+    if program is None:
+        package = _PACKAGES[name]
+        raise ToolError(f"{name} is not installed where the proxy runs: install {package}")
+    return program
 
 
 def _run(command: list[str], document: str) -> str:
@@ -106,11 +102,7 @@ def _run(command: list[str], document: str) -> str:
     except OSError as error:
         raise ToolError(f"{command[0]} can't run: {error.strerror}") from None
     if done.returncode != 0:
-        raise ToolError(_complaint(command[0], done.stderr))
+        said = " ".join(done.stderr.split())[:300]
+        refused = "not permitted" in said or "you must be root" in said
+        raise ToolError(f"{command[0]}: {said}" + (f": {REMEDY}" if refused else ""))
     return done.stdout
-
-
-def _complaint(program: str, said: str) -> str:
-    text = " ".join(said.split())[:300]
-    refused = "not permitted" in text or "you must be root" in text
-    return f"{program}: {text}" + (f": {REMEDY}" if refused else "")

@@ -21,9 +21,9 @@ from typing import Any
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
-from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.interfaces import address_towards
+from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias import policy
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
