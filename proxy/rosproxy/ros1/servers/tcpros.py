@@ -13,7 +13,6 @@ from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
@@ -32,8 +31,8 @@ class TcprosServer:
     a reply or registration is never used, so none can lead to another inside host.
     """
 
-    def __init__(self, context: Context, nodes: NodeClient) -> None:
-        self._context, self._nodes = context, nodes
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._may_splice = context.settings.data_plane != "copy"
         self._relays = OpenRelays()
         self._ended = Traffic()
@@ -108,7 +107,7 @@ class TcprosServer:
         return await asyncio.shield(asking)
 
     async def _ask_port(self, endpoint: Endpoint) -> int | None:
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         endpoint.replace_tcpros_ports(info.tcpros_port if info else None)
         return endpoint.tcpros_port
 

@@ -7,8 +7,8 @@ no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 
 import asyncio
 import logging
 import socket
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -16,9 +16,11 @@ from aiohttp import HttpVersion, HttpVersion11, web
 
 from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
 from rosproxy.net.http_client import pieces, read_bounded
-from rosproxy.net.sockets import reset_on_close
+from rosproxy.net.sockets import peek, reset_on_close
 from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
+from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +48,6 @@ class IncomingCall:
         """Whether a proxy itself made this call."""
         return self.loop_id.partition(" ")[0] == instance
 
-    def with_body(self, body: bytes) -> "IncomingCall":
-        """The same call with another body."""
-        other = copy(self)
-        other.body = body
-        return other
-
     @property
     def reached_locally(self) -> bool:
         """Whether the caller named the very address and port of this machine that it reached.
@@ -66,23 +62,38 @@ XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
 """Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
 
 
-class PortConnections:
-    """The connections of a port; those that have ended are forgotten now and then."""
+async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[bytes]) -> bytes:
+    """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
+    try:
+        answer = await reply
+    except Unreachable:
+        metrics.count(api, method, "unreachable")
+        raise
+    metrics.count(api, method, "answered")
+    return answer
 
-    def __init__(self) -> None:
-        self._known: list[web.RequestHandler] = []
-        self._enough = 16
 
-    def add(self, handler: web.RequestHandler) -> None:
-        """Take one in; all are looked at only once their number has doubled."""
-        self._known.append(handler)
-        if len(self._known) > self._enough:
-            self._known = self.alive()
-            self._enough = max(16, 2 * len(self._known))
+class _HttpServer(web.Server):
+    """aiohttp's server, which knows its open connections by the port that they came in on."""
 
-    def alive(self) -> list[web.RequestHandler]:
-        """Those that are open."""
-        return [handler for handler in self._known if handler.transport is not None]
+    def __init__(self, handler: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
+        super().__init__(handler, access_log=None, keepalive_timeout=75)
+        self.by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
+        self._ports: dict[web.RequestHandler, int] = {}
+
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Take a connection in."""
+        super().connection_made(handler, transport)
+        port = self._ports[handler] = transport.get_extra_info("sockname")[1]
+        self.by_port[port].add(handler)
+
+    def connection_lost(
+        self, handler: web.RequestHandler, exc: BaseException | None = None
+    ) -> None:
+        """Forget a connection."""
+        super().connection_lost(handler, exc)
+        port = self._ports.pop(handler, 0)
+        self.by_port[port].discard(handler)
 
 
 class XmlRpcServer:
@@ -90,26 +101,34 @@ class XmlRpcServer:
 
     def __init__(self, service: XmlRpcService, greeting: str) -> None:
         self._service, self._greeting = service, greeting
-        self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
-        self._by_port: dict[int, PortConnections] = {}
+        self._server = _HttpServer(self._handle)
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
-    async def serve(self, conn: socket.socket) -> None:
-        """Take over a connection. Raises OSError if it has ended already."""
-        port, loop = conn.getsockname()[1], asyncio.get_running_loop()
-        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
-        self._mute.add(handler)
-        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
-        self._by_port.setdefault(port, PortConnections()).add(handler)
+    async def dispatch(
+        self, conn: socket.socket, relay: Callable[[socket.socket], Awaitable[None]] | None = None
+    ) -> None:
+        """Take a connection over, or hand it to ``relay`` if it is TCPROS; without, all is HTTP.
+
+        In both protocols the client speaks first, and four bytes tell them apart: letters are an
+        HTTP method, anything else the length of a connection header. They are only peeked at. One
+        that ends before it has said anything is closed. Raises TimeoutError, OSError.
+        """
+        first = await peek(conn, 4)
+        if first and (relay is None or speaks_http(first)):
+            await self._serve(conn)
+        elif len(first) < 4 or relay is None:
+            conn.close()
+        else:
+            await relay(conn)
 
     def connections(self, port: int) -> int:
         """How many connections are open that came in on a port."""
-        return len(self._by_port[port].alive()) if port in self._by_port else 0
+        return len(self._server.by_port[port])
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in self._by_port.pop(port, PortConnections()).alive():
+        for handler in list(self._server.by_port[port]):
             if handler in self._busy:
                 handler.close()
             else:
@@ -118,6 +137,12 @@ class XmlRpcServer:
     async def close(self) -> None:
         """Close all connections."""
         await self._server.shutdown(STOP_TIMEOUT)
+
+    async def _serve(self, conn: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
+        self._mute.add(handler)
+        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
 
     def _close_mute(self, handler: web.RequestHandler) -> None:
         if handler in self._mute:

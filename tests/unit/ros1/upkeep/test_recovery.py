@@ -1,6 +1,6 @@
 """Recovery from what the master knows: claims, who bears them out, and what the master lost."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from ipaddress import ip_network
 
 import pytest
@@ -12,15 +12,15 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import InsidePath
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
-from rosproxy.ros1.upkeep.recovery import policy
-from rosproxy.ros1.upkeep.recovery.policy import Claim
+from rosproxy.ros1.upkeep.policy import recovery as policy
+from rosproxy.ros1.upkeep.policy.recovery import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
 
-PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+PUB, SRV = Kind.PUBLISHER, Kind.SERVICE
 
 
-def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
-    return Registration(kind, name, caller_id, since=since)
+def held(name: str, caller_id: str = "/n") -> Registration:
+    return Registration(PUB, name, caller_id)
 
 
 def graph(uris: dict[str, str], names: Sequence[str] = ("/a",)) -> Graph:
@@ -88,47 +88,44 @@ def test_a_node_without_registrations_or_without_a_uri() -> None:
     assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing) == []
 
 
-def claim(port: int, address: str, topics: Sequence[str] = (), slave: int = 40001) -> Claim:
+def claim(
+    port: int,
+    address: str,
+    topics: Sequence[str] = (),
+    said: Collection[str] | None = None,
+    slave: int = 40001,
+) -> Claim:
     inside = InsidePath(HostPort(address, slave))
-    return Claim(port, inside, [held(topic) for topic in topics])
+    return Claim(
+        port, inside, [held(topic) for topic in topics], None if said is None else set(said)
+    )
 
 
 A, B = "10.0.0.5", "10.0.0.6"
 SETTLED = [
-    # claims, what the nodes asked said (by index), the ports and addresses kept
-    ([], {}, []),
-    ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], {}, [(1, A), (2, B)]),
+    # claims: port, address, topics at the master, topics that the node asked said; who is kept
+    ([], []),
+    ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], [(1, A), (2, B)]),
     # one port, two nodes: a left-over, or a forgery of many topics that no node bears out
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: {"/a"}}, [(1, A)]),
-    ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"])], {0: None, 1: {"/b"}}, [(1, B)]),
-    ([claim(1, A, ["/a"]), claim(1, B, ["/b"])], {0: {"/x"}, 1: {"/b"}}, [(1, B)]),
+    ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/a", "/b"])], [(1, A)]),
+    ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
+    ([claim(1, A, ["/a"], ["/x"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
     # a forgery that leads to a real node, but claims too much of it
-    (
-        [claim(1, A, ["/a", "/b"]), claim(1, B, ["/c", "/x", "/y"])],
-        {0: {"/a", "/b"}, 1: {"/c"}},
-        [(1, A)],
-    ),
+    ([claim(1, A, ["/a", "/b"], ["/a", "/b"]), claim(1, B, ["/c", "/x", "/y"], ["/c"])], [(1, A)]),
     # one node, two ports: as many topics as it has, no more
-    (
-        [claim(1, A, ["/a"]), claim(2, A, ["/a", "/b"])],
-        {0: {"/a", "/b"}, 1: {"/a", "/b"}},
-        [(2, A)],
-    ),
+    ([claim(1, A, ["/a"], ["/a", "/b"]), claim(2, A, ["/a", "/b"], ["/a", "/b"])], [(2, A)]),
     # nobody answered: the one with more registrations
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {}, [(1, B)]),
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: None, 1: None}, [(1, B)]),
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], [(1, B)]),
     # an answer that bears out nothing is still better than none
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: set()}, [(1, A)]),
+    ([claim(1, A, ["/a"], []), claim(1, B, ["/a", "/b"])], [(1, A)]),
 ]
 
 
-@pytest.mark.parametrize(("found", "said", "kept"), SETTLED)
+@pytest.mark.parametrize(("found", "kept"), SETTLED)
 def test_one_claim_is_kept_for_each_port_and_each_node(
-    found: list[Claim], said: dict[int, set[str] | None], kept: list[tuple[int, str]]
+    found: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
-    answers = {i: None if topics is None else frozenset(topics) for i, topics in said.items()}
-    settled = policy.settle(found, answers)
-    assert sorted((one.port, one.address) for one in settled) == kept
+    assert sorted((one.port, one.address) for one in policy.settle(found)) == kept
 
 
 @pytest.mark.parametrize(
@@ -147,22 +144,14 @@ def test_claims_to_the_same_port_or_node_are_contested(
     assert [one.port for one in policy.contested(found)] == ports
 
 
-CLAIMS = st.lists(
-    st.builds(
-        claim,
-        st.integers(1, 4),
-        st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"]),
-        st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True),
-    ),
-    max_size=6,
-)
+TOPICS = st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True)
+ADDRESSES = st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"])
+CLAIMS = st.builds(claim, st.integers(1, 4), ADDRESSES, TOPICS, st.none() | TOPICS)
 
 
-@given(CLAIMS, st.dictionaries(st.integers(0, 5), st.none() | st.frozensets(st.sampled_from("ab"))))
-def test_settling_leaves_no_contest_and_forgets_nobody_without_one(
-    found: list[Claim], said: dict[int, frozenset[str] | None]
-) -> None:
-    settled = policy.settle(found, said)
+@given(st.lists(CLAIMS, max_size=6))
+def test_settling_leaves_no_contest_and_forgets_nobody_without_one(found: list[Claim]) -> None:
+    settled = policy.settle(found)
     assert policy.contested(settled) == []
     rivals = policy.contested(found)
     assert all(one in settled for one in found if one not in rivals)

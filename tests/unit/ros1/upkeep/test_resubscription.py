@@ -7,8 +7,8 @@ import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.policy import resubscription as policy
+from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE

@@ -7,7 +7,7 @@ served (`confirmed_by`).
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -17,16 +17,19 @@ from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
-_EVERYBODYS = frozenset({"/rosout"})
 
 
 @dataclass(slots=True)
 class Claim:
-    """An endpoint that the master's data tell of: its port, its inside address, what it holds."""
+    """An endpoint that the master's data tell of: its port, its inside address, what it holds.
+
+    ``said`` are the topics that the node there names; None if it was not asked or gave no answer.
+    """
 
     port: int
     inside: InsidePath
     registrations: list[Registration] = field(default_factory=list)
+    said: set[str] | None = None
 
     @property
     def address(self) -> str:
@@ -53,8 +56,7 @@ def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     """The endpoints of this proxy among the nodes of a master."""
     found: dict[str, Claim] = {}
     for node, uri in graph.uris.items():
-        ours = addressing.identify(uri)
-        if ours:
+        if ours := addressing.identify(uri):
             found.setdefault(uri, Claim(*ours)).registrations += graph.held.get(node, [])
     return list(found.values())
 
@@ -65,23 +67,16 @@ def contested(found: Sequence[Claim]) -> list[Claim]:
     return [claim for claim in found if ports[claim.port] > 1 or keys[claim.key] > 1]
 
 
-def settle(found: Sequence[Claim], said: Mapping[int, frozenset[str] | None]) -> list[Claim]:
-    """One claim per port and inside address: the one that its node bears out best.
+def settle(found: Sequence[Claim]) -> list[Claim]:
+    """One claim per port and inside address: the one that its node bears out best."""
 
-    ``said`` gives, by index, the topics that the node there names; nothing or None where it was
-    not asked or gave no answer.
-    """
-
-    def merit(index: int) -> tuple[int, int]:
-        claim, topics = found[index], said.get(index)
-        if topics is None:
-            return NO_MERIT, len(claim.registrations)
-        return len(claim.topics & topics) - len(claim.topics - topics), len(claim.registrations)
+    def merit(claim: Claim) -> tuple[int, int]:
+        topics, said, count = claim.topics, claim.said, len(claim.registrations)
+        return NO_MERIT if said is None else len(topics & said) - len(topics - said), count
 
     ports: dict[int, Claim] = {}
     keys: set[tuple[str, int]] = set()
-    for index in sorted(range(len(found)), key=merit, reverse=True):
-        claim = found[index]
+    for claim in sorted(found, key=merit, reverse=True):
         if claim.port not in ports and claim.key not in keys:
             ports[claim.port] = claim
             keys.add(claim.key)
@@ -94,5 +89,5 @@ def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
     A forged URI that leads to something other than the node of that name finds no answer here,
     or one of another node.
     """
-    telling = endpoint.topics - _EVERYBODYS
+    telling = endpoint.topics - {"/rosout"}  # everybody's
     return bool((telling or endpoint.topics) & topics)

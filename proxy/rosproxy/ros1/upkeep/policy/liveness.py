@@ -1,21 +1,52 @@
-"""Which endpoints it concerns that containers are gone or have other addresses.
+"""When a node is probed, when it counts as gone or moved, and when its port is free again.
 
-An operator knows it before any time-out can tell, but its events may be late, or about an address
-that another container has by now. So each is a hint, and the node itself is asked before anything
-is done.
+An operator knows that a container is gone or has moved before any time-out can tell, but its
+events may be late, or about an address that another container has by now. So each is a hint, and
+the node itself is asked before anything is done.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import UNKNOWN_PID, ProbeResult
-from rosproxy.ros1.upkeep.recovery.policy import confirmed_by
+from rosproxy.ros1.upkeep.policy.recovery import confirmed_by
+
+DIRECT_INTERVAL = 2.0
+"""Seconds between probes, at most, of a node that registered around the proxy."""
+FORGET_AFTER = 3600.0
+"""Seconds after which a node that was cleaned up while it was silent is forgotten."""
+NO_PATIENCE = 0.001
+"""Seconds: less than between any two probes. Zero would mean that nothing is ever cleaned up."""
 
 
-def at(endpoints: Iterable[Endpoint], addresses: Collection[str]) -> list[Endpoint]:
-    """The endpoints at some addresses."""
-    return [endpoint for endpoint in endpoints if endpoint.place.address in addresses]
+def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
+    """Whether it is time to probe a node; ``interval`` is that of idle nodes in seconds."""
+    return endpoint.health.due(now, min(interval, DIRECT_INTERVAL) if endpoint.direct else interval)
+
+
+def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
+    """Whether a node has been down for long enough (``after`` seconds; 0: never).
+
+    One that registered around the proxy has unregistered there as well, to no effect; so it
+    keeps nothing once it has ended.
+    """
+    if endpoint.direct and endpoint.health.refused:
+        after = min(after, NO_PATIENCE)
+    return endpoint.health.clean_up(now, after)
+
+
+def is_unused(endpoint: Endpoint) -> bool:
+    """Whether nobody needs an endpoint's port, so that the lease may end."""
+    if endpoint.connected or endpoint.pending:
+        return False
+    return endpoint.idle or endpoint.health.cleaned
+
+
+def lease_lasts(endpoint: Endpoint, linger: float) -> float:
+    """Seconds for which an unused lease lasts; a node that was just silent may come back."""
+    health = endpoint.health
+    return FORGET_AFTER if health.cleaned and not (health.refused or health.over) else linger
 
 
 def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
@@ -31,11 +62,6 @@ def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint
         if probe is ProbeResult.REFUSED
         or (probe is ProbeResult.SILENT and not _registered_since(endpoint, since))
     ]
-
-
-def _registered_since(endpoint: Endpoint, since: float) -> bool:
-    held = endpoint.registrations.values()
-    return endpoint.pending > 0 or any(one.since >= since for one in held)
 
 
 def movable(
@@ -70,3 +96,8 @@ def is_same_process(endpoint: Endpoint, pid: int | None, topics: set[str]) -> bo
     if pid is None or (known not in UNKNOWN_PID and known != pid):
         return False
     return confirmed_by(endpoint, topics) if endpoint.topics else known == pid
+
+
+def _registered_since(endpoint: Endpoint, since: float) -> bool:
+    held = endpoint.registrations.values()
+    return endpoint.pending > 0 or any(one.since >= since for one in held)
