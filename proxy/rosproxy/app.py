@@ -7,6 +7,7 @@ in turn may close the port (``leases.server``).
 
 import asyncio
 import logging
+from functools import partial
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
@@ -21,8 +22,8 @@ from rosproxy.net import limits, sockets
 from rosproxy.net.acceptor import Acceptor
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
-from rosproxy.ros1.api.master import MasterApi, PublishedMaster
-from rosproxy.ros1.api.slave import NodeServer, SlaveApi
+from rosproxy.ros1.api.master import MasterApi, serve_published
+from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
@@ -68,10 +69,8 @@ class App:
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
         self.master_monitor = MasterMonitor(context, self._recovery, registrar)
         self._adopter = Adopter(context, leases, self._admission, registrar)
-        slave = SlaveApi(context, leases, self.alias, self._adopter)
-        slaves = XmlRpcServer(slave, "rosproxy: slave API of a ROS node behind it\n")
-        leases.server = NodeServer(slaves, self.tcpros)
-        self._servers = [slaves]
+        leases.server = slave = SlaveApi(context, leases, self.alias, self._adopter, self.tcpros)
+        self._servers = [slave.server]
         self._acceptors: list[Acceptor] = []
         self._admin = self._make_admin()
 
@@ -85,7 +84,7 @@ class App:
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
-            published = PublishedMaster(self.context, str(where))
+            published = partial(serve_published, self.context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
         self.context.metrics.registry.register(
             StateCollector(
@@ -112,7 +111,9 @@ class App:
         await self.context.tasks.cancel()
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(self._admin.stop(), self.tcpros.stop(), self.alias.stop(), *servers)
+        await asyncio.gather(
+            self._admin.stop(), self.tcpros.relays.stop(), self.alias.stop(), *servers
+        )
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class StateCollector(Collector):
         yield _gauge(
             "alias_ports",
             "Ports that stand in for nodes on the master's host.",
-            len(self._alias),
+            len(self._alias.status()),
         )
         yield _gauge("master_up", "Whether the master answers.", int(bool(self._monitor.up)))
         yield self._endpoints()

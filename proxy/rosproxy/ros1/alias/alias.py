@@ -56,10 +56,6 @@ class Alias:
         self._server = XmlRpcServer(self._forward, "rosproxy: a ROS node on the master's host\n")
         self._closed = False
 
-    def __len__(self) -> int:
-        """How many ports stand in for nodes."""
-        return len(self._acceptors)
-
     async def listen_for(self, uris: Iterable[str]) -> None:
         """Have the ports listen that these URIs lead to, before an inside node is given them."""
         if self._address is None or self._closed:
@@ -180,7 +176,7 @@ class Alias:
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._relays)
-        counts.update({port: self._server.connections(port) for port in self._acceptors})
+        counts.update({port: self._server.count(port) for port in self._acceptors})
         return counts
 
     async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:

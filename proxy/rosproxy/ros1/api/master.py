@@ -43,7 +43,11 @@ class MasterApi:
 
     async def __call__(self, call: IncomingCall) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
-        self._refuse_loop(call)
+        if call.comes_from(self._context.instance):
+            what = "a node's address"
+            if call.loop_id == self._context.instance:
+                what = f"--master-uri {self._context.settings.master_uri}"
+            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics = self._context.metrics
         try:
@@ -108,27 +112,14 @@ class MasterApi:
                 own = source == fact.endpoint.place.address
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
 
-    def _refuse_loop(self, call: IncomingCall) -> None:
-        if not call.comes_from(self._context.instance):
-            return
-        what = "a node's address"
-        if call.loop_id == self._context.instance:
-            what = f"--master-uri {self._context.settings.master_uri}"
-        raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
 
-
-class PublishedMaster:
+async def serve_published(context: Context, address: str, call: IncomingCall) -> bytes:
     """The master itself for outside (``--publish-master``), where it runs inside.
 
-    What the master holds are outside addresses already; only its own URI is replaced.
+    What the master holds are outside addresses already; only its own URI is replaced. Raises
+    XmlRpcError, Unreachable.
     """
-
-    def __init__(self, context: Context, address: str) -> None:
-        self._context, self._address = context, address
-
-    async def __call__(self, call: IncomingCall) -> bytes:
-        """The master's reply to a call. Raises XmlRpcError, Unreachable."""
-        asker = Asker(call.source, call.local.host, master=self._address)
-        request = master_api.read_request(call.body, asker)
-        reply = await self._context.upstream.post_to_master(call.body)
-        return master_api.rename_master(request, reply, self._address)
+    asker = Asker(call.source, call.local.host, master=address)
+    request = master_api.read_request(call.body, asker)
+    reply = await context.upstream.post_to_master(call.body)
+    return master_api.rename_master(request, reply, address)

@@ -33,13 +33,31 @@ REGISTRATION_GRACE = 0.5
 
 
 class SlaveApi:
-    """Forwards slave API calls to the node behind the port at which they arrive."""
+    """Answers at the ports of nodes inside, each of which stands for all of its node.
+
+    Slave API calls are forwarded to the node behind the port at which they arrive; its topics and
+    services, which speak TCPROS, are left to ``tcpros``.
+    """
 
     def __init__(
-        self, context: Context, leases: Leases[Endpoint], alias: Alias, adopter: Adopter
+        self,
+        context: Context,
+        leases: Leases[Endpoint],
+        alias: Alias,
+        adopter: Adopter,
+        tcpros: TcprosServer,
     ) -> None:
-        self._context, self._leases = context, leases
-        self._alias, self._adopter = alias, adopter
+        self._context, self._leases, self._alias = context, leases, alias
+        self._adopter, self._tcpros = adopter, tcpros
+        self.server = XmlRpcServer(self, "rosproxy: slave API of a ROS node behind it\n")
+
+    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+        """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
+        await self.server.dispatch(conn, partial(self._tcpros.serve, endpoint, peer))
+
+    def end_calls(self, port: int) -> None:
+        """Let the XML-RPC connections of a port end, which refuses from now on."""
+        self.server.close_port(port)
 
     async def __call__(self, call: IncomingCall) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
@@ -130,20 +148,17 @@ class SlaveApi:
             await asyncio.sleep(0.002)
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
+        health = endpoint.health
         try:
             reply = await self._context.upstream.post_to_node(endpoint.slave, body)
         except Unreachable as error:
-            await self._suspect(endpoint, error)
+            if error.refused and health.note(error.probe, self._context.now()) is Change.DOWN:
+                # Refused twice, the node has ended: its port refuses as well at once.
+                log.info("%s is gone: %s", endpoint.label, error)
+                self._leases.close(endpoint)
             raise
-        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
+        health.note(ProbeResult.ANSWERED, self._context.now())
         return reply
-
-    async def _suspect(self, endpoint: Endpoint, error: Unreachable) -> None:
-        """A refused call tells that the node has ended: its port refuses as well at once."""
-        health, now = endpoint.health, self._context.now()
-        if error.refused and health.note(error.probe, now) is Change.DOWN:
-            log.info("%s is gone: %s", endpoint.label, error)
-            self._leases.close(endpoint)
 
     def _visit(self, endpoint: Endpoint, call: IncomingCall, port: int) -> Visit:
         """A call at an endpoint, whose topics the caller is to find at a ``port``."""
@@ -157,21 +172,3 @@ class SlaveApi:
         if anybody or method not in slave_api.MASTER_ONLY:
             return True
         return source in await self._context.upstream.master_addresses()
-
-
-class NodeServer:
-    """What answers at a node's leases, where one port stands for all of it.
-
-    These are its slave API (XML-RPC over HTTP), and its topics and services (TCPROS).
-    """
-
-    def __init__(self, slaves: XmlRpcServer, tcpros: TcprosServer) -> None:
-        self._slaves, self._tcpros = slaves, tcpros
-
-    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
-        """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
-        await self._slaves.dispatch(conn, partial(self._tcpros.serve, endpoint, peer))
-
-    def end_calls(self, port: int) -> None:
-        """Let the XML-RPC connections of a port end, which refuses from now on."""
-        self._slaves.close_port(port)

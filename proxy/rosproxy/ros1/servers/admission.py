@@ -49,7 +49,13 @@ class NodeAdmission:
             )
         if self._context.addressing.handed_out(uri, asker):
             return None
-        return await self._admit_new(uri, node, asker)
+        place = await self._place(node, asker.address)
+        taken_in = self.take_in(uri, node, place, asker)
+        if isinstance(taken_in, Endpoint):
+            await self._leases.cleared(taken_in)
+            first_probe = self._probe_first(taken_in, asker.caller_id)
+            self._context.tasks.spawn(first_probe, f"first probe of {uri}")
+        return taken_in
 
     def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
         """The endpoint of a node found at a place, its port open; a refusal if none is left.
@@ -74,15 +80,6 @@ class NodeAdmission:
             registry.pool.block(endpoint.port)
             problems.solved_at(endpoint.port)
             problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
-
-    async def _admit_new(self, uri: str, node: HostPort, asker: Asker) -> Admission:
-        place = await self._place(node, asker.address)
-        endpoint = self.take_in(uri, node, place, asker)
-        if isinstance(endpoint, Endpoint):
-            await self._leases.cleared(endpoint)
-            first_probe = self._probe_first(endpoint, asker.caller_id)
-            self._context.tasks.spawn(first_probe, f"first probe of {uri}")
-        return endpoint
 
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
         """A node that registers is alive, whatever was believed of it."""

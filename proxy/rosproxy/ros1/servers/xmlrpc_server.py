@@ -73,35 +73,14 @@ async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[byte
     return answer
 
 
-class _HttpServer(web.Server):
-    """aiohttp's server, which knows its open connections by the port that they came in on."""
-
-    def __init__(self, handler: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
-        super().__init__(handler, access_log=None, keepalive_timeout=75)
-        self.by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
-        self._ports: dict[web.RequestHandler, int] = {}
-
-    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Take a connection in."""
-        super().connection_made(handler, transport)
-        port = self._ports[handler] = transport.get_extra_info("sockname")[1]
-        self.by_port[port].add(handler)
-
-    def connection_lost(
-        self, handler: web.RequestHandler, exc: BaseException | None = None
-    ) -> None:
-        """Forget a connection."""
-        super().connection_lost(handler, exc)
-        port = self._ports.pop(handler, 0)
-        self.by_port[port].discard(handler)
-
-
-class XmlRpcServer:
+class XmlRpcServer(web.Server):
     """Turns accepted sockets into XML-RPC calls to a service."""
 
     def __init__(self, service: XmlRpcService, greeting: str) -> None:
+        super().__init__(self._handle, access_log=None, keepalive_timeout=75)
         self._service, self._greeting = service, greeting
-        self._server = _HttpServer(self._handle)
+        self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
+        self._ports: dict[web.RequestHandler, int] = {}
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
@@ -122,13 +101,13 @@ class XmlRpcServer:
         else:
             await relay(conn)
 
-    def connections(self, port: int) -> int:
+    def count(self, port: int) -> int:
         """How many connections are open that came in on a port."""
-        return len(self._server.by_port[port])
+        return len(self._by_port[port])
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in list(self._server.by_port[port]):
+        for handler in list(self._by_port[port]):
             if handler in self._busy:
                 handler.close()
             else:
@@ -136,11 +115,24 @@ class XmlRpcServer:
 
     async def close(self) -> None:
         """Close all connections."""
-        await self._server.shutdown(STOP_TIMEOUT)
+        await self.shutdown(STOP_TIMEOUT)
+
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Know a connection by the port that it came in on."""
+        super().connection_made(handler, transport)
+        port = self._ports[handler] = transport.get_extra_info("sockname")[1]
+        self._by_port[port].add(handler)
+
+    def connection_lost(
+        self, handler: web.RequestHandler, exc: BaseException | None = None
+    ) -> None:
+        """Forget a connection."""
+        super().connection_lost(handler, exc)
+        self._by_port[self._ports.pop(handler, 0)].discard(handler)
 
     async def _serve(self, conn: socket.socket) -> None:
         loop = asyncio.get_running_loop()
-        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
+        _, handler = await loop.connect_accepted_socket(self, sock=conn)
         self._mute.add(handler)
         loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
 
@@ -163,9 +155,8 @@ class XmlRpcServer:
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
         body = await _body(request)
-        return await self._answer(request, body) if isinstance(body, bytes) else body
-
-    async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
+        if not isinstance(body, bytes):
+            return body
         try:
             reply = await self._service(IncomingCall(request, body))
         except xmlrpc.XmlRpcError as error:

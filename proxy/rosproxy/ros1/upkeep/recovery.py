@@ -53,26 +53,23 @@ class Recovery:
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
-        self._done = False
+        self._done = asyncio.Event()
         self._one_at_a_time = asyncio.Lock()
         self._failures = 0
         self._unannounced: list[Endpoint] = []
         self._announcing = asyncio.Lock()
 
     async def ensure(self) -> None:
-        """Have the registry rebuilt from the master, once. Raises Unreachable."""
-        if not self._done:
-            await self._recover_once()
-
-    async def _recover_once(self) -> None:
-        """Recover, unless another caller does so meanwhile.
+        """Have the registry rebuilt from the master, once. Raises Unreachable.
 
         All who wait for the same attempt share its failure: a master that hangs would keep the
         last of them waiting for as many attempts as there are callers.
         """
+        if self._done.is_set():
+            return
         failures = self._failures
         async with self._one_at_a_time:
-            if self._done:
+            if self._done.is_set():
                 return
             if self._failures != failures:
                 raise Unreachable("the master has not told its state")
@@ -81,7 +78,7 @@ class Recovery:
             except (Unreachable, MasterError) as error:
                 self._failures += 1
                 raise Unreachable(str(error)) from None
-            self._done = True
+            self._done.set()
 
     async def serve(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears it out, and have subscribers connect again.

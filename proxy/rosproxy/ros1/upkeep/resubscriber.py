@@ -50,11 +50,7 @@ class Resubscriber:
     """Looks after the subscribers of publishers that were out of reach for a time."""
 
     def __init__(
-        self,
-        context: Context,
-        registrar: Registrar,
-        tcpros: TcprosServer,
-        plane: KernelPlane,
+        self, context: Context, registrar: Registrar, tcpros: TcprosServer, plane: KernelPlane
     ) -> None:
         self._context, self._registrar = context, registrar
         self._tcpros, self._plane = tcpros, plane
@@ -132,17 +128,16 @@ class Resubscriber:
         self, graph: Graph, left: Iterable[TopicSubscription]
     ) -> list[TopicSubscription]:
         """Those whose subscribers reach the publisher through the proxy."""
-        addressing, subscribers = self._context.addressing, {one.caller_id for one in left}
-        uris = {node: graph.uris[node] for node in subscribers if node in graph.uris}
-        inside = {node: addressing.stands_for(uri) for node, uri in uris.items()}
-        askers = {e: self._context.node_asker(e) for e in inside.values() if e}
+        addressing = self._context.addressing
 
         def is_relayed(one: TopicSubscription) -> bool:
-            subscriber = inside.get(one.caller_id)
+            uri = graph.uris.get(one.caller_id)
+            subscriber = addressing.stands_for(uri) if uri else None
             if subscriber is None:
-                return one.caller_id in inside
-            asker, uri = askers[subscriber], addressing.advertised_uri(one.endpoint)
-            return addressing.handed_out(addressing.import_slave(uri, asker), asker)
+                return uri is not None
+            asker = self._context.node_asker(subscriber)
+            handed = addressing.import_slave(addressing.advertised_uri(one.endpoint), asker)
+            return addressing.handed_out(handed, asker)
 
         return [one for one in left if is_relayed(one)]
 

@@ -56,11 +56,15 @@ def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint
     has registered ``since`` then is spared: a container that is restarted has its address
     again, and a node that is just starting may take its time.
     """
+
+    def is_spared(endpoint: Endpoint) -> bool:
+        held = endpoint.registrations.values()
+        return endpoint.pending > 0 or any(one.since >= since for one in held)
+
     return [
         endpoint
         for endpoint, probe in answers.items()
-        if probe is ProbeResult.REFUSED
-        or (probe is ProbeResult.SILENT and not _registered_since(endpoint, since))
+        if probe is ProbeResult.REFUSED or (probe is ProbeResult.SILENT and not is_spared(endpoint))
     ]
 
 
@@ -68,11 +72,9 @@ def movable(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
     """The endpoints at addresses that have changed, with their new one, if that is inside."""
-    candidates = {e: moved[e.place.address] for e in endpoints if e.place.address in moved}
+    found = {e: moved.get(e.place.address, "") for e in endpoints}
     return {
-        endpoint: new
-        for endpoint, new in candidates.items()
-        if new != endpoint.place.address and is_inside(new, networks)
+        e: new for e, new in found.items() if new != e.place.address and is_inside(new, networks)
     }
 
 
@@ -96,8 +98,3 @@ def is_same_process(endpoint: Endpoint, pid: int | None, topics: set[str]) -> bo
     if pid is None or (known not in UNKNOWN_PID and known != pid):
         return False
     return confirmed_by(endpoint, topics) if endpoint.topics else known == pid
-
-
-def _registered_since(endpoint: Endpoint, since: float) -> bool:
-    held = endpoint.registrations.values()
-    return endpoint.pending > 0 or any(one.since >= since for one in held)
