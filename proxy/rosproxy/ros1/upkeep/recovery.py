@@ -129,9 +129,9 @@ class Recovery:
             text = "port %d: the master has %s for it, which is not in an inside network; refused"
             log.warning(text, claim.port, address)
             return None
-        place = Place(address, named=claim.inside.node.host == address, confirmed=False)
+        place = Place(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
-        endpoint = registry.restore(claim.uri, claim.inside.node, place, claim.port)
+        endpoint = registry.restore(claim.uri, claim.node, place, claim.port)
         if endpoint is None:
             log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
             return None

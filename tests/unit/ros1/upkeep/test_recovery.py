@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import InsidePath
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.upkeep.policy import recovery as policy
@@ -23,17 +22,17 @@ def held(name: str, caller_id: str = "/n") -> Registration:
     return Registration(PUB, name, caller_id)
 
 
-def graph(uris: dict[str, str], names: Sequence[str] = ("/a",)) -> Graph:
-    return Graph({node: [held(name, node) for name in names] for node in uris}, uris)
+def graph(uris: dict[str, str]) -> Graph:
+    return Graph({node: [held("/a", node)] for node in uris}, uris)
 
 
 URIS = [
-    # what the master has for a node, the claim: port, host and port it calls itself, address
-    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5", 40001, "10.0.0.5")),
-    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5", 40001, "10.0.0.5")),
-    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1", 40001, "10.0.0.5")),
-    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "fd00::5", 40001, "fd00::5")),
-    ("http://robot-host:45003/c5:40001/", (45003, "c5", 40001, "c5")),  # refused by address
+    # what the master has for a node, the claim: port, what it calls itself, where it is looked for
+    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5:40001", "10.0.0.5")),
+    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5:40001", "10.0.0.5")),
+    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1:40001", "10.0.0.5")),
+    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "[fd00::5]:40001", "fd00::5")),
+    ("http://robot-host:45003/c5:40001/", (45003, "c5:40001", "c5")),  # refused by address
     ("http://robot-host:45003/", None),
     ("http://robot-host:45003", None),
     ("http://robot-host:45003/RPC2", None),
@@ -49,20 +48,15 @@ URIS = [
 
 @pytest.mark.parametrize(("uri", "expected"), URIS)
 def test_claims_are_read_from_advertised_uris(
-    uri: str, expected: tuple[int, str, int, str] | None
+    uri: str, expected: tuple[int, str, str] | None
 ) -> None:
     found = policy.claims(graph({"/n": uri}), make_addressing())
+    claims = [(one.port, one.uri, one.key, one.topics) for one in found]
     if expected is None:
-        assert found == []
-        return
-    (claim,) = found
-    assert (claim.port, *claim.uri.removeprefix("http://").rsplit(":", 1)) == (
-        expected[0],
-        f"[{expected[1]}]" if ":" in expected[1] else expected[1],
-        f"{expected[2]}/",
-    )
-    assert claim.key == (expected[3], expected[2])
-    assert claim.topics == {"/a"}
+        assert claims == []
+    else:
+        port, node, address = expected
+        assert claims == [(port, f"http://{node}/", (address, 40001), {"/a"})]
 
 
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
@@ -95,10 +89,8 @@ def claim(
     said: Collection[str] | None = None,
     slave: int = 40001,
 ) -> Claim:
-    inside = InsidePath(HostPort(address, slave))
-    return Claim(
-        port, inside, [held(topic) for topic in topics], None if said is None else set(said)
-    )
+    named = None if said is None else set(said)
+    return Claim(port, HostPort(address, slave), address, list(map(held, topics)), named)
 
 
 A, B = "10.0.0.5", "10.0.0.6"
@@ -111,7 +103,7 @@ SETTLED = [
     ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
     ([claim(1, A, ["/a"], ["/x"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
     # a forgery that leads to a real node, but claims too much of it
-    ([claim(1, A, ["/a", "/b"], ["/a", "/b"]), claim(1, B, ["/c", "/x", "/y"], ["/c"])], [(1, A)]),
+    ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/c", "/x", "/y"], ["/c"])], [(1, A)]),
     # one node, two ports: as many topics as it has, no more
     ([claim(1, A, ["/a"], ["/a", "/b"]), claim(2, A, ["/a", "/b"], ["/a", "/b"])], [(2, A)]),
     # nobody answered: the one with more registrations

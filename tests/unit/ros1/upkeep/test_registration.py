@@ -100,6 +100,7 @@ LEFT_OVER = [
     ([*OLD, *NEW], {"/rosout"}, {"/b"}, OLD),  # another node on the same port
     ([*OLD, *NEW], {"/rosout", "/a"}, {"/b"}, []),  # two names in one process
     ([*OLD, (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),  # is being made right now
+    ([*OLD, (SRV, "/late", "/old", 12.0), (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),
 ]
 
 

@@ -10,8 +10,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import InsidePath, slave_uri
+from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.rewriting.addressing import Addressing
@@ -23,23 +24,20 @@ NO_MERIT = -(10**9)
 class Claim:
     """An endpoint that the master's data tell of: its port, its inside address, what it holds.
 
-    ``said`` are the topics that the node there names; None if it was not asked or gave no answer.
+    ``node`` is the host and port that the node calls itself, ``address`` where to look for it.
+    ``said`` are the topics that it names there; None if it was not asked or gave no answer.
     """
 
     port: int
-    inside: InsidePath
+    node: HostPort
+    address: str
     registrations: list[Registration] = field(default_factory=list)
     said: set[str] | None = None
 
     @property
-    def address(self) -> str:
-        """The address to look for the node at."""
-        return self.inside.address or self.inside.node.host
-
-    @property
     def key(self) -> tuple[str, int]:
         """What the endpoint would be keyed by."""
-        return self.address, self.inside.node.port
+        return self.address, self.node.port
 
     @property
     def topics(self) -> set[str]:
@@ -49,7 +47,7 @@ class Claim:
     @property
     def uri(self) -> str:
         """The slave URI as the node must have given it."""
-        return slave_uri(self.inside.node)
+        return slave_uri(self.node)
 
 
 def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
@@ -57,7 +55,9 @@ def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     found: dict[str, Claim] = {}
     for node, uri in graph.uris.items():
         if ours := addressing.identify(uri):
-            found.setdefault(uri, Claim(*ours)).registrations += graph.held.get(node, [])
+            port, inside = ours
+            claim = Claim(port, inside.node, inside.address or inside.node.host)
+            found.setdefault(uri, claim).registrations += graph.held.get(node, [])
     return list(found.values())
 
 
