@@ -78,7 +78,9 @@ class Alias:
 
         rospy complains of connections to a service's port that say nothing: none is made.
         """
-        for problem in self._context.problems.all() if self._address else ():
+        if self._address is None:
+            return
+        for problem in self._context.problems.all():
             uri = problem.subject
             for port in policy.ports_needed([uri], self._name, self._context.addressing):
                 if parse_service_uri(uri):
@@ -200,8 +202,8 @@ class Alias:
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(port)
             return
-        relay = Relay(port, "service", f"at port {port}", "", peer, outside=node, inside=conn)
-        relay.splice = self._context.settings.data_plane != "copy"
+        splice = self._context.settings.data_plane != "copy"
+        relay = Relay(port, "service", f"at port {port}", "", peer, node, conn, splice=splice)
         self._relays.start(relay, lambda ended: self._note_used(ended.port))
 
     async def _forward(self, call: IncomingCall) -> bytes:

@@ -23,7 +23,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.upkeep.policy import registration as policy
-from rosproxy.ros1.upkeep.policy.registration import COMMON_PARAMETER, Held
+from rosproxy.ros1.upkeep.policy.registration import Held
 
 log = logging.getLogger(__name__)
 
@@ -260,15 +260,9 @@ class Registrar:
         services = await look_up_services(
             upstream, {one.name for one in mine if one.kind is Kind.SERVICE}
         )
-        params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
-        ask: list[policy.MethodCall] = [("lookupNode", [CALLER_ID, name]) for name in uris]
-        release = policy.free_calls(params, uris, {})
         free = policy.free_calls(mine, uris, services)
-        values = await upstream.multicall([*free, *ask, *release, *ask])
-        before = values[len(free) :][: len(ask)]
-        params = [one for one, uri in zip(params, before, strict=True) if uri is not None]
-        after = zip(uris, values[-len(ask) :], strict=True)
-        known = {name: uri for name, uri in after if uri is not None}
+        values = await upstream.multicall([*free, *policy.release_calls(uris, CALLER_ID)])
+        params, known = policy.read_release(uris, values[len(free) :])
         stuck = [name for name, uri in known.items() if uri == uris[name]]
         restored = [one for one in mine if one.caller_id in stuck]
         await upstream.multicall(policy.restore_calls(restored, uris, services))

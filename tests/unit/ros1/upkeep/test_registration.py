@@ -149,6 +149,25 @@ def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
     ]
 
 
+def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
+    ask = [("lookupNode", ["/rosproxy", name]) for name in ("/n", "/m")]
+    parameter = "/rosout_disable_topics_generation"
+    assert policy.release_calls({"/n": "http://c1:1/", "/m": "http://c1:2/"}, "/rosproxy") == [
+        *ask,
+        ("unsubscribeParam", ["/n", "http://c1:1/", parameter]),
+        ("unsubscribeParam", ["/m", "http://c1:2/", parameter]),
+        *ask,
+    ]
+
+
+def test_who_was_subscribed_to_it_and_who_is_known_still() -> None:
+    uris = dict.fromkeys(("/unknown", "/common", "/another", "/taken"), "U")
+    before, after = [None, "U", "U", "other"], [None, None, "U", "other"]
+    ended, known = policy.read_release(uris, [*before, 1, 1, 1, 1, *after])
+    assert ended == [Registration(PARAM, policy.COMMON_PARAMETER, "/common")]
+    assert known == {"/another": "U", "/taken": "other"}
+
+
 def test_what_has_not_ended_meanwhile_is_registered_subscribers_last() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)

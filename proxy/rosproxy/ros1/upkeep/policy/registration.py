@@ -90,6 +90,27 @@ def restore_calls(
     return [register_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
 
 
+def release_calls(uris: Mapping[str, str], asker: str) -> list[MethodCall]:
+    """The calls that end the parameter subscription that every node has, and tell what is left.
+
+    There is nothing to see of such a subscription, apart from the name that stays known.
+    """
+    ask: list[MethodCall] = [("lookupNode", [asker, name]) for name in uris]
+    params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
+    return [*ask, *free_calls(params, uris, {}), *ask]
+
+
+def read_release(
+    uris: Mapping[str, str], values: Sequence[Any]
+) -> tuple[list[Registration], dict[str, str]]:
+    """The results of `release_calls`: subscriptions that ended; names known still, with URIs."""
+    before = zip(uris, values, strict=False)
+    after = zip(uris, values[2 * len(uris) :], strict=True)
+    known = {name: uri for name, uri in after if uri is not None}
+    held = [name for name, uri in before if uri is not None and name not in known]
+    return [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in held], known
+
+
 def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
     """Which of an endpoint's registrations a process that is gone has left behind.
 
