@@ -11,10 +11,11 @@ import logging
 import resource
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
-from rosproxy.admin.requests import read_master_address
+from rosproxy.admin.requests import read_master_address, read_news, read_nothing
 from rosproxy.admin.server import AdminServer
 from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
@@ -25,22 +26,19 @@ from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
-from rosproxy.ros1.clients.node import NodeClient
-from rosproxy.ros1.context import make_context
+from rosproxy.ros1.api.master import MasterApi, serve_published
+from rosproxy.ros1.api.slave import SlaveApi
+from rosproxy.ros1.context import Context
 from rosproxy.ros1.servers.admission import NodeAdmission
-from rosproxy.ros1.servers.dispatch import NodeServer, dispatch
-from rosproxy.ros1.servers.master import MasterApi, PublishedMaster
-from rosproxy.ros1.servers.slave import SlaveApi
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import XmlRpcServer, XmlRpcService
-from rosproxy.ros1.upkeep.adoption.adopter import Adopter
-from rosproxy.ros1.upkeep.containers.events import ContainerEvents
+from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.prober.prober import PROBE_TICK, Prober
-from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
-from rosproxy.ros1.upkeep.recovery.recovery import Recovery
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription.resubscriber import RESUBSCRIBE_TICK, Resubscriber
+from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
+from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
 from rosproxy.settings import SettingError, Settings
 
 log = logging.getLogger(__name__)
@@ -60,16 +58,14 @@ class App:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.context = context = make_context(settings)
-        nodes = NodeClient(context.upstream, settings.probe_timeout)
-        self.tcpros = TcprosServer(context, nodes)
+        self.context = context = Context(settings)
+        self.tcpros = TcprosServer(context)
         self.plane = plane = KernelPlane(
             settings, context.registry, context.tasks, context.problems, context.now
         )
         self.alias = Alias(context)
-        updates = PublisherUpdates(context, self.alias)
-        self.registrar = registrar = Registrar(context, nodes, updates)
-        self._resubscriber = Resubscriber(context, registrar, updates, self.tcpros, plane)
+        self.registrar = registrar = Registrar(context, self.alias)
+        self._resubscriber = Resubscriber(context, registrar, self.tcpros, plane)
         self.leases = leases = Leases(
             context.registry,
             settings.bind,
@@ -78,17 +74,15 @@ class App:
             context.tasks,
             context.problems,
         )
-        self._admission = NodeAdmission(context, leases, nodes)
-        self._recovery = Recovery(context, leases, nodes, registrar, self._resubscriber, plane)
-        self.prober = Prober(context, leases, nodes, registrar, self._resubscriber, self._recovery)
+        self._admission = NodeAdmission(context, leases)
+        self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane)
+        self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
         self.master_monitor = MasterMonitor(context, self._recovery, registrar)
-        self._adopter = Adopter(context, leases, self._admission, nodes, registrar)
-        slave = SlaveApi(context, leases, self.alias, self._adopter)
-        slaves = XmlRpcServer(slave, "rosproxy: slave API of a ROS node behind it\n")
-        leases.server = NodeServer(slaves, self.tcpros)
-        self._servers = [slaves]
+        self._adopter = Adopter(context, leases, self._admission, registrar)
+        leases.server = slave = SlaveApi(context, leases, self.alias, self._adopter, self.tcpros)
+        self._servers = [slave.server]
         self._acceptors: list[Acceptor] = []
-        self._admin = self._make_admin(nodes)
+        self._admin = self._make_admin()
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
@@ -101,7 +95,7 @@ class App:
         self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
-            published = PublishedMaster(context, str(where))
+            published = partial(serve_published, context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
         state = StateCollector(
             context.registry, self.tcpros, self.alias, self.master_monitor, self.plane
@@ -135,7 +129,9 @@ class App:
         await self.context.tasks.cancel()
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(self._admin.stop(), self.tcpros.stop(), self.alias.stop(), *servers)
+        await asyncio.gather(
+            self._admin.stop(), self.tcpros.relays.stop(), self.alias.stop(), *servers
+        )
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:
@@ -143,11 +139,10 @@ class App:
         monitor = self.master_monitor
         return to_json(describe(self.context, monitor, self.tcpros, self.alias, self.plane))
 
-    def _make_admin(self, nodes: NodeClient) -> AdminServer:
-        containers = ContainerEvents(
+    def _make_admin(self) -> AdminServer:
+        self._containers = ContainerEvents(
             self.context,
             self.leases,
-            nodes,
             self.registrar,
             self._adopter,
             self._recovery,
@@ -156,9 +151,9 @@ class App:
         )
         actions = {
             "/probe": self._probe,
-            "/containers": containers.handle,
+            "/containers": self._handle_news,
             "/master-address": self._set_master_address,
-            "/retire": containers.retire,
+            "/retire": self._retire,
         }
         metrics, token = self.context.metrics.registry, self.settings.admin_token
         return AdminServer(metrics, self.status, self._unready, actions, token)
@@ -172,6 +167,17 @@ class App:
 
     async def _probe(self, body: Any) -> dict[str, Any]:
         return to_json(await probe_range(self.context, self.leases))
+
+    async def _handle_news(self, body: Any) -> dict[str, Any]:
+        """``POST /containers``: how many nodes were unregistered, moved and adopted."""
+        news = read_news(body)
+        arrived = [(one.address, one.names) for one in news.arrived]
+        return {**await self._containers.handle(news.gone, news.moved, arrived)}
+
+    async def _retire(self, body: Any) -> dict[str, Any]:
+        """``POST /retire``: how many nodes were unregistered."""
+        read_nothing(body)
+        return {"unregistered": await self._containers.retire()}
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""
@@ -202,7 +208,7 @@ class App:
         server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
         self._servers.append(server)
         self._acceptors.append(
-            Acceptor(self.context.tasks, sock, lambda conn, peer: dispatch(conn, server))
+            Acceptor(self.context.tasks, sock, lambda conn, peer: server.dispatch(conn))
         )
 
 

@@ -48,10 +48,6 @@ class Arrival(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         msgspec.structs.force_setattr(self, "address", _address("address", self.address))
         msgspec.structs.force_setattr(self, "names", frozenset(map(str.lower, self.names)))
 
-    def is_called(self, host: str) -> bool:
-        """Whether a host name or address in a URI may mean this container."""
-        return host == self.address or host.lower() in self.names
-
 
 class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The body of ``POST /containers``: what has become of containers.

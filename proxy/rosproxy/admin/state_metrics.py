@@ -45,7 +45,7 @@ class StateCollector(Collector):
             (
                 "alias_ports",
                 "Ports that stand in for nodes on the master's host.",
-                len(self._alias),
+                len(self._alias.status()),
             ),
             ("master_up", "Whether the master answers.", bool(self._monitor.up)),
             ("kernel_plane", "Whether the kernel forwards topics.", self._plane.syncer.usable),

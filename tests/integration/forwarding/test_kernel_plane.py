@@ -14,7 +14,7 @@ from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases import fast_ports
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.context import Context, make_context
+from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import PATIENCE
@@ -49,7 +49,7 @@ class Bench:
     """A plane over a made-up kernel; nothing listens."""
 
     def __init__(self, mode: str = "auto", tools: FakeTools | None = None) -> None:
-        self.context: Context = make_context(parse_settings(settings(mode)))
+        self.context = Context(parse_settings(settings(mode)))
         self.tools = tools or FakeTools()
         self.later = 0.0
         self.plane = KernelPlane(

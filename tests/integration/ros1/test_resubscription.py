@@ -13,7 +13,7 @@ from rosproxy.demo.fake_http import End
 from rosproxy.demo.fake_http import value as answer
 from rosproxy.demo.fake_master import FakeMaster
 from rosproxy.demo.fake_node import FakeNode
-from rosproxy.ros1.upkeep.resubscription import resubscriber
+from rosproxy.ros1.upkeep import resubscriber
 from tests.integration.net import (
     OTHER_NODE,
     OUTSIDE,

@@ -122,11 +122,3 @@ def test_no_body() -> None:
     read_nothing({})
     with pytest.raises(BodyError, match="unknown field `x`; known: none"):
         read_nothing({"x": 1})
-
-
-def test_what_a_container_is_called() -> None:
-    arrival = Arrival("172.18.0.7", frozenset({"talker"}))
-    assert arrival.is_called("172.18.0.7")
-    assert arrival.is_called("TALKER")
-    assert not arrival.is_called("172.18.0.8")
-    assert not arrival.is_called("talker.local")

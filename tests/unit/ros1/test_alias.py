@@ -132,21 +132,6 @@ def test_advice_says_what_to_do() -> None:
     assert "ROS_IP=192.0.2.7" in text
 
 
-@pytest.mark.parametrize(
-    ("used", "busy", "expected"),
-    [
-        ({}, set(), None),
-        ({1: 5.0, 2: 3.0, 3: 4.0}, set(), 2),
-        ({1: 5.0, 2: 3.0, 3: 4.0}, {2}, 3),
-        ({1: 5.0, 2: 3.0}, {1, 2}, None),
-    ],
-)
-def test_the_port_unused_for_longest_goes_first(
-    used: dict[int, float], busy: set[int], expected: int | None
-) -> None:
-    assert policy.least_used(used, busy) == expected
-
-
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_datagrams_are_sent_to_the_address(dialect: str) -> None:
     def body(host: str, method: str = "requestTopic") -> bytes:
@@ -207,16 +192,3 @@ def test_other_methods_pass_unparsed() -> None:
     assert direct(dump_fault(1, "robot")) == dump_fault(1, "robot")
     with pytest.raises(XmlRpcError):
         direct(b"whatever")
-
-
-def test_topics_asked_for_in_a_multicall() -> None:
-    def reply(host: str) -> bytes:
-        said = [1, f"ready on {host}:40002", ["TCPROS", host, 40002]]
-        fault = {"faultCode": 1, "faultString": "robot"}
-        return py_reply([[[1, "", 5]], [said], fault, [[1, "", ["TCPROS", "robot", 7]]]])
-
-    asked = ["/n", "/chatter", [["TCPROS"]]]
-    methods = ("getPid", "requestTopic", "requestTopic", "other")
-    body = [{"methodName": method, "params": asked} for method in methods]
-    call = xmlrpc.parse_call(py_call("system.multicall", body))
-    assert policy.direct_reply(call, reply(ROBOT), ROBOT, ADDRESS) == reply(ADDRESS)

@@ -13,7 +13,7 @@ import asyncio
 import logging
 import socket
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
@@ -27,14 +27,14 @@ from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias import policy
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.servers.dispatch import dispatch
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 
 log = logging.getLogger(__name__)
 
 MOST_PORTS = 1024
-"""How many ports stand in for nodes at most, and how many that refused are remembered."""
+"""How many ports stand in for nodes at most."""
 CONNECT_TIMEOUT = 2.0
 TIDY_INTERVAL = 30.0
 SERVICE_PROBLEM = 600.0
@@ -48,48 +48,46 @@ class Alias:
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._name = policy.aliased_host(context.settings.master_uri)
+        self._name = policy.aliased_host(context.settings.master_uri) or ""
         self._acceptors: dict[int, Acceptor] = {}
-        self._used: dict[int, float] = {}
-        self._refused: OrderedDict[int, None] = OrderedDict()
+        """By port, the one that was of no use for longest first."""
+        self._refused: set[int] = set()
         self._relays = OpenRelays()
         self._server = XmlRpcServer(self._forward, "rosproxy: a ROS node on the master's host\n")
         self._closed = False
 
-    def __len__(self) -> int:
-        """How many ports stand in for nodes."""
-        return len(self._acceptors)
-
     async def listen_for(self, uris: Iterable[str]) -> None:
         """Have the ports listen that these URIs lead to, before an inside node is given them."""
-        address = self._context.upstream.master_address
-        if self._name is None or address is None or self._closed:
+        if self._address is None or self._closed:
             return
         wanted = policy.ports_needed(uris, self._name, self._context.addressing)
-        await asyncio.gather(*(self._try_again(port) for port in wanted if port in self._refused))
+        again = self._refused & wanted.keys()
+        still = await asyncio.gather(*map(self._refuses, again))
+        self._refused -= {port for port, gone in zip(again, still, strict=True) if not gone}
         for port, uri in wanted.items():
             if port not in self._refused:
-                self._listen(port, uri, address)
+                self._listen(port, uri)
 
     def import_call(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
-        address = self._context.upstream.master_address
-        if self._name is None or address is None:
-            return body
-        return policy.direct_call(call, body, self._name, address)
+        address = self._address
+        return policy.direct_call(call, body, self._name, address) if address else body
 
     async def tidy(self) -> None:
         """Forget the problems of nodes that have ended, and of services not looked up any more.
 
         rospy complains of connections to a service's port that say nothing: none is made.
         """
-        if self._name is None or self._context.upstream.master_address is None:
+        if self._address is None:
             return
         for problem in self._context.problems.all():
             uri = problem.subject
             for port in policy.ports_needed([uri], self._name, self._context.addressing):
-                old = time.time() - problem.when > SERVICE_PROBLEM
-                if old if policy.is_service(uri) else await self._refuses(port):
+                if parse_service_uri(uri):
+                    ended = time.time() - problem.when > SERVICE_PROBLEM
+                else:
+                    ended = await self._refuses(port)
+                if ended:
                     self._context.problems.solved(uri)
 
     def status(self) -> list[dict[str, Any]]:
@@ -107,30 +105,39 @@ class Alias:
         """End all connections."""
         await asyncio.gather(self._relays.stop(), self._server.close())
 
-    def _listen(self, port: int, uri: str, address: str) -> None:
+    @property
+    def _address(self) -> str | None:
+        """The address of the master's host; None if its name can't lead to the proxy."""
+        return self._context.upstream.master_address if self._name else None
+
+    def _listen(self, port: int, uri: str) -> None:
         """Let a port listen that a URI needs, or report why it can't."""
-        if port not in self._acceptors:
-            why = policy.obstacle(port, self._context.settings) or self._open(port)
-            if why is not None:
-                self._report(uri, policy.advice(port, why, address))
-                return
-            self._context.problems.solved(uri)
-        self._used[port] = self._context.now()
+        problems = self._context.problems
+        if port in self._acceptors:
+            self._note_used(port)
+            return
+        why = policy.obstacle(port, self._context.settings) or self._open(port)
+        if why is None:
+            problems.solved(uri)
+            return
+        text = policy.advice(port, why, self._address or "")
+        if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
+            log.warning("%s: %s", uri, text)
+        problems.add(uri, text)
 
     def _open(self, port: int) -> str | None:
         """Open a port; the reason if that can't be done."""
         if len(self._acceptors) >= MOST_PORTS:
-            oldest = policy.least_used(self._used, +self._connections())
-            if oldest is None:
+            counts = self._connections()
+            unused = next((port for port in self._acceptors if not counts[port]), None)
+            if unused is None:
                 return f"is one too many: {MOST_PORTS} others stand in for nodes and are in use"
-            self._close(oldest)
+            self._close(unused)
         try:
             sock = sockets.listen(self._context.settings.bind, port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
-        self._acceptors[port] = Acceptor(
-            self._context.tasks, sock, lambda conn, peer: self._serve(port, conn, peer)
-        )
+        self._acceptors[port] = Acceptor(self._context.tasks, sock, partial(self._serve, port))
         log.debug("port %d stands in for that of %s", port, self._name)
         return None
 
@@ -138,55 +145,41 @@ class Alias:
         """Let a port refuse; relays that are open stay."""
         acceptor = self._acceptors.pop(port, None)
         if acceptor is not None:
-            del self._used[port]
             acceptor.stop()
             acceptor.sock.close()
             self._server.close_port(port)
+
+    def _note_used(self, port: int) -> None:
+        if port in self._acceptors:
+            self._acceptors[port] = self._acceptors.pop(port)
 
     def _note_refused(self, port: int) -> None:
         """A node that refuses has ended: its port refuses as well, until it is found again."""
         log.debug("port %d of %s refuses; it does so here", port, self._name)
         self._close(port)
-        self._refused[port] = None
-        if len(self._refused) > MOST_PORTS:
-            self._refused.popitem(last=False)
-
-    async def _try_again(self, port: int) -> None:
-        if not await self._refuses(port):
-            self._refused.pop(port, None)
+        self._refused.add(port)
 
     async def _refuses(self, port: int) -> bool:
         """Whether nobody listens at a port of the master's host."""
         try:
-            (await sockets.dial(self._target(port), LOOK_TIMEOUT)).close()
+            (await self._dial(port, LOOK_TIMEOUT)).close()
         except ConnectionRefusedError:
             return True
         except OSError as error:
             log.debug("port %d of %s: %s", port, self._name, error)
         return False
 
-    def _target(self, port: int) -> HostPort:
-        """Where a port of the master's host is. Raises ConnectionRefusedError if that is here."""
-        address = self._context.upstream.master_address
+    async def _dial(self, port: int, within: float) -> socket.socket:
+        """Connect to a port of the master's host; refused if that is here. Raises OSError."""
+        address = self._address
         if address is None or address_towards(address) == address:
             raise ConnectionRefusedError(f"--master-address {address} is the proxy's own")
-        return HostPort(address, port)
+        return await sockets.dial(HostPort(address, port), within)
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._relays)
-        for port in self._acceptors:
-            counts[port] += self._server.connections(port)
+        counts.update({port: self._server.count(port) for port in self._acceptors})
         return counts
-
-    def _report(self, uri: str, text: str) -> None:
-        problems = self._context.problems
-        if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
-            log.warning("%s: %s", uri, text)
-        problems.add(uri, text)
-
-    def _note_used(self, port: int) -> None:
-        if port in self._used:
-            self._used[port] = self._context.now()
 
     async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
@@ -196,12 +189,12 @@ class Alias:
             conn.close()
             return
         self._note_used(port)
-        await dispatch(conn, self._server, partial(self._relay, port, peer))
+        await self._server.dispatch(conn, partial(self._relay, port, peer))
 
     async def _relay(self, port: int, peer: str, conn: socket.socket) -> None:
         """Relay TCPROS as it is."""
         try:
-            node = await sockets.dial(self._target(port), CONNECT_TIMEOUT)
+            node = await self._dial(port, CONNECT_TIMEOUT)
         except OSError as error:
             log.debug("port %d of %s: %s", port, self._name, error)
             sockets.reset_on_close(conn)
@@ -209,8 +202,8 @@ class Alias:
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(port)
             return
-        relay = Relay(port, "service", f"at port {port}", "", peer, outside=node, inside=conn)
-        relay.splice = self._context.settings.data_plane != "copy"
+        splice = self._context.settings.data_plane != "copy"
+        relay = Relay(port, "service", f"at port {port}", "", peer, node, conn, splice=splice)
         self._relays.start(relay, lambda ended: self._note_used(ended.port))
 
     async def _forward(self, call: IncomingCall) -> bytes:
@@ -218,13 +211,12 @@ class Alias:
         if call.comes_from(self._context.instance):
             raise Unreachable(f"the address of {self._name} leads back to the proxy itself")
         parsed = xmlrpc.parse_call(call.body)
-        port, name, upstream = call.local.port, self._name or "", self._context.upstream
+        port, upstream = call.local.port, self._context.upstream
+        answer = upstream.post_to_node(HostPort(self._name, port), call.body, path=call.path)
         try:
-            reply = await upstream.post_to_node(HostPort(name, port), call.body, path=call.path)
+            reply = await counted(self._context.metrics, "alias", parsed.method, answer)
         except Unreachable as error:
-            self._context.metrics.count("alias", parsed.method, "unreachable")
             if error.refused:
                 self._note_refused(port)
             raise
-        self._context.metrics.count("alias", parsed.method, "answered")
-        return policy.direct_reply(parsed, reply, name, upstream.master_address or name)
+        return policy.direct_reply(parsed, reply, self._name, self._address or self._name)

@@ -6,13 +6,12 @@ URIs; inside, those lead to the proxy as well. So the proxy listens on the same 
 passes on what arrives there. The URIs stay as they are, and nothing has to be mapped back.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
-from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.rewriting.slave_api import ros_triple, send_to, tcpros_address
 from rosproxy.settings import Settings
@@ -39,23 +38,16 @@ def ports_needed(uris: Iterable[str], host: str, addressing: Addressing) -> dict
     return found
 
 
-def is_service(uri: str) -> bool:
-    """Whether a URI is that of a service, not of a slave API."""
-    return parse_service_uri(uri) is not None
-
-
 def obstacle(port: int, settings: Settings) -> str | None:
     """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
         return f"lies in --port-range {settings.ports.listen}"
-    for option, own in (
-        ("--master-port", settings.master_port),
-        ("--publish-master", settings.publish_master),
-        ("--admin-bind", settings.admin.port),
-    ):
-        if port == own:
-            return f"is that of {option}"
-    return None
+    own = {
+        settings.master_port: "--master-port",
+        settings.publish_master: "--publish-master",
+        settings.admin.port: "--admin-bind",
+    }
+    return f"is that of {own[port]}" if port in own else None
 
 
 def advice(port: int, why: str, address: str) -> str:
@@ -64,14 +56,6 @@ def advice(port: int, why: str, address: str) -> str:
         f"inside nodes can't reach it: port {port} {why}. Start that node with ROS_IP={address}, "
         "so that it gives its address instead of its host name"
     )
-
-
-def least_used(used: Mapping[int, float], busy: Collection[int]) -> int | None:
-    """The port to give up first: the one unused for the longest time and not ``busy``.
-
-    ``used`` tells when, in seconds, each was last of use.
-    """
-    return min((port for port in used if port not in busy), key=used.__getitem__, default=None)
 
 
 def direct_call(call: Call, body: bytes, host: str, address: str) -> bytes:
@@ -93,22 +77,8 @@ def direct_reply(call: Call, reply: bytes, host: str, address: str) -> bytes:
 
     So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
     """
-    if call.method not in ("requestTopic", MULTICALL):
+    triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "requestTopic" else None
+    said = tcpros_address(triple) if triple else None
+    if triple is None or said is None or said.host.lower() != host:
         return reply
-    edits: list[Edit] = []
-    for triple in _topic_replies(call, xmlrpc.parse_reply(reply)):
-        said = tcpros_address(triple)
-        if said and said.host.lower() == host:
-            edits += send_to(triple, HostPort(address, said.port))
-    return xmlrpc.apply(reply, edits)
-
-
-def _topic_replies(call: Call, value: Value | None) -> Iterator[Value]:
-    """The ROS triples with which a reply answers to ``requestTopic``."""
-    if value and call.method == MULTICALL:
-        pairs = zip(inner_calls(call), value.items, strict=False)
-        values = [v for inner, v in pairs if inner and inner.method == "requestTopic"]
-        triples = [ros_triple(v.items[0]) for v in values if v.items]
-    else:
-        triples = [ros_triple(value)]
-    yield from (triple for triple in triples if triple)
+    return xmlrpc.apply(reply, send_to(triple, HostPort(address, said.port)))

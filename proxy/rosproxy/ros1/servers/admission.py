@@ -7,13 +7,10 @@ of at once; a node that is known is taken for alive, whatever was believed of it
 """
 
 import logging
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
 
 from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -21,8 +18,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Admission, Refusal, Request, registering_uri
-from rosproxy.ros1.servers.needs import TakingOver
+from rosproxy.ros1.rewriting.master_api import Admission, Refusal, registering_uri
 
 log = logging.getLogger(__name__)
 
@@ -32,43 +28,10 @@ RETIRED = "rosproxy: this proxy has been retired and registers nothing any more"
 class NodeAdmission:
     """Gives endpoints to nodes that register."""
 
-    def __init__(self, context: Context, leases: Leases[Endpoint], nodes: NodeClient) -> None:
-        self._context, self._leases, self._nodes = context, leases, nodes
+    def __init__(self, context: Context, leases: Leases[Endpoint]) -> None:
+        self._context, self._leases = context, leases
 
-    @asynccontextmanager
-    async def of(self, request: Request, adopter: TakingOver) -> AsyncIterator[Sequence[Admission]]:
-        """What becomes of each call of a request. Raises Unreachable.
-
-        Within the context their endpoints are *pending*: their leases do not end while the calls
-        are on their way.
-        """
-        asker = request.asker
-        self._context.refresh_networks(asker.address)
-        admissions: list[Admission] = []
-        try:
-            for call in request.calls:  # one after the other: they may register the same new node
-                admission = await self._admit(call, asker) if call else None
-                admissions.append(admission)
-                if isinstance(admission, Endpoint):
-                    admission.hold()
-                    await adopter.take_over(admission, call.string(0) or "" if call else "")
-            yield admissions
-        finally:
-            for admission in admissions:
-                if isinstance(admission, Endpoint):
-                    admission.release()
-
-    def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
-        """The endpoint of a node found at a place, its port open; a refusal if none is left."""
-        try:
-            return self._lease(uri, node, place, asker.address)
-        except RangeExhausted as error:
-            self._context.metrics.exhausted.inc()
-            self._context.problems.add(asker.caller_id, str(error))
-            log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
-            return Refusal(str(error))
-
-    async def _admit(self, call: Call, asker: Asker) -> Admission:
+    async def admit(self, call: Call, asker: Asker) -> Admission:
         """The endpoint of a call that registers, or why there is none; None for other calls."""
         uri = registering_uri(call)
         if uri is None:
@@ -86,16 +49,37 @@ class NodeAdmission:
             )
         if self._context.addressing.handed_out(uri, asker):
             return None
-        return await self._admit_new(uri, node, asker)
-
-    async def _admit_new(self, uri: str, node: HostPort, asker: Asker) -> Admission:
         place = await self._place(node, asker.address)
-        endpoint = self.take_in(uri, node, place, asker)
-        if isinstance(endpoint, Endpoint):
-            await self._leases.cleared(endpoint)
-            first_probe = self._probe_first(endpoint, asker.caller_id)
+        taken_in = self.take_in(uri, node, place, asker)
+        if isinstance(taken_in, Endpoint):
+            await self._leases.cleared(taken_in)
+            first_probe = self._probe_first(taken_in, asker.caller_id)
             self._context.tasks.spawn(first_probe, f"first probe of {uri}")
-        return endpoint
+        return taken_in
+
+    def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
+        """The endpoint of a node found at a place, its port open; a refusal if none is left.
+
+        Ports that turn out to be taken are passed over.
+        """
+        registry, leases, problems = self._context.registry, self._leases, self._context.problems
+        while True:
+            try:
+                endpoint = registry.admit(uri, node, place, asker.address)
+            except RangeExhausted as error:
+                if leases.make_room():
+                    continue
+                self._context.metrics.exhausted.inc()
+                problems.add(asker.caller_id, str(error))
+                log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
+                return Refusal(str(error))
+            leases.open(endpoint)
+            if leases.is_open(endpoint) or endpoint.registrations:
+                return endpoint
+            registry.remove(endpoint)
+            registry.pool.block(endpoint.port)
+            problems.solved_at(endpoint.port)
+            problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
 
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
         """A node that registers is alive, whatever was believed of it."""
@@ -107,40 +91,21 @@ class NodeAdmission:
         if endpoint.health.down or (known and asker.caller_id not in known):
             endpoint.health.suspect()
 
-    def _lease(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
-        """A node's endpoint, its port open; ports that turn out to be taken are passed over."""
-        registry = self._context.registry
-        while True:
-            try:
-                endpoint = registry.admit(uri, node, place, source)
-            except RangeExhausted:
-                if not self._leases.make_room():
-                    raise
-                continue
-            self._leases.open(endpoint)
-            if self._leases.is_open(endpoint) or endpoint.registrations:
-                return endpoint
-            registry.remove(endpoint)
-            registry.pool.block(endpoint.port)
-            self._context.problems.solved_at(endpoint.port)
-            self._context.problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
-
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""
         addresses = await resolve(self._context.upstream.reach(node).host)
         elsewhere = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not elsewhere:
             return Place(source, named=source in addresses)
-        if (await self._nodes.probe(HostPort(source, node.port))).pid is not None:
-            return Place(source, named=False)
-        for address in elsewhere:
-            if (await self._nodes.probe(HostPort(address, node.port))).pid is not None:
-                return Place(address, named=True, confirmed=False)
+        for address in (source, *elsewhere):
+            if (await self._context.nodes.probe(HostPort(address, node.port))).pid is not None:
+                at_source = address == source
+                return Place(address, named=not at_source, confirmed=at_source)
         return Place(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
         """Look at once whether a new node can be reached, and say so if not."""
-        answer = await self._nodes.probe(endpoint.slave)
+        answer = await self._context.nodes.probe(endpoint.slave)
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid
         uri = self._context.addressing.advertised_uri(endpoint)

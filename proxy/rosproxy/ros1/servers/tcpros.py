@@ -13,7 +13,6 @@ from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
@@ -32,34 +31,29 @@ class TcprosServer:
     a reply or registration is never used, so none can lead to another inside host.
     """
 
-    def __init__(self, context: Context, nodes: NodeClient) -> None:
-        self._context, self._nodes = context, nodes
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._may_splice = context.settings.data_plane != "copy"
-        self._relays = OpenRelays()
+        self.relays = OpenRelays()
         self._ended = Traffic()
         self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
 
-    @property
-    def relays(self) -> list[Relay]:
-        """The open connections."""
-        return list(self._relays)
-
     def topic_connections(self) -> set[tuple[int, str, str]]:
         """The open connections of topics: port, topic and the subscriber's name."""
-        return {(r.port, r.name, r.caller_id) for r in self._relays if r.kind == "topic"}
+        return {(r.port, r.name, r.caller_id) for r in self.relays if r.kind == "topic"}
 
     def traffic(self) -> Traffic:
         """Bytes by topic and service, of ended and open connections."""
         total = Traffic()
         total.sent, total.received = dict(self._ended.sent), dict(self._ended.received)
-        for relay in self._relays:
+        for relay in self.relays:
             total.add(relay.kind, relay.name, relay.sent, relay.received)
         return total
 
     async def sample_rates(self) -> None:
         """Compute the rates of all connections since the last time."""
         now = self._context.now()
-        for relay in self._relays:
+        for relay in self.relays:
             relay.sample(now)
 
     async def serve(self, endpoint: Endpoint, peer: str, conn: socket.socket) -> None:
@@ -68,93 +62,69 @@ class TcprosServer:
             header = await _read_header(conn)
             fields = decode_header(header[4:])
         except HeaderError as error:
-            await self._answer_error(conn, f"rosproxy: {error}")
+            reply = encode_header({"error": f"rosproxy: {error}"})
+            await asyncio.get_running_loop().sock_sendall(conn, reply)
+            conn.close()
             self._context.metrics.relay_errors.labels("bad header").inc()
             return
-        inside = await self._connect(endpoint, fields)
+        kind = "service" if "service" in fields else "topic"
+        name = fields.get(kind, "")
+        inside = await self._connect(endpoint, kind, name)
         if inside is None or not await _hand_on(header, inside):
-            self._fail(endpoint, conn, fields)
+            self._fail(endpoint, conn, name)
             return
-        self._start(endpoint, fields, conn, inside, peer)
+        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
+        if name not in endpoint.names(wanted):  # a label that outsiders can't multiply
+            name = "unregistered"
+        caller_id, splice = fields.get("callerid", ""), self._may_splice
+        relay = Relay(endpoint.port, kind, name, caller_id, peer, conn, inside, splice=splice)
+        endpoint.note_connection()
+        self.relays.start(relay, lambda ended: self._finished(endpoint, ended))
 
     def cut(self, port: int) -> None:
         """End the connections through a port."""
-        for relay in self._relays:
+        for relay in self.relays:
             if relay.port == port:
                 relay.end()
 
-    async def stop(self) -> None:
-        """End all connections."""
-        await self._relays.stop()
-
-    async def _connect(self, endpoint: Endpoint, fields: dict[str, str]) -> socket.socket | None:
+    async def _connect(self, endpoint: Endpoint, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; its port is asked for anew if the known one refuses."""
-        port = self._known_port(endpoint, fields)
-        inside = await _dial(endpoint.place.address, port) if port else None
+        if kind == "service":
+            known = self._context.registry.service_port(endpoint, name) or endpoint.tcpros_port
+        else:
+            known = endpoint.topic_ports.get(name, endpoint.tcpros_port)
+        inside = await _dial(endpoint.place.address, known)
         if inside is not None:
             return inside
-        learned = await self._learn_port(endpoint)
-        return await _dial(endpoint.place.address, learned) if learned else None
+        return await _dial(endpoint.place.address, await self._learn_port(endpoint))
 
     async def _learn_port(self, endpoint: Endpoint) -> int | None:
         """The TCPROS port that the node names now; it is asked once for all who wait."""
         asking = self._asking.get(endpoint)
         if asking is None:
-            asking = self._context.tasks.spawn(
-                self._ask_port(endpoint), f"TCPROS port of {endpoint.uri}"
-            )
+            work = self._ask_port(endpoint)
+            asking = self._context.tasks.spawn(work, f"TCPROS port of {endpoint.uri}")
             self._asking[endpoint] = asking
             asking.add_done_callback(lambda _: self._asking.pop(endpoint))
         return await asyncio.shield(asking)
 
     async def _ask_port(self, endpoint: Endpoint) -> int | None:
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         endpoint.replace_tcpros_ports(info.tcpros_port if info else None)
         return endpoint.tcpros_port
-
-    def _known_port(self, endpoint: Endpoint, fields: dict[str, str]) -> int | None:
-        service = fields.get("service")
-        if service is None:
-            return endpoint.topic_ports.get(fields.get("topic", ""), endpoint.tcpros_port)
-        return self._context.registry.service_port(endpoint, service) or endpoint.tcpros_port
-
-    def _start(
-        self,
-        endpoint: Endpoint,
-        fields: dict[str, str],
-        conn: socket.socket,
-        inside: socket.socket,
-        peer: str,
-    ) -> None:
-        kind = "service" if "service" in fields else "topic"
-        name = self._registered_name(endpoint, kind, fields.get(kind, ""))
-        caller_id = fields.get("callerid", "")
-        relay = Relay(
-            endpoint.port, kind, name, caller_id, peer, conn, inside, splice=self._may_splice
-        )
-        endpoint.note_connection()
-        self._relays.start(relay, lambda ended: self._finished(endpoint, ended))
-
-    def _registered_name(self, endpoint: Endpoint, kind: str, name: str) -> str:
-        """The name if the node has registered it: a label that outsiders can't multiply."""
-        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
-        return name if name in endpoint.names(wanted) else "unregistered"
 
     def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
         endpoint.note_disconnection()
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
-    def _fail(self, endpoint: Endpoint, conn: socket.socket, fields: dict[str, str]) -> None:
+    def _fail(self, endpoint: Endpoint, conn: socket.socket, name: str) -> None:
         """Reset, as a node that is gone would: roscpp and rospy try again."""
         self._context.metrics.relay_errors.labels("node unreachable").inc()
         sockets.reset_on_close(conn)
         conn.close()
-        if endpoint.registrations:
-            self._report(endpoint, fields)
-
-    def _report(self, endpoint: Endpoint, fields: dict[str, str]) -> None:
-        what = fields.get("service") or fields.get("topic") or "?"
-        text = f"no TCPROS connection to it for {what}"
+        if not endpoint.registrations:
+            return
+        text = f"no TCPROS connection to it for {name or '?'}"
         if is_loopback(endpoint.node.host):
             text += (
                 f": it listens on loopback only ({endpoint.uri}). Unset ROS_IP and ROS_HOSTNAME "
@@ -162,13 +132,6 @@ class TcprosServer:
             )
         log.warning("%s: %s", endpoint.label, text)
         self._context.problems.add(endpoint.label, text, endpoint.port)
-
-    async def _answer_error(self, conn: socket.socket, message: str) -> None:
-        try:
-            reply = encode_header({"error": message})
-            await asyncio.get_running_loop().sock_sendall(conn, reply)
-        finally:
-            conn.close()
 
 
 async def _read_header(conn: socket.socket) -> bytes:
@@ -181,11 +144,11 @@ async def _read_header(conn: socket.socket) -> bytes:
         return first + await sockets.read_exactly(conn, header_length(first))
 
 
-async def _dial(address: str, port: int) -> socket.socket | None:
+async def _dial(address: str, port: int | None) -> socket.socket | None:
     try:
-        return await sockets.dial(HostPort(address, port))
+        return await sockets.dial(HostPort(address, port)) if port else None
     except (OSError, TimeoutError) as error:
-        log.debug("connecting to %s:%d: %s", address, port, error)
+        log.debug("connecting to %s:%s: %s", address, port, error)
         return None
 
 
@@ -194,11 +157,10 @@ async def _hand_on(header: bytes, inside: socket.socket) -> bool:
     try:
         async with asyncio.timeout(sockets.CONNECT_TIMEOUT):
             await asyncio.get_running_loop().sock_sendall(inside, header)
-    except (OSError, TimeoutError) as error:
+    except BaseException as error:
+        inside.close()
+        if not isinstance(error, OSError):  # a time-out is one, too
+            raise
         log.debug("handing a header on: %s", error)
-        inside.close()
         return False
-    except BaseException:
-        inside.close()
-        raise
     return True

@@ -7,8 +7,8 @@ no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 
 import asyncio
 import logging
 import socket
+from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from copy import copy
 from functools import lru_cache
 from typing import Any
 
@@ -16,9 +16,11 @@ from aiohttp import HttpVersion, HttpVersion11, web
 
 from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
 from rosproxy.net.http_client import pieces, read_bounded
-from rosproxy.net.sockets import reset_on_close
+from rosproxy.net.sockets import peek, reset_on_close
 from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
+from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +48,6 @@ class IncomingCall:
         """Whether a proxy itself made this call."""
         return self.loop_id.partition(" ")[0] == instance
 
-    def with_body(self, body: bytes) -> "IncomingCall":
-        """The same call with another body."""
-        other = copy(self)
-        other.body = body
-        return other
-
     @property
     def reached_locally(self) -> bool:
         """Whether the caller named the very address and port of this machine that it reached.
@@ -66,50 +62,52 @@ XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
 """Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
 
 
-class PortConnections:
-    """The connections of a port; those that have ended are forgotten now and then."""
-
-    def __init__(self) -> None:
-        self._known: list[web.RequestHandler] = []
-        self._enough = 16
-
-    def add(self, handler: web.RequestHandler) -> None:
-        """Take one in; all are looked at only once their number has doubled."""
-        self._known.append(handler)
-        if len(self._known) > self._enough:
-            self._known = self.alive()
-            self._enough = max(16, 2 * len(self._known))
-
-    def alive(self) -> list[web.RequestHandler]:
-        """Those that are open."""
-        return [handler for handler in self._known if handler.transport is not None]
+async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[bytes]) -> bytes:
+    """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
+    try:
+        answer = await reply
+    except Unreachable:
+        metrics.count(api, method, "unreachable")
+        raise
+    metrics.count(api, method, "answered")
+    return answer
 
 
-class XmlRpcServer:
+class XmlRpcServer(web.Server):
     """Turns accepted sockets into XML-RPC calls to a service."""
 
     def __init__(self, service: XmlRpcService, greeting: str) -> None:
+        super().__init__(self._handle, access_log=None, keepalive_timeout=75)
         self._service, self._greeting = service, greeting
-        self._server = web.Server(self._handle, access_log=None, keepalive_timeout=75)
-        self._by_port: dict[int, PortConnections] = {}
+        self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
+        self._ports: dict[web.RequestHandler, int] = {}
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
-    async def serve(self, conn: socket.socket) -> None:
-        """Take over a connection. Raises OSError if it has ended already."""
-        port, loop = conn.getsockname()[1], asyncio.get_running_loop()
-        _, handler = await loop.connect_accepted_socket(self._server, sock=conn)
-        self._mute.add(handler)
-        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
-        self._by_port.setdefault(port, PortConnections()).add(handler)
+    async def dispatch(
+        self, conn: socket.socket, relay: Callable[[socket.socket], Awaitable[None]] | None = None
+    ) -> None:
+        """Take a connection over, or hand it to ``relay`` if it is TCPROS; without, all is HTTP.
 
-    def connections(self, port: int) -> int:
+        In both protocols the client speaks first, and four bytes tell them apart: letters are an
+        HTTP method, anything else the length of a connection header. They are only peeked at. One
+        that ends before it has said anything is closed. Raises TimeoutError, OSError.
+        """
+        first = await peek(conn, 4)
+        if first and (relay is None or speaks_http(first)):
+            await self._serve(conn)
+        elif len(first) < 4 or relay is None:
+            conn.close()
+        else:
+            await relay(conn)
+
+    def count(self, port: int) -> int:
         """How many connections are open that came in on a port."""
-        return len(self._by_port[port].alive()) if port in self._by_port else 0
+        return len(self._by_port[port])
 
     def close_port(self, port: int) -> None:
         """Let the connections that came in on a port end with the calls that they carry now."""
-        for handler in self._by_port.pop(port, PortConnections()).alive():
+        for handler in list(self._by_port[port]):
             if handler in self._busy:
                 handler.close()
             else:
@@ -117,7 +115,26 @@ class XmlRpcServer:
 
     async def close(self) -> None:
         """Close all connections."""
-        await self._server.shutdown(STOP_TIMEOUT)
+        await self.shutdown(STOP_TIMEOUT)
+
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Know a connection by the port that it came in on."""
+        super().connection_made(handler, transport)
+        port = self._ports[handler] = transport.get_extra_info("sockname")[1]
+        self._by_port[port].add(handler)
+
+    def connection_lost(
+        self, handler: web.RequestHandler, exc: BaseException | None = None
+    ) -> None:
+        """Forget a connection."""
+        super().connection_lost(handler, exc)
+        self._by_port[self._ports.pop(handler, 0)].discard(handler)
+
+    async def _serve(self, conn: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        _, handler = await loop.connect_accepted_socket(self, sock=conn)
+        self._mute.add(handler)
+        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
 
     def _close_mute(self, handler: web.RequestHandler) -> None:
         if handler in self._mute:
@@ -138,9 +155,8 @@ class XmlRpcServer:
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
         body = await _body(request)
-        return await self._answer(request, body) if isinstance(body, bytes) else body
-
-    async def _answer(self, request: web.BaseRequest, body: bytes) -> web.StreamResponse:
+        if not isinstance(body, bytes):
+            return body
         try:
             reply = await self._service(IncomingCall(request, body))
         except xmlrpc.XmlRpcError as error:

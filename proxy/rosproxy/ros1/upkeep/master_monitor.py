@@ -11,8 +11,8 @@ import logging
 
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.upkeep.recovery.recovery import Recovery
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
@@ -46,20 +46,17 @@ class MasterMonitor:
                 pid = await self._context.upstream.call_master("getPid")
             self.round_trip = self._context.now() - started
             await self._recovery.ensure()
-            await self._check(pid)
+            restarted = not self.up or pid != self.pid
+            self.pid = pid
+            self._looks += 1
+            if restarted or self._looks % LOOKS_PER_CHECK == 0:
+                await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:
             self._mark(False, str(error))
         except TimeoutError:
             uri = self._context.settings.master_uri
             self._mark(False, f"master {uri}: no answer in {LOOK_TIMEOUT:g} s")
-
-    async def _check(self, pid: int) -> None:
-        restarted = not self.up or pid != self.pid
-        self.pid = pid
-        self._looks += 1
-        if restarted or self._looks % LOOKS_PER_CHECK == 0:
-            await self._registrar.register_lost()
 
     def _mark(self, up: bool, error: str = "") -> None:
         if up != self.up:

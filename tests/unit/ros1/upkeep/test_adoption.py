@@ -4,20 +4,19 @@ from collections.abc import Mapping, Sequence
 
 import pytest
 
-from rosproxy.admin.requests import Arrival
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
-from rosproxy.ros1.upkeep.adoption import policy
-from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
-from rosproxy.ros1.upkeep.registration.policy import known_as
+from rosproxy.ros1.upkeep.policy import adoption as policy
+from rosproxy.ros1.upkeep.policy.adoption import DirectNode
+from rosproxy.ros1.upkeep.policy.registration import known_as
 from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
-C1 = Arrival("10.0.0.5", frozenset({"c1", "3f2a91c0b7de"}))
-C2 = Arrival("10.0.0.6", frozenset({"c2", "twin"}))
-C3 = Arrival("10.0.0.7", frozenset({"c3", "twin"}))
+C1 = ("10.0.0.5", {"c1", "3f2a91c0b7de"})
+C2 = ("10.0.0.6", {"c2", "twin"})
+C3 = ("10.0.0.7", {"c3", "twin"})
 
 
 def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
@@ -56,14 +55,13 @@ def test_whose_uri_may_mean_a_container(uri: str, expected: tuple[HostPort, ...]
 def test_a_container_named_as_the_advertised_host_is_no_way_to_the_proxys_own_nodes() -> None:
     uris = {"/ours": "http://robot-host:45003/10.0.0.5:40001/", "/its": "http://robot-host:50000/"}
     graph = Graph({name: [held("/a", name)] for name in uris}, uris)
-    arrival = Arrival("10.0.0.5", frozenset({"robot-host"}))
-    found = policy.find_direct(graph, [arrival], make_addressing())
+    found = policy.find_direct(graph, [("10.0.0.5", {"robot-host"})], make_addressing())
     assert [node.caller_id for node in found] == ["/its"]
 
 
 def test_a_container_on_two_networks_is_looked_for_on_both() -> None:
     graph = Graph({"/n": [held("/a")]}, {"/n": "http://c1:40001/"})
-    both = [C1, Arrival("10.1.0.5", C1.names), C1]
+    both = [C1, ("10.1.0.5", C1[1]), C1]
     (found,) = policy.find_direct(graph, both, make_addressing())
     assert found.places == places("10.0.0.5:40001", "10.1.0.5:40001")
 
@@ -167,26 +165,26 @@ def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) ->
 
 
 LITERAL, ADVERTISED = "http://c1:40001/", "http://robot-host:45000/c1:40001/10.0.0.5/"
-CAUSES = [
-    # registered around the proxy before? what the master has, the cause
-    (False, ADVERTISED, ShutdownCause.ADOPTED_AGAIN),
-    (True, ADVERTISED, ShutdownCause.ADOPTED_AGAIN),
-    (False, LITERAL, ShutdownCause.REGISTERED_DIRECTLY),
-    (True, LITERAL, ShutdownCause.REGISTERED_DIRECTLY),
-    (False, None, ShutdownCause.NAME_TAKEN),
-    (True, None, ShutdownCause.REGISTERED_DIRECTLY),
-    (False, "http://laptop:1/", ShutdownCause.NAME_TAKEN),
-    (True, "http://laptop:1/", ShutdownCause.NAME_TAKEN),
-    (True, "http://robot-host:45001/c2:40001/10.0.0.6/", ShutdownCause.NAME_TAKEN),
+NAMES = [
+    # registered around the proxy before? what the master has, whether no other has its name
+    (False, ADVERTISED, True),
+    (True, ADVERTISED, True),
+    (False, LITERAL, True),
+    (True, LITERAL, True),
+    (False, None, False),
+    (True, None, True),
+    (False, "http://laptop:1/", False),
+    (True, "http://laptop:1/", False),
+    (True, "http://robot-host:45001/c2:40001/10.0.0.6/", False),
 ]
 
 
-@pytest.mark.parametrize(("direct", "uri", "cause"), CAUSES)
-def test_who_is_to_be_shut_down(direct: bool, uri: str | None, cause: ShutdownCause) -> None:
+@pytest.mark.parametrize(("direct", "uri", "its_own"), NAMES)
+def test_who_is_to_be_shut_down(direct: bool, uri: str | None, its_own: bool) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing, LITERAL, "10.0.0.5", True)
     assert addressing.advertised_uri(endpoint) == ADVERTISED
     if direct:
         endpoint.former_uris.add(LITERAL)
     assert endpoint.direct is direct
-    assert policy.shutdown_cause(endpoint, uri, ADVERTISED) is cause
+    assert policy.has_name_still(endpoint, uri, ADVERTISED) is its_own

@@ -1,6 +1,6 @@
 """Recovery from what the master knows: claims, who bears them out, and what the master lost."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from ipaddress import ip_network
 
 import pytest
@@ -9,31 +9,30 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import InsidePath
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph
-from rosproxy.ros1.upkeep.recovery import policy
-from rosproxy.ros1.upkeep.recovery.policy import Claim
+from rosproxy.ros1.upkeep.policy import recovery as policy
+from rosproxy.ros1.upkeep.policy.recovery import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
 
-PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
+PUB, SRV = Kind.PUBLISHER, Kind.SERVICE
 
 
-def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0) -> Registration:
-    return Registration(kind, name, caller_id, since=since)
+def held(name: str, caller_id: str = "/n") -> Registration:
+    return Registration(PUB, name, caller_id)
 
 
-def graph(uris: dict[str, str], names: Sequence[str] = ("/a",)) -> Graph:
-    return Graph({node: [held(name, node) for name in names] for node in uris}, uris)
+def graph(uris: dict[str, str]) -> Graph:
+    return Graph({node: [held("/a", node)] for node in uris}, uris)
 
 
 URIS = [
-    # what the master has for a node, the claim: port, host and port it calls itself, address
-    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5", 40001, "10.0.0.5")),
-    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5", 40001, "10.0.0.5")),
-    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1", 40001, "10.0.0.5")),
-    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "fd00::5", 40001, "fd00::5")),
-    ("http://robot-host:45003/c5:40001/", (45003, "c5", 40001, "c5")),  # refused by address
+    # what the master has for a node, the claim: port, what it calls itself, where it is looked for
+    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5:40001", "10.0.0.5")),
+    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5:40001", "10.0.0.5")),
+    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1:40001", "10.0.0.5")),
+    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "[fd00::5]:40001", "fd00::5")),
+    ("http://robot-host:45003/c5:40001/", (45003, "c5:40001", "c5")),  # refused by address
     ("http://robot-host:45003/", None),
     ("http://robot-host:45003", None),
     ("http://robot-host:45003/RPC2", None),
@@ -49,20 +48,15 @@ URIS = [
 
 @pytest.mark.parametrize(("uri", "expected"), URIS)
 def test_claims_are_read_from_advertised_uris(
-    uri: str, expected: tuple[int, str, int, str] | None
+    uri: str, expected: tuple[int, str, str] | None
 ) -> None:
     found = policy.claims(graph({"/n": uri}), make_addressing())
+    claims = [(one.port, one.uri, one.key, one.topics) for one in found]
     if expected is None:
-        assert found == []
-        return
-    (claim,) = found
-    assert (claim.port, *claim.uri.removeprefix("http://").rsplit(":", 1)) == (
-        expected[0],
-        f"[{expected[1]}]" if ":" in expected[1] else expected[1],
-        f"{expected[2]}/",
-    )
-    assert claim.key == (expected[3], expected[2])
-    assert claim.topics == {"/a"}
+        assert claims == []
+    else:
+        port, node, address = expected
+        assert claims == [(port, f"http://{node}/", (address, 40001), {"/a"})]
 
 
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
@@ -88,47 +82,42 @@ def test_a_node_without_registrations_or_without_a_uri() -> None:
     assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing) == []
 
 
-def claim(port: int, address: str, topics: Sequence[str] = (), slave: int = 40001) -> Claim:
-    inside = InsidePath(HostPort(address, slave))
-    return Claim(port, inside, [held(topic) for topic in topics])
+def claim(
+    port: int,
+    address: str,
+    topics: Sequence[str] = (),
+    said: Collection[str] | None = None,
+    slave: int = 40001,
+) -> Claim:
+    named = None if said is None else set(said)
+    return Claim(port, HostPort(address, slave), address, list(map(held, topics)), named)
 
 
 A, B = "10.0.0.5", "10.0.0.6"
 SETTLED = [
-    # claims, what the nodes asked said (by index), the ports and addresses kept
-    ([], {}, []),
-    ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], {}, [(1, A), (2, B)]),
+    # claims: port, address, topics at the master, topics that the node asked said; who is kept
+    ([], []),
+    ([claim(1, A, ["/a"]), claim(2, B, ["/a"])], [(1, A), (2, B)]),
     # one port, two nodes: a left-over, or a forgery of many topics that no node bears out
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: {"/a"}}, [(1, A)]),
-    ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"])], {0: None, 1: {"/b"}}, [(1, B)]),
-    ([claim(1, A, ["/a"]), claim(1, B, ["/b"])], {0: {"/x"}, 1: {"/b"}}, [(1, B)]),
+    ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/a", "/b"])], [(1, A)]),
+    ([claim(1, A, ["/a", "/b", "/c"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
+    ([claim(1, A, ["/a"], ["/x"]), claim(1, B, ["/b"], ["/b"])], [(1, B)]),
     # a forgery that leads to a real node, but claims too much of it
-    (
-        [claim(1, A, ["/a", "/b"]), claim(1, B, ["/c", "/x", "/y"])],
-        {0: {"/a", "/b"}, 1: {"/c"}},
-        [(1, A)],
-    ),
+    ([claim(1, A, ["/a"], ["/a"]), claim(1, B, ["/c", "/x", "/y"], ["/c"])], [(1, A)]),
     # one node, two ports: as many topics as it has, no more
-    (
-        [claim(1, A, ["/a"]), claim(2, A, ["/a", "/b"])],
-        {0: {"/a", "/b"}, 1: {"/a", "/b"}},
-        [(2, A)],
-    ),
+    ([claim(1, A, ["/a"], ["/a", "/b"]), claim(2, A, ["/a", "/b"], ["/a", "/b"])], [(2, A)]),
     # nobody answered: the one with more registrations
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {}, [(1, B)]),
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: None, 1: None}, [(1, B)]),
+    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], [(1, B)]),
     # an answer that bears out nothing is still better than none
-    ([claim(1, A, ["/a"]), claim(1, B, ["/a", "/b"])], {0: set()}, [(1, A)]),
+    ([claim(1, A, ["/a"], []), claim(1, B, ["/a", "/b"])], [(1, A)]),
 ]
 
 
-@pytest.mark.parametrize(("found", "said", "kept"), SETTLED)
+@pytest.mark.parametrize(("found", "kept"), SETTLED)
 def test_one_claim_is_kept_for_each_port_and_each_node(
-    found: list[Claim], said: dict[int, set[str] | None], kept: list[tuple[int, str]]
+    found: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
-    answers = {i: None if topics is None else frozenset(topics) for i, topics in said.items()}
-    settled = policy.settle(found, answers)
-    assert sorted((one.port, one.address) for one in settled) == kept
+    assert sorted((one.port, one.address) for one in policy.settle(found)) == kept
 
 
 @pytest.mark.parametrize(
@@ -147,22 +136,14 @@ def test_claims_to_the_same_port_or_node_are_contested(
     assert [one.port for one in policy.contested(found)] == ports
 
 
-CLAIMS = st.lists(
-    st.builds(
-        claim,
-        st.integers(1, 4),
-        st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"]),
-        st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True),
-    ),
-    max_size=6,
-)
+TOPICS = st.lists(st.sampled_from(["/a", "/b", "/c"]), unique=True)
+ADDRESSES = st.sampled_from(["10.0.0.5", "10.0.0.6", "10.0.0.7"])
+CLAIMS = st.builds(claim, st.integers(1, 4), ADDRESSES, TOPICS, st.none() | TOPICS)
 
 
-@given(CLAIMS, st.dictionaries(st.integers(0, 5), st.none() | st.frozensets(st.sampled_from("ab"))))
-def test_settling_leaves_no_contest_and_forgets_nobody_without_one(
-    found: list[Claim], said: dict[int, frozenset[str] | None]
-) -> None:
-    settled = policy.settle(found, said)
+@given(st.lists(CLAIMS, max_size=6))
+def test_settling_leaves_no_contest_and_forgets_nobody_without_one(found: list[Claim]) -> None:
+    settled = policy.settle(found)
     assert policy.contested(settled) == []
     rivals = policy.contested(found)
     assert all(one in settled for one in found if one not in rivals)

@@ -7,7 +7,7 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.upkeep.registration import policy
+from rosproxy.ros1.upkeep.policy import registration as policy
 from tests.unit.builders import (
     add_node,
     add_registration,
@@ -100,6 +100,7 @@ LEFT_OVER = [
     ([*OLD, *NEW], {"/rosout"}, {"/b"}, OLD),  # another node on the same port
     ([*OLD, *NEW], {"/rosout", "/a"}, {"/b"}, []),  # two names in one process
     ([*OLD, (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),  # is being made right now
+    ([*OLD, (SRV, "/late", "/old", 12.0), (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),
 ]
 
 
@@ -129,56 +130,53 @@ def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     assert policy.unregistered(endpoint, said({"/b"})) == []
 
 
-def test_what_is_taken_back_and_in_which_order() -> None:
+def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
     uris = {"/n": "http://c1:40001/", "/m": "http://c1:40001"}
-    known = {
-        "/n": [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB)],
-        "/m": [held("/c", "/m", SUB), held("/lost", "/m", SRV)],
-        "/other": [held("/a", "/other")],
-    }
     services = {"/add": "rosrpc://c1:50001"}
-    assert policy.free_calls(uris, known, services) == [
+    mine = [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB), held("/c", "/m", SUB)]
+    mine.append(held("/lost", kind=SRV))
+    assert policy.free_calls(mine, uris, services) == [
         ("unregisterSubscriber", ["/n", "/b", "http://c1:40001/"]),
         ("unregisterSubscriber", ["/m", "/c", "http://c1:40001"]),
         ("unregisterPublisher", ["/n", "/a", "http://c1:40001/"]),
         ("unregisterService", ["/n", "/add", "rosrpc://c1:50001"]),
     ]
-
-
-def test_what_is_put_back() -> None:
-    known = [Registration(PUB, "/a", "/n", "std_msgs/String"), held("/add", kind=SRV)]
-    known += [held("/lost", kind=SRV)]
-    services = {"/add": "rosrpc://c1:50001"}
-    assert policy.restore_calls({"/n": "http://c1:40001/"}, {"/n": known}, services) == [
-        ("registerPublisher", ["/n", "/a", "std_msgs/String", "http://c1:40001/"]),
+    assert policy.restore_calls(mine, uris, services) == [
+        ("registerPublisher", ["/n", "/a", "*", "http://c1:40001/"]),
         ("registerService", ["/n", "/add", "rosrpc://c1:50001", "http://c1:40001/"]),
+        ("registerSubscriber", ["/n", "/b", "*", "http://c1:40001/"]),
+        ("registerSubscriber", ["/m", "/c", "*", "http://c1:40001"]),
     ]
 
 
 def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
-    ask = ("lookupNode", ["/rosproxy", "/n"])
+    ask = [("lookupNode", ["/rosproxy", name]) for name in ("/n", "/m")]
     parameter = "/rosout_disable_topics_generation"
-    assert policy.release_calls("/n", "http://c1:1/", "/rosproxy") == [
-        ask,
+    assert policy.release_calls({"/n": "http://c1:1/", "/m": "http://c1:2/"}, "/rosproxy") == [
+        *ask,
         ("unsubscribeParam", ["/n", "http://c1:1/", parameter]),
-        ask,
+        ("unsubscribeParam", ["/m", "http://c1:2/", parameter]),
+        *ask,
     ]
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "expected"),
-    [
-        # the answers to lookupNode, the parameters that were subscribed to at most
-        (None, None, []),
-        ("U", None, [policy.COMMON_PARAMETER]),
-        ("U", "U", None),
-        ("other", "other", None),  # somebody else has the name by now
-    ],
-)
-def test_what_a_node_was_subscribed_to(
-    before: str | None, after: str | None, expected: list[str] | None
-) -> None:
-    assert policy.released_parameters([before, 1, after]) == expected
+def test_who_was_subscribed_to_it_and_who_is_known_still() -> None:
+    uris = dict.fromkeys(("/unknown", "/common", "/another", "/taken"), "U")
+    before, after = [None, "U", "U", "other"], [None, None, "U", "other"]
+    ended, known = policy.read_release(uris, [*before, 1, 1, 1, 1, *after])
+    assert ended == [Registration(PARAM, policy.COMMON_PARAMETER, "/common")]
+    assert known == {"/another": "U", "/taken": "other"}
+
+
+def test_what_has_not_ended_meanwhile_is_registered_subscribers_last() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    kinds = (SUB, PUB, PARAM, SRV)
+    wanted = [(endpoint, add_registration(addressing, endpoint, kind, "/a")) for kind in kinds]
+    ended = endpoint, held("/gone")
+    replaced = endpoint, held("/a", "/talker")
+    found = policy.to_register([ended, replaced, *wanted])
+    assert found == [*wanted[1:], wanted[0]]
 
 
 def test_topics_that_a_node_no_longer_has() -> None:

@@ -7,8 +7,8 @@ import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.policy import resubscription as policy
+from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
@@ -106,9 +106,9 @@ def test_a_relay_serves_one_subscriber_of_one_topic_of_one_publisher(
 
 
 ROWS = [
-    ([0, "/a", "o", "TCPROS", "/t", True, "text"], BusRow("/t", "/a", "TCPROS")),
-    ([7, "/a", "o", "UDPROS", "/t", 1], BusRow("/t", "/a", "UDPROS")),
-    ([1, "/a", "o", "INTRAPROCESS", "/t"], BusRow("/t", "/a", "INTRAPROCESS")),
+    ([0, "/a", "o", "TCPROS", "/t", True, "text"], ("/t", "/a", "TCPROS")),
+    ([7, "/a", "o", "UDPROS", "/t", 1], ("/t", "/a", "UDPROS")),
+    ([1, "/a", "o", "INTRAPROCESS", "/t"], ("/t", "/a", "INTRAPROCESS")),
     ([1, "http://laptop:5/", "i", "TCPROS", "/t"], None),
     ([1, 2, "o", "TCPROS", "/t"], None),
     ([1, "/a", "o"], None),
@@ -129,7 +129,7 @@ def test_bus_info_of_another_form_tells_nothing(value: Any) -> None:
 
 def test_a_subscriber_by_udpros_is_not_silent_and_one_by_tcpros_may_be() -> None:
     endpoint = publisher("/t")
-    bus = {endpoint: [BusRow("/t", "/a", "UDPROS"), BusRow("/t", "/b", "TCPROS")]}
+    bus = {endpoint: [("/t", "/a", "UDPROS"), ("/t", "/b", "TCPROS")]}
     assert names(policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
     assert names(policy.unconnected(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == ["/a"]
     assert names(policy.unconnected(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
@@ -158,7 +158,7 @@ def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_s
 ) -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = peers
-    bus = {endpoint: [BusRow("/t", name, "TCPROS") for name in named]}
+    bus = {endpoint: [("/t", name, "TCPROS") for name in named]}
     left = subscribed(endpoint, "/a", "/b", "/c")
     assert names(policy.unconnected(left, bus, HOSTS)) == found
 
@@ -180,7 +180,7 @@ def test_a_host_that_is_not_found_has_no_connections() -> None:
 def test_a_udpros_subscriber_needs_no_connection_in_the_kernel() -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = {LAPTOP: 1}
-    bus = {endpoint: [BusRow("/t", "/a", "UDPROS")]}
+    bus = {endpoint: [("/t", "/a", "UDPROS")]}
     assert policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
 
 

@@ -2,30 +2,30 @@
 
 *gone*: nodes at these addresses that don't answer are unregistered at once, and their ports refuse.
 *moved*: nodes that answer at the new address keep their ports, and subscribers are told. *arrived*:
-nodes that registered around the proxy before it could be reached are adopted (`adoption`).
+nodes that registered around the proxy before it could be reached are adopted (`adopter`).
 """
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Awaitable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
 
-from rosproxy.admin import requests
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.upkeep.adoption.adopter import Adopter
-from rosproxy.ros1.upkeep.containers import policy
-from rosproxy.ros1.upkeep.recovery.recovery import Recovery
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
+from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.ros1.upkeep.policy import liveness
+from rosproxy.ros1.upkeep.policy.adoption import Container
+from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,6 @@ class ContainerEvents:
 
     context: Context
     leases: Leases[Endpoint]
-    nodes: NodeClient
     registrar: Registrar
     adopter: Adopter
     recovery: Recovery
@@ -53,30 +52,39 @@ class ContainerEvents:
     plane: KernelPlane
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    async def handle(self, body: Any) -> dict[str, Any]:
+    async def handle(
+        self, gone: Collection[str], moved: Mapping[str, str], arrived: Sequence[Container]
+    ) -> dict[str, int]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
-        All of it is safe to be told again. Raises BodyError, Unreachable, MasterError; the latter
-        two once all has been tried.
+        ``gone``: addresses that no container has any more; ``moved``: old address to new address;
+        ``arrived``: containers that may have nodes. All of it is safe to be told again.
+        Raises Unreachable, MasterError, once all has been tried.
         """
-        news = requests.read_news(body)
-        failed: list[Exception] = []
+        steps = {
+            "moved": partial(self._move, moved),
+            "unregistered": partial(self._remove, gone),
+            "adopted": partial(self.adopter.adopt, arrived),
+        }
+        counts: dict[str, int] = {}
+        failed: Exception | None = None
         async with self._one_at_a_time:
             await self.recovery.ensure()
             self.context.read_networks()
-            moved = await _try(self._move(news.moved), failed)
-            unregistered = await _try(self._remove(news.gone), failed)
-            adopted = await _try(self._adopt(news.arrived), failed)
+            for what, step in steps.items():
+                try:
+                    counts[what] = await step()
+                except (Unreachable, MasterError) as error:
+                    failed = failed or error
         if failed:
-            raise failed[0]
-        return {"unregistered": unregistered, "moved": moved, "adopted": adopted}
+            raise failed
+        return counts
 
-    async def retire(self, body: Any) -> dict[str, Any]:
+    async def retire(self) -> int:
         """``POST /retire``: how many nodes were unregistered; nothing is registered any more.
 
-        Raises BodyError, Unreachable, MasterError.
+        Raises Unreachable, MasterError.
         """
-        requests.read_nothing(body)
         self.context.retired = True
         async with self._one_at_a_time:
             await self.recovery.ensure()
@@ -89,18 +97,19 @@ class ContainerEvents:
                 self._cut(endpoint)
                 self.leases.end(endpoint)
         log.info("retired: %d nodes unregistered; waiting to be stopped", count)
-        return {"unregistered": count}
+        return count
 
-    async def _remove(self, addresses: Sequence[str]) -> int:
+    async def _remove(self, addresses: Collection[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
-        found = policy.at(self.context.registry, addresses)
+        found = [e for e in self.context.registry if e.place.address in addresses]
         return await self._remove_dead(found, self.context.now() - YOUNG)
 
     async def _remove_dead(self, found: Sequence[Endpoint], since: float) -> int:
         """Unregister those that don't answer; who is silent and registered ``since``, later."""
-        answers = await asyncio.gather(*(self.nodes.probe(e.slave, GONE_TIMEOUT) for e in found))
+        probe = self.context.nodes.probe
+        answers = await asyncio.gather(*(probe(e.slave, GONE_TIMEOUT) for e in found))
         outcomes = {e: answer.probe for e, answer in zip(found, answers, strict=True)}
-        dead = policy.dead(outcomes, since)
+        dead = liveness.dead(outcomes, since)
         for endpoint in dead:
             self._close(endpoint)
         alive = [endpoint for endpoint in found if endpoint not in dead]
@@ -116,16 +125,17 @@ class ContainerEvents:
         await asyncio.sleep(SECOND_CHANCE)
         async with self._one_at_a_time:
             there = [e for e in silent if self.context.registry.by_port.get(e.port) is e]
-            await _try(self._remove_dead(there, float("inf")), [])
+            with contextlib.suppress(Unreachable, MasterError):
+                await self._remove_dead(there, float("inf"))
 
     async def _move(self, moved: Mapping[str, str]) -> int:
         """Take in that containers have other addresses now; how many nodes that concerns."""
         registry, addressing = self.context.registry, self.context.addressing
-        candidates = policy.movable(registry, moved, addressing.networks)
+        candidates = liveness.movable(registry, moved, addressing.networks)
         found = await asyncio.gather(*(self._inspect(e, new) for e, new in candidates.items()))
         infos = {e: info for e, info in zip(candidates, found, strict=True) if info}
         before = {endpoint: addressing.advertised_uri(endpoint) for endpoint in infos}
-        places = {e: policy.new_place(e, candidates[e]) for e in infos}
+        places = {e: liveness.new_place(e, candidates[e]) for e in infos}
         there = registry.move(places)
         for endpoint in there:
             self._settle(endpoint, before[endpoint], infos[endpoint])
@@ -141,8 +151,8 @@ class ContainerEvents:
 
     async def _inspect(self, endpoint: Endpoint, address: str) -> NodeInfo | None:
         """What the node of an endpoint says, if it is the one that answers at another address."""
-        info = await self.nodes.inspect(HostPort(address, endpoint.node.port))
-        same = info is not None and policy.is_same_process(endpoint, info.pid, info.topics)
+        info = await self.context.nodes.inspect(HostPort(address, endpoint.node.port))
+        same = info is not None and liveness.is_same_process(endpoint, info.pid, info.topics)
         return info if same else None
 
     def _settle(self, endpoint: Endpoint, before: str, info: NodeInfo) -> None:
@@ -152,12 +162,8 @@ class ContainerEvents:
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)
-        log.info(
-            "%s is at %s now", endpoint.label, endpoint.place.address, extra=endpoint.log_fields
-        )
-
-    async def _adopt(self, arrived: Sequence[requests.Arrival]) -> int:
-        return len((await self.adopter.adopt(arrived)).names) if arrived else 0
+        address, fields = endpoint.place.address, endpoint.log_fields
+        log.info("%s is at %s now", endpoint.label, address, extra=fields)
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:
         """Unregister nodes; how many names that were."""
@@ -176,12 +182,3 @@ class ContainerEvents:
         """End the connections to a node, also those that the kernel forwards."""
         self.tcpros.cut(endpoint.port)
         self.plane.cut(endpoint)
-
-
-async def _try(work: Awaitable[int], failed: list[Exception]) -> int:
-    """A result; 0 if the master could not be asked, which is noted in ``failed``."""
-    try:
-        return await work
-    except (Unreachable, MasterError) as error:
-        failed.append(error)
-        return 0

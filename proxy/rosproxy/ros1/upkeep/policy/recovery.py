@@ -7,36 +7,37 @@ served (`confirmed_by`).
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import InsidePath, slave_uri
+from rosproxy.ros1.protocol.uris import slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
-_EVERYBODYS = frozenset({"/rosout"})
 
 
 @dataclass(slots=True)
 class Claim:
-    """An endpoint that the master's data tell of: its port, its inside address, what it holds."""
+    """An endpoint that the master's data tell of: its port, its inside address, what it holds.
+
+    ``node`` is the host and port that the node calls itself, ``address`` where to look for it.
+    ``said`` are the topics that it names there; None if it was not asked or gave no answer.
+    """
 
     port: int
-    inside: InsidePath
+    node: HostPort
+    address: str
     registrations: list[Registration] = field(default_factory=list)
-
-    @property
-    def address(self) -> str:
-        """The address to look for the node at."""
-        return self.inside.address or self.inside.node.host
+    said: set[str] | None = None
 
     @property
     def key(self) -> tuple[str, int]:
         """What the endpoint would be keyed by."""
-        return self.address, self.inside.node.port
+        return self.address, self.node.port
 
     @property
     def topics(self) -> set[str]:
@@ -46,16 +47,17 @@ class Claim:
     @property
     def uri(self) -> str:
         """The slave URI as the node must have given it."""
-        return slave_uri(self.inside.node)
+        return slave_uri(self.node)
 
 
 def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     """The endpoints of this proxy among the nodes of a master."""
     found: dict[str, Claim] = {}
     for node, uri in graph.uris.items():
-        ours = addressing.identify(uri)
-        if ours:
-            found.setdefault(uri, Claim(*ours)).registrations += graph.held.get(node, [])
+        if ours := addressing.identify(uri):
+            port, inside = ours
+            claim = Claim(port, inside.node, inside.address or inside.node.host)
+            found.setdefault(uri, claim).registrations += graph.held.get(node, [])
     return list(found.values())
 
 
@@ -65,23 +67,16 @@ def contested(found: Sequence[Claim]) -> list[Claim]:
     return [claim for claim in found if ports[claim.port] > 1 or keys[claim.key] > 1]
 
 
-def settle(found: Sequence[Claim], said: Mapping[int, frozenset[str] | None]) -> list[Claim]:
-    """One claim per port and inside address: the one that its node bears out best.
+def settle(found: Sequence[Claim]) -> list[Claim]:
+    """One claim per port and inside address: the one that its node bears out best."""
 
-    ``said`` gives, by index, the topics that the node there names; nothing or None where it was
-    not asked or gave no answer.
-    """
-
-    def merit(index: int) -> tuple[int, int]:
-        claim, topics = found[index], said.get(index)
-        if topics is None:
-            return NO_MERIT, len(claim.registrations)
-        return len(claim.topics & topics) - len(claim.topics - topics), len(claim.registrations)
+    def merit(claim: Claim) -> tuple[int, int]:
+        topics, said, count = claim.topics, claim.said, len(claim.registrations)
+        return NO_MERIT if said is None else len(topics & said) - len(topics - said), count
 
     ports: dict[int, Claim] = {}
     keys: set[tuple[str, int]] = set()
-    for index in sorted(range(len(found)), key=merit, reverse=True):
-        claim = found[index]
+    for claim in sorted(found, key=merit, reverse=True):
         if claim.port not in ports and claim.key not in keys:
             ports[claim.port] = claim
             keys.add(claim.key)
@@ -94,5 +89,5 @@ def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
     A forged URI that leads to something other than the node of that name finds no answer here,
     or one of another node.
     """
-    telling = endpoint.topics - _EVERYBODYS
+    telling = endpoint.topics - {"/rosout"}  # everybody's
     return bool((telling or endpoint.topics) & topics)

@@ -7,9 +7,12 @@ the calls tell is noted: the TCPROS port that a node names, and that a node refu
 
 import asyncio
 import logging
+import socket
+from functools import partial
 
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_inside_path
@@ -19,8 +22,9 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import Change, ProbeResult
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.slave_api import Visit
-from rosproxy.ros1.servers.needs import AliasPorts, TakingOver
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
+from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
+from rosproxy.ros1.upkeep.adopter import Adopter
 
 log = logging.getLogger(__name__)
 
@@ -29,17 +33,31 @@ REGISTRATION_GRACE = 0.5
 
 
 class SlaveApi:
-    """Forwards slave API calls to the node behind the port at which they arrive."""
+    """Answers at the ports of nodes inside, each of which stands for all of its node.
+
+    Slave API calls are forwarded to the node behind the port at which they arrive; its topics and
+    services, which speak TCPROS, are left to ``tcpros``.
+    """
 
     def __init__(
         self,
         context: Context,
         leases: Leases[Endpoint],
-        alias: AliasPorts,
-        adopter: TakingOver,
+        alias: Alias,
+        adopter: Adopter,
+        tcpros: TcprosServer,
     ) -> None:
         self._context, self._leases, self._alias = context, leases, alias
-        self._adopter = adopter
+        self._adopter, self._tcpros = adopter, tcpros
+        self.server = XmlRpcServer(self, "rosproxy: slave API of a ROS node behind it\n")
+
+    async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
+        """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
+        await self.server.dispatch(conn, partial(self._tcpros.serve, endpoint, peer))
+
+    def end_calls(self, port: int) -> None:
+        """Let the XML-RPC connections of a port end, which refuses from now on."""
+        self.server.close_port(port)
 
     async def __call__(self, call: IncomingCall) -> bytes:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
@@ -54,7 +72,7 @@ class SlaveApi:
             self._context.metrics.count("slave", "other", "malformed")
             raise
         if parsed.method != multicall.MULTICALL:
-            return await self._one(endpoint, parsed, call)
+            return await self._one(endpoint, parsed, call.body, call)
         calls = multicall.inner_calls(parsed)
         results = [await self._result(endpoint, inner, call) for inner in calls]
         return multicall.results_reply(results)
@@ -74,34 +92,34 @@ class SlaveApi:
         """One result of a multicall, which is taken apart here: nodes get single calls only."""
         if inner is None:
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
-        single = call.with_body(multicall.single_call(inner))
-        reply = await self._one(endpoint, xmlrpc.parse_call(single.body), single)
+        body = multicall.single_call(inner)
+        reply = await self._one(endpoint, xmlrpc.parse_call(body), body, call)
         return multicall.result_value(reply)
 
-    async def _one(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
+    async def _one(
+        self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
+    ) -> bytes:
+        """The reply to one call, whose document is ``body``, of those that came as ``call``."""
         if not await self._may(parsed.method, call.source):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
-        try:
-            reply = await self._forward(endpoint, parsed, call)
-        except Unreachable:
-            self._context.metrics.count("slave", parsed.method, "unreachable")
-            raise
-        self._context.metrics.count("slave", parsed.method, "answered")
-        return reply
+        reply = self._forward(endpoint, parsed, body, call)
+        return await counted(self._context.metrics, "slave", parsed.method, reply)
 
-    async def _forward(self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
+    async def _forward(
+        self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
+    ) -> bytes:
         if await self._is_void(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.rewritten(parsed):
-            return await self._ask(endpoint, call.body)
+            return await self._ask(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
             await self._alias.listen_for(slave_api.announced_publishers(parsed))
         self._context.refresh_networks()
         visit = self._visit(endpoint, call, endpoint.port)
         addressing = self._context.addressing
-        body = self._alias.import_call(call.body, parsed)
+        body = self._alias.import_call(body, parsed)
         reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
         said = slave_api.topic_port(parsed, reply)
         if said is not None:
@@ -130,20 +148,17 @@ class SlaveApi:
             await asyncio.sleep(0.002)
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
+        health = endpoint.health
         try:
             reply = await self._context.upstream.post_to_node(endpoint.slave, body)
         except Unreachable as error:
-            await self._suspect(endpoint, error)
+            if error.refused and health.note(error.probe, self._context.now()) is Change.DOWN:
+                # Refused twice, the node has ended: its port refuses as well at once.
+                log.info("%s is gone: %s", endpoint.label, error)
+                self._leases.close(endpoint)
             raise
-        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
+        health.note(ProbeResult.ANSWERED, self._context.now())
         return reply
-
-    async def _suspect(self, endpoint: Endpoint, error: Unreachable) -> None:
-        """A refused call tells that the node has ended: its port refuses as well at once."""
-        health, now = endpoint.health, self._context.now()
-        if error.refused and health.note(error.probe, now) is Change.DOWN:
-            log.info("%s is gone: %s", endpoint.label, error)
-            self._leases.close(endpoint)
 
     def _visit(self, endpoint: Endpoint, call: IncomingCall, port: int) -> Visit:
         """A call at an endpoint, whose topics the caller is to find at a ``port``."""

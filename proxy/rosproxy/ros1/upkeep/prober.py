@@ -5,7 +5,7 @@ port refuse, so that a dead node looks dead; after the time of ``--cleanup-after
 unregistered at the master. A node that answers again is served again, and registered again if need
 be. Another pid than before means another process: what the former one left is taken back.
 
-What follows from a probe: `Health.note` says how the node is, `policy` what is due, and the
+What follows from a probe: `Health.note` says how the node is, `liveness` what is due, and the
 `Registrar` and the rooms beside this one do it.
 """
 
@@ -14,14 +14,13 @@ import logging
 
 from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import Change, ProbeResult
-from rosproxy.ros1.upkeep.prober import policy
-from rosproxy.ros1.upkeep.recovery.recovery import Recovery
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription.resubscriber import Resubscriber
+from rosproxy.ros1.upkeep.policy import liveness
+from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 
 log = logging.getLogger(__name__)
 
@@ -37,13 +36,12 @@ class Prober:
         self,
         context: Context,
         leases: Leases[Endpoint],
-        nodes: NodeClient,
         registrar: Registrar,
         resubscriber: Resubscriber,
         recovery: Recovery,
     ) -> None:
-        self._context, self._leases, self._nodes = context, leases, nodes
-        self._registrar, self._resubscriber, self._recovery = registrar, resubscriber, recovery
+        self._context, self._leases, self._registrar = context, leases, registrar
+        self._resubscriber, self._recovery = resubscriber, recovery
         self._probing: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_PROBES)
 
@@ -54,7 +52,7 @@ class Prober:
         now, interval = self._context.now(), self._context.settings.probe_interval
         busy = self._probing | self._recovery.verifying
         for endpoint in self._context.registry:
-            if endpoint not in busy and policy.is_due(endpoint, now, interval):
+            if endpoint not in busy and liveness.is_due(endpoint, now, interval):
                 self._probing.add(endpoint)
                 self._context.tasks.spawn(self._probe(endpoint), f"probe of {endpoint.uri}")
             self._end_if_unused(endpoint)
@@ -71,7 +69,7 @@ class Prober:
     async def _look_after(self, endpoint: Endpoint) -> None:
         """Probe an endpoint's node and act on the result."""
         where, health = endpoint.slave, endpoint.health
-        answer = await self._nodes.probe(where)
+        answer = await self._context.nodes.probe(where)
         if endpoint.slave != where:
             return  # it has moved meanwhile
         failing = health.failures > 0
@@ -84,7 +82,7 @@ class Prober:
             self._report_down(endpoint, answer.reason)
             self._leases.close(endpoint)
         after = self._context.settings.cleanup_after
-        if policy.is_to_be_unregistered(endpoint, self._context.now(), after):
+        if liveness.is_to_be_unregistered(endpoint, self._context.now(), after):
             await self._registrar.clean_up(endpoint)
 
     async def _answered(self, endpoint: Endpoint, pid: int | None) -> None:
@@ -112,10 +110,10 @@ class Prober:
     def _end_if_unused(self, endpoint: Endpoint) -> None:
         """End the lease of an endpoint that nobody has needed for long enough."""
         now = self._context.now()
-        if not policy.is_unused(endpoint):
+        if not liveness.is_unused(endpoint):
             endpoint.note_used()
             return
-        lasts = policy.lease_lasts(endpoint, self._context.settings.linger)
+        lasts = liveness.lease_lasts(endpoint, self._context.settings.linger)
         if endpoint.note_unused(now) >= lasts:
             log.info(
                 "port %d is free again: %s", endpoint.port, endpoint.uri, extra=endpoint.log_fields

@@ -21,6 +21,8 @@ from rosproxy.ros1.rewriting.addressing import Addressing
 
 TopicConnection = tuple[int, str, str]
 """A connection through the proxy: its port, the topic and the subscriber's name."""
+BusRow = tuple[str, str, str]
+"""One of a publisher's own connections: the topic, the subscriber's name and the transport."""
 Addresses = Mapping[str, Collection[str]]
 """Nodes' names with the addresses of their hosts."""
 
@@ -32,20 +34,6 @@ class TopicSubscription:
     endpoint: Endpoint
     topic: str
     caller_id: str
-
-    @property
-    def connection(self) -> TopicConnection:
-        """The connection that it has while it is served by a relay."""
-        return self.endpoint.port, self.topic, self.caller_id
-
-
-@dataclass(frozen=True, slots=True)
-class BusRow:
-    """One of a publisher's own connections, as its getBusInfo tells."""
-
-    topic: str
-    caller_id: str
-    transport: str
 
 
 def subscriptions(
@@ -85,7 +73,7 @@ def without_relay(
     wanted: Iterable[TopicSubscription], relays: Collection[TopicConnection]
 ) -> list[TopicSubscription]:
     """Those that no relay serves."""
-    return [one for one in wanted if one.connection not in relays]
+    return [one for one in wanted if (one.endpoint.port, one.topic, one.caller_id) not in relays]
 
 
 def read_bus(rows: Any) -> list[BusRow]:
@@ -97,7 +85,7 @@ def read_bus(rows: Any) -> list[BusRow]:
     for row in rows if isinstance(rows, list) else ():
         match row:
             case [_, str(caller_id), "o", str(transport), str(topic), *_]:
-                found.append(BusRow(topic, caller_id, transport))
+                found.append((topic, caller_id, transport))
     return found
 
 
@@ -113,7 +101,7 @@ def unconnected(
     """
     rest: dict[Endpoint, list[TopicSubscription]] = {}
     for one in left:
-        if BusRow(one.topic, one.caller_id, "UDPROS") not in bus.get(one.endpoint, ()):
+        if (one.topic, one.caller_id, "UDPROS") not in bus.get(one.endpoint, ()):
             rest.setdefault(one.endpoint, []).append(one)
     return [
         one
@@ -167,6 +155,6 @@ def _short_of(
     """
     if connections >= len(group):
         return []
-    named = {(row.topic, row.caller_id) for row in rows}
+    named = {row[:2] for row in rows}
     unknown = [one for one in group if (one.topic, one.caller_id) not in named]
     return unknown if len(unknown) >= len(group) - connections else group

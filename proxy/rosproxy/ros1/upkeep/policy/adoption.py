@@ -7,22 +7,23 @@ everything that it holds is taken back and registered anew in the form that outs
 Its connection to the real master stays open (both client libraries keep it), so that later calls
 of such a node may go around the proxy as well. Then the master drops what the name had before and
 calls ``shutdown`` at the node, through the proxy, as it does if another node has taken the name.
-`shutdown_cause` tells the two apart.
+`has_name_still` tells the two apart.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 
-from rosproxy.admin.requests import Arrival
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.upkeep.registration.policy import known_as
+from rosproxy.ros1.upkeep.policy.registration import known_as
+
+Container = tuple[str, Collection[str]]
+"""A container on an inside network: its IP address there, and its host names in lower case."""
 
 _NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
 """rosmaster/registrations.py, shutdown_node_task."""
@@ -44,16 +45,8 @@ class DirectNode:
         return names - {"/rosout"} or names
 
 
-class ShutdownCause(Enum):
-    """Why the master calls ``shutdown`` at a node."""
-
-    NAME_TAKEN = "another node has its name"
-    REGISTERED_DIRECTLY = "it registered around the proxy"
-    ADOPTED_AGAIN = "it registered around the proxy, and is registered anew already"
-
-
 def find_direct(
-    graph: Graph, arrived: Iterable[Arrival], addressing: Addressing
+    graph: Graph, arrived: Iterable[Container], addressing: Addressing
 ) -> list[DirectNode]:
     """The nodes of a master whose URI may mean one of the containers that have arrived."""
     found, containers = [], list(arrived)
@@ -61,7 +54,8 @@ def find_direct(
         where = parse_slave_uri(uri)
         if where is None or addressing.advertises(where):
             continue
-        called = dict.fromkeys(c.address for c in containers if c.is_called(where.host))
+        host = where.host.lower()
+        called = dict.fromkeys(a for a, names in containers if host in (a, *names))
         if called:
             places = tuple(HostPort(address, where.port) for address in called)
             found.append(DirectNode(name, uri, places, tuple(graph.held.get(name, ()))))
@@ -94,16 +88,15 @@ def renamed_node(caller_id: str, reason: str) -> str | None:
     return found[1] if found and caller_id == "/master" else None
 
 
-def shutdown_cause(endpoint: Endpoint, uri: str | None, advertised: str) -> ShutdownCause:
-    """Why a name of an endpoint, which the master has by a URI now, is to be shut down.
+def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool:
+    """Whether no other node has taken a name of an endpoint, which the master has by a URI now.
 
-    The master calls at the URI that the name had before. If the new one is a former URI of the
-    same node, or is the endpoint's own by now, no other node has taken the name.
+    The master calls ``shutdown`` at the URI that the name had before. The new one may be a former
+    one of the same node, which has registered around the proxy, or is advertised again by now.
     """
-    if uri == advertised:
-        return ShutdownCause.ADOPTED_AGAIN
-    itself = endpoint.direct if uri is None else known_as(endpoint, uri)
-    return ShutdownCause.REGISTERED_DIRECTLY if itself else ShutdownCause.NAME_TAKEN
+    if uri is None:
+        return endpoint.direct
+    return uri == advertised or known_as(endpoint, uri)
 
 
 def _score(node: DirectNode, topics: set[str]) -> int | None:
@@ -113,10 +106,11 @@ def _score(node: DirectNode, topics: set[str]) -> int | None:
 
 
 def _doubt(node: DirectNode, best: list[HostPort], topics: Mapping[HostPort, Iterable[str]]) -> str:
-    places = ", ".join(str(place) for place in node.places)
+    places = ", ".join(map(str, node.places))
     if best:
-        either = " and ".join(str(place) for place in best)
-        return f"registered as {node.uri} around the proxy: could be at {either}; left alone"
-    if any(place in topics for place in node.places):
-        return f"registered as {node.uri} around the proxy: the node at {places} is another"
-    return f"registered as {node.uri} around the proxy: no node answers at {places}"
+        why = f"could be at {' and '.join(map(str, best))}; left alone"
+    elif any(place in topics for place in node.places):
+        why = f"the node at {places} is another"
+    else:
+        why = f"no node answers at {places}"
+    return f"registered as {node.uri} around the proxy: {why}"

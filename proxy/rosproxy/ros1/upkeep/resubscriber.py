@@ -16,23 +16,22 @@ in the meantime takes up to three minutes.
 
 import asyncio
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.master_graph import locate, read_registrations
+from rosproxy.ros1.clients.master_graph import look_up_nodes, read_registrations
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
-from rosproxy.ros1.upkeep.registration.policy import one_publisher_per_topic
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription import policy
-from rosproxy.ros1.upkeep.resubscription.policy import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.policy import resubscription as policy
+from rosproxy.ros1.upkeep.policy.registration import one_publisher_per_topic
+from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.registrar import PARALLEL_CALLS, Registrar
 
 log = logging.getLogger(__name__)
 
@@ -51,14 +50,9 @@ class Resubscriber:
     """Looks after the subscribers of publishers that were out of reach for a time."""
 
     def __init__(
-        self,
-        context: Context,
-        registrar: Registrar,
-        updates: PublisherUpdates,
-        tcpros: TcprosServer,
-        plane: KernelPlane,
+        self, context: Context, registrar: Registrar, tcpros: TcprosServer, plane: KernelPlane
     ) -> None:
-        self._context, self._registrar, self._updates = context, registrar, updates
+        self._context, self._registrar = context, registrar
         self._tcpros, self._plane = tcpros, plane
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
@@ -69,14 +63,13 @@ class Resubscriber:
         for endpoint in endpoints:
             self._looks[endpoint] = [now + after for after in LOOKS]
 
-    async def announce(self, endpoints: Iterable[Endpoint]) -> None:
+    async def announce(self, endpoints: Sequence[Endpoint]) -> None:
         """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
-        found = list(endpoints)
-        self.watch(found)
-        await self._withdraw(found, ask=False)
-        held = [(e, held) for e in found for held in e.registrations.values()]
+        self.watch(endpoints)
+        await self._withdraw(endpoints, ask=False)
+        held = [(e, held) for e in endpoints for held in e.registrations.values()]
         subscribers = [one for one in held if one[1].kind is Kind.SUBSCRIBER]
-        await self._registrar.register([*one_publisher_per_topic(found), *subscribers])
+        await self._registrar.register([*one_publisher_per_topic(endpoints), *subscribers])
 
     async def remind(self, endpoint: Endpoint) -> None:
         """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
@@ -103,17 +96,12 @@ class Resubscriber:
 
     def _due(self) -> list[Endpoint]:
         """The endpoints for which it is time; each is named once per look."""
-        now, found = self._context.now(), []
-        for endpoint, times in list(self._looks.items()):
-            left = [time for time in times if time > now]
-            if self._context.registry.by_port.get(endpoint.port) is not endpoint:
-                left = []
-            elif len(left) < len(times):
-                found.append(endpoint)
-            self._looks[endpoint] = left
-            if not left:
-                del self._looks[endpoint]
-        return [e for e in found if e.trusted and not (e.health.down or e.health.cleaned)]
+        now, by_port = self._context.now(), self._context.registry.by_port
+        there = {e: times for e, times in self._looks.items() if by_port.get(e.port) is e}
+        left = {e: [time for time in times if time > now] for e, times in there.items()}
+        self._looks = {e: times for e, times in left.items() if times}
+        due = [e for e, times in left.items() if len(times) < len(there[e])]
+        return [e for e in due if e.answers and not e.health.cleaned]
 
     async def _withdraw(self, endpoints: Iterable[Endpoint], ask: bool = True) -> set[str]:
         """Tell subscribers without connection that these publishers have gone; the topics.
@@ -127,7 +115,7 @@ class Resubscriber:
         left = policy.without_relay(wanted, self._tcpros.topic_connections())
         if not left:
             return set()
-        graph = await self._locate(held, left)
+        graph = Graph(held, await look_up_nodes(self._context.upstream, held))
         left = self._through_proxy(graph, left)
         bus = await self._read_buses(left) if ask else {}
         if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
@@ -136,34 +124,20 @@ class Resubscriber:
         left = policy.without_relay(left, self._tcpros.topic_connections())
         return await self._send_without(graph, policy.unconnected(left, bus, addresses))
 
-    async def _locate(
-        self, held: Mapping[str, list[Registration]], left: Sequence[TopicSubscription]
-    ) -> Graph:
-        """What is registered, with the URIs of those whom it is about."""
-        topics = {one.topic for one in left}
-        publishers = {
-            node
-            for node, registrations in held.items()
-            if any(one.kind is Kind.PUBLISHER and one.name in topics for one in registrations)
-        }
-        names = publishers | {one.caller_id for one in left}
-        return await locate(self._context.upstream, held, names)
-
     def _through_proxy(
         self, graph: Graph, left: Iterable[TopicSubscription]
     ) -> list[TopicSubscription]:
         """Those whose subscribers reach the publisher through the proxy."""
-        addressing, subscribers = self._context.addressing, {one.caller_id for one in left}
-        uris = {node: graph.uris[node] for node in subscribers if node in graph.uris}
-        inside = {node: addressing.stands_for(uri) for node, uri in uris.items()}
-        askers = {e: self._context.node_asker(e) for e in inside.values() if e}
+        addressing = self._context.addressing
 
         def is_relayed(one: TopicSubscription) -> bool:
-            subscriber = inside.get(one.caller_id)
+            uri = graph.uris.get(one.caller_id)
+            subscriber = addressing.stands_for(uri) if uri else None
             if subscriber is None:
-                return one.caller_id in inside
-            asker, uri = askers[subscriber], addressing.advertised_uri(one.endpoint)
-            return addressing.handed_out(addressing.import_slave(uri, asker), asker)
+                return uri is not None
+            asker = self._context.node_asker(subscriber)
+            handed = addressing.import_slave(addressing.advertised_uri(one.endpoint), asker)
+            return addressing.handed_out(handed, asker)
 
         return [one for one in left if is_relayed(one)]
 
@@ -205,7 +179,7 @@ class Resubscriber:
             missed.setdefault((one.topic, one.caller_id), set()).add(one.endpoint)
         publishers, addressing = graph.by_topic(Kind.PUBLISHER), self._context.addressing
         calls = (
-            self._updates.send(
+            self._registrar.update(
                 graph.uris[node],
                 topic,
                 policy.publishers_left(publishers.get(topic, []), endpoints, addressing),

@@ -23,13 +23,12 @@ from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.master_graph import read_graph
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
-from rosproxy.ros1.upkeep.recovery import policy
-from rosproxy.ros1.upkeep.recovery.policy import Claim
-from rosproxy.ros1.upkeep.registration.registrar import Registrar
-from rosproxy.ros1.upkeep.resubscription.resubscriber import Resubscriber
+from rosproxy.ros1.upkeep.policy import recovery as policy
+from rosproxy.ros1.upkeep.policy.recovery import Claim
+from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 
 log = logging.getLogger(__name__)
 
@@ -46,35 +45,31 @@ class Recovery:
         self,
         context: Context,
         leases: Leases[Endpoint],
-        nodes: NodeClient,
         registrar: Registrar,
         resubscriber: Resubscriber,
         plane: KernelPlane,
     ) -> None:
-        self._context, self._leases, self._nodes = context, leases, nodes
-        self._registrar, self._resubscriber, self._plane = registrar, resubscriber, plane
+        self._context, self._leases, self._plane = context, leases, plane
+        self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
-        self._done = False
+        self._done = asyncio.Event()
         self._one_at_a_time = asyncio.Lock()
         self._failures = 0
         self._unannounced: list[Endpoint] = []
         self._announcing = asyncio.Lock()
 
     async def ensure(self) -> None:
-        """Have the registry rebuilt from the master, once. Raises Unreachable."""
-        if not self._done:
-            await self._recover_once()
-
-    async def _recover_once(self) -> None:
-        """Recover, unless another caller does so meanwhile.
+        """Have the registry rebuilt from the master, once. Raises Unreachable.
 
         All who wait for the same attempt share its failure: a master that hangs would keep the
         last of them waiting for as many attempts as there are callers.
         """
+        if self._done.is_set():
+            return
         failures = self._failures
         async with self._one_at_a_time:
-            if self._done:
+            if self._done.is_set():
                 return
             if self._failures != failures:
                 raise Unreachable("the master has not told its state")
@@ -83,7 +78,7 @@ class Recovery:
             except (Unreachable, MasterError) as error:
                 self._failures += 1
                 raise Unreachable(str(error)) from None
-            self._done = True
+            self._done.set()
 
     async def serve(self, endpoint: Endpoint) -> None:
         """Serve a recovered endpoint if its node bears it out, and have subscribers connect again.
@@ -118,32 +113,25 @@ class Recovery:
     async def _settle(self, found: Sequence[Claim]) -> list[Claim]:
         """One claim per port: where several are made, the nodes themselves are asked first."""
 
-        async def topics_at(claim: Claim) -> frozenset[str] | None:
-            if not is_inside(claim.address, self._context.addressing.networks):
-                return None
-            info = await self._nodes.inspect(HostPort(*claim.key))
-            return frozenset(info.topics) if info else None
-
-        contested = policy.contested(found)
-        answers = await asyncio.gather(*map(topics_at, contested))
-        for claim in contested:
+        async def ask(claim: Claim) -> None:
             log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
-        said = {found.index(c): topics for c, topics in zip(contested, answers, strict=True)}
-        return policy.settle(found, said)
+            if is_inside(claim.address, self._context.addressing.networks):
+                info = await self._context.nodes.inspect(HostPort(*claim.key))
+                claim.said = info.topics if info else None
+
+        await asyncio.gather(*map(ask, policy.contested(found)))
+        return policy.settle(found)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
         address = claim.address
         if not is_inside(address, self._context.addressing.networks):
-            log.warning(
-                "port %d: the master has %s for it, which is not in an inside network; refused",
-                claim.port,
-                address,
-            )
+            text = "port %d: the master has %s for it, which is not in an inside network; refused"
+            log.warning(text, claim.port, address)
             return None
-        place = Place(address, named=claim.inside.node.host == address, confirmed=False)
+        place = Place(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
-        endpoint = registry.restore(claim.uri, claim.inside.node, place, claim.port)
+        endpoint = registry.restore(claim.uri, claim.node, place, claim.port)
         if endpoint is None:
             log.warning("port %d of %s is not free; not recovered", claim.port, claim.uri)
             return None
@@ -161,7 +149,7 @@ class Recovery:
             log.warning("recovery is incomplete: %s", error)
 
     async def _verify(self, endpoint: Endpoint) -> None:
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         if info is None or endpoint.trusted:
             return
         if not policy.confirmed_by(endpoint, info.topics):

@@ -10,11 +10,11 @@ node itself says (`NodeInfo`). A node can be asked for its topics, but not for s
 parameters.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rosproxy.net.addresses import is_loopback
-from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, row
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 
@@ -26,42 +26,27 @@ Held = tuple[Endpoint, Registration]
 COMMON_PARAMETER = "/rosout_disable_topics_generation"
 """roscpp and rospy subscribe to it with their first log message; it need not exist."""
 
-_REGISTERING_ORDER = (Kind.PUBLISHER, Kind.SERVICE, Kind.SUBSCRIBER, Kind.PARAM)
-"""Subscribers come after publishers, so that they are handed all of them at once."""
-_FREEING_ORDER = (Kind.SUBSCRIBER, Kind.PUBLISHER, Kind.SERVICE, Kind.PARAM)
-"""Subscribers go first, so that they are not told that the publishers go."""
+_REGISTERING = {found.registers: method for method, found in MASTER_METHODS.items()}
+_UNREGISTERING = {found.unregisters: method for method, found in MASTER_METHODS.items()}
 
 
 def register_call(held: Registration, uri: str, service: str) -> MethodCall:
     """The call that makes a registration with a slave URI, and for a service with its URI."""
-    match held.kind:
-        case Kind.PUBLISHER:
-            return "registerPublisher", [held.caller_id, held.name, held.type, uri]
-        case Kind.SUBSCRIBER:
-            return "registerSubscriber", [held.caller_id, held.name, held.type, uri]
-        case Kind.SERVICE:
-            return "registerService", [held.caller_id, held.name, service, uri]
-        case Kind.PARAM:
-            return "subscribeParam", [held.caller_id, uri, held.name]
+    return _call(_REGISTERING[held.kind], held, uri, service)
 
 
 def unregister_call(held: Registration, uri: str, service: str) -> MethodCall:
     """The call that takes back a registration that was made with these URIs."""
-    match held.kind:
-        case Kind.PUBLISHER:
-            return "unregisterPublisher", [held.caller_id, held.name, uri]
-        case Kind.SUBSCRIBER:
-            return "unregisterSubscriber", [held.caller_id, held.name, uri]
-        case Kind.SERVICE:
-            return "unregisterService", [held.caller_id, held.name, service]
-        case Kind.PARAM:
-            return "unsubscribeParam", [held.caller_id, uri, held.name]
+    return _call(_UNREGISTERING[held.kind], held, uri, service)
 
 
 def to_register(held: Iterable[Held]) -> list[Held]:
-    """Those of some registrations that have not ended meanwhile, in the order to make them."""
+    """Those of some registrations that have not ended meanwhile, in the order to make them.
+
+    Subscribers come last, so that they are handed all publishers at once.
+    """
     current = [(e, one) for e, one in held if e.registrations.get(one.key) is one]
-    return sorted(current, key=lambda item: _REGISTERING_ORDER.index(item[1].kind))
+    return sorted(current, key=lambda item: item[1].kind is Kind.SUBSCRIBER)
 
 
 def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[Held]:
@@ -87,50 +72,43 @@ def known_as(endpoint: Endpoint, uri: str) -> bool:
 
 
 def free_calls(
-    uris: Mapping[str, str],
-    held: Mapping[str, Sequence[Registration]],
-    services: Mapping[str, str],
+    held: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
     """The calls that end what names hold with their ``uris``; ``services`` are the services' URIs.
 
-    Parameter subscriptions, which the master does not tell of, come after (`release_calls`).
+    Subscribers go first, so that they are not told that the publishers go.
     """
-    wanted = [one for name in uris for one in _held_by(name, held, services)]
-    wanted.sort(key=lambda one: _FREEING_ORDER.index(one.kind))
-    return [unregister_call(one, uris[one.caller_id], services.get(one.name, "")) for one in wanted]
+    known = sorted(_known(held, services), key=lambda one: one.kind is not Kind.SUBSCRIBER)
+    return [unregister_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
 
 
 def restore_calls(
-    uris: Mapping[str, str],
-    held: Mapping[str, Sequence[Registration]],
-    services: Mapping[str, str],
+    held: Iterable[Registration], uris: Mapping[str, str], services: Mapping[str, str]
 ) -> list[MethodCall]:
     """The calls that make again what `free_calls` ended."""
-    return [
-        register_call(one, uri, services.get(one.name, ""))
-        for name, uri in uris.items()
-        for one in _held_by(name, held, services)
-    ]
+    known = _known(held, services)
+    return [register_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
 
 
-def release_calls(caller_id: str, uri: str, asker: str) -> list[MethodCall]:
+def release_calls(uris: Mapping[str, str], asker: str) -> list[MethodCall]:
     """The calls that end the parameter subscription that every node has, and tell what is left.
 
     There is nothing to see of such a subscription, apart from the name that stays known.
     """
-    ask: MethodCall = ("lookupNode", [asker, caller_id])
-    return [ask, ("unsubscribeParam", [caller_id, uri, COMMON_PARAMETER]), ask]
+    ask: list[MethodCall] = [("lookupNode", [asker, name]) for name in uris]
+    params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
+    return [*ask, *free_calls(params, uris, {}), *ask]
 
 
-def released_parameters(values: Sequence[object]) -> list[str] | None:
-    """The parameters that a name was subscribed to, from the results of `release_calls`.
-
-    None if the name is known still.
-    """
-    before, _, after = values
-    if after is not None:
-        return None
-    return [] if before is None else [COMMON_PARAMETER]
+def read_release(
+    uris: Mapping[str, str], values: Sequence[Any]
+) -> tuple[list[Registration], dict[str, str]]:
+    """The results of `release_calls`: subscriptions that ended; names known still, with URIs."""
+    before = zip(uris, values, strict=False)
+    after = zip(uris, values[2 * len(uris) :], strict=True)
+    known = {name: uri for name, uri in after if uri is not None}
+    held = [name for name, uri in before if uri is not None and name not in known]
+    return [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in held], known
 
 
 def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
@@ -147,11 +125,24 @@ def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registr
         for held in everything
         if held is newest or (held.name != "/rosout" and held.name in topics.get(held.kind, ()))
     }
+    gone = vanished(endpoint, info, before)
     return [
         held
         for held in everything
-        if held.since < before
-        and (held.caller_id not in alive or held.name not in topics.get(held.kind, (held.name,)))
+        if held in gone or (held.since < before and held.caller_id not in alive)
+    ]
+
+
+def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
+    """The topics registered before a time that the node no longer has.
+
+    A node that registers around the proxy unregisters there too, where its URI means nothing.
+    """
+    topics = info.by_kind
+    return [
+        held
+        for held in endpoint.registrations.values()
+        if held.name not in topics.get(held.kind, (held.name,)) and held.since < before
     ]
 
 
@@ -166,19 +157,6 @@ def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[R
     if not (kept and same_process):
         return kept
     return kept + [held for held in everything if held.kind not in topics]
-
-
-def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
-    """The topics registered before a time that the node no longer has.
-
-    A node that registers around the proxy unregisters there too, where its URI means nothing.
-    """
-    topics = info.by_kind
-    return [
-        held
-        for held in endpoint.registrations.values()
-        if held.name not in topics.get(held.kind, (held.name,)) and held.since < before
-    ]
 
 
 def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:
@@ -207,16 +185,24 @@ def lost(
     parameter subscriptions, which the master's state leaves out, unless their node is unknown.
     """
     known = {held.key for registrations in state.values() for held in registrations}
-    gone = [h for h in ours if h.since < before and h.kind is not Kind.PARAM]
-    missing = [held for held in gone if held.key not in known]
-    lost_nodes = {held.caller_id for held in missing} - set(state)
-    return missing + [
-        held for held in ours if held.kind is Kind.PARAM and held.caller_id in lost_nodes
-    ]
+    params = [held for held in ours if held.kind is Kind.PARAM]
+    gone = [h for h in ours if h.since < before and h.key not in known and h.kind is not Kind.PARAM]
+    lost_nodes = {held.caller_id for held in gone} - set(state)
+    return gone + [held for held in params if held.caller_id in lost_nodes]
 
 
-def _held_by(
-    name: str, held: Mapping[str, Sequence[Registration]], services: Mapping[str, str]
-) -> Iterator[Registration]:
-    """What a name holds, without services whose URI is not known (any more)."""
-    yield from (o for o in held.get(name, ()) if o.kind is not Kind.SERVICE or o.name in services)
+def _known(held: Iterable[Registration], services: Mapping[str, str]) -> list[Registration]:
+    """Those of some registrations that are no services whose URI is not known (any more)."""
+    return [one for one in held if one.kind is not Kind.SERVICE or one.name in services]
+
+
+def _call(method: str, held: Registration, uri: str, service: str) -> MethodCall:
+    places = row(method)
+    params = {
+        0: held.caller_id,
+        places.name: held.name,
+        places.type: held.type,
+        places.service_api: service,
+        places.caller_api: uri,
+    }
+    return method, [params[place] for place in range(4) if place in params]

@@ -9,39 +9,29 @@ node shut down that has registered around the proxy once more (`absorb_shutdown`
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
-from rosproxy.admin.requests import Arrival
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.clients.master_graph import look_up_nodes, read_graph
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.rewriting.addressing import Asker
 from rosproxy.ros1.servers.admission import NodeAdmission
-from rosproxy.ros1.upkeep.adoption import policy
-from rosproxy.ros1.upkeep.adoption.policy import DirectNode, ShutdownCause
-from rosproxy.ros1.upkeep.registration.policy import known_as
-from rosproxy.ros1.upkeep.registration.registrar import Former, Registrar
+from rosproxy.ros1.upkeep.policy import adoption as policy
+from rosproxy.ros1.upkeep.policy.adoption import Container, DirectNode
+from rosproxy.ros1.upkeep.policy.registration import known_as
+from rosproxy.ros1.upkeep.registrar import Former, Registrar
 
 log = logging.getLogger(__name__)
 
 SHUTDOWN_TIMEOUT = 2.0
 """Seconds in which the master must say where a node is that is to be shut down."""
 NO_PORT = "registered around the proxy and can't be adopted: no port of the range is left"
-
-
-@dataclass(slots=True)
-class Adoption:
-    """The names of the nodes that were adopted, and why others were not, by name."""
-
-    names: list[str] = field(default_factory=list)
-    doubts: dict[str, str] = field(default_factory=dict)
 
 
 class Adopter:
@@ -52,32 +42,38 @@ class Adopter:
         context: Context,
         leases: Leases[Endpoint],
         admission: NodeAdmission,
-        nodes: NodeClient,
         registrar: Registrar,
     ) -> None:
-        self._context, self._leases, self._admission = context, leases, admission
-        self._nodes, self._registrar = nodes, registrar
+        self._context, self._leases = context, leases
+        self._admission, self._registrar = admission, registrar
         self._one_at_a_time = asyncio.Lock()
 
-    async def adopt(self, arrived: Sequence[Arrival]) -> Adoption:
-        """Adopt the nodes of containers that have arrived. Raises Unreachable, MasterError.
+    async def adopt(self, arrived: Sequence[Container]) -> int:
+        """Adopt the nodes of containers that have arrived.
 
         A node is adopted if one answers at the container's address and the port that it gave,
-        and names its topics. The others are left as they are.
+        and names its topics. The others are left as they are. Returns how many were adopted.
+        Raises Unreachable, MasterError.
         """
-        addressing = self._context.addressing
+        context = self._context
+        inside: list[Container] = []
+        for address, names in arrived:  # published ports lead nowhere else than inside
+            if is_inside(address, context.addressing.networks):
+                inside.append((address, names))
+            else:
+                text = "is in none of the inside networks: its nodes are not looked at"
+                context.problems.add(address, text)
+        if not inside:
+            return 0
         async with self._one_at_a_time:
-            graph = await read_graph(self._context.upstream)
-            nodes = policy.find_direct(graph, self._inside(arrived), addressing)
+            graph = await read_graph(context.upstream)
+            nodes = policy.find_direct(graph, inside, context.addressing)
             infos = await self._inspect({place for node in nodes for place in node.places})
             topics = {place: info.topics for place, info in infos.items()}
             located, doubts = policy.locate(nodes, topics)
-            adoption = Adoption(doubts=doubts)
-            await self._take_in(located, infos, adoption)
-        for name, why in adoption.doubts.items():
-            log.warning("%s: %s", name, why)
-            self._context.problems.add(name, why)
-        return adoption
+            for name, why in doubts.items():
+                self._report(name, why)
+            return await self._take_in(located, infos)
 
     async def take_over(self, endpoint: Endpoint, caller_id: str) -> None:
         """Before a name registers: take back what the same node registered around the proxy.
@@ -108,12 +104,11 @@ class Adopter:
                 uri = await self._look_up(name)
         except (TimeoutError, Unreachable):
             return False
-        cause = policy.shutdown_cause(endpoint, uri, self._advertised(endpoint))
-        if cause is ShutdownCause.NAME_TAKEN:
+        advertised = self._advertised(endpoint)
+        if not policy.has_name_still(endpoint, uri, advertised):
             return False
         log.info("%s registered around the proxy; not shut down", name)
-        direct = cause is ShutdownCause.REGISTERED_DIRECTLY
-        former = {name: (endpoint, uri or endpoint.uri)} if direct else {}
+        former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
         self._context.tasks.spawn(self._repeat(endpoint, former), f"taking over {endpoint.uri}")
         return True
 
@@ -126,37 +121,24 @@ class Adopter:
         except (Unreachable, MasterError) as error:
             log.warning("%s; what is lost is registered later", error)
 
-    def _inside(self, arrived: Sequence[Arrival]) -> list[Arrival]:
-        """Those at addresses in inside networks; published ports lead nowhere else."""
-        networks, inside = self._context.addressing.networks, []
-        for arrival in arrived:
-            if is_inside(arrival.address, networks):
-                inside.append(arrival)
-            else:
-                text = "is in none of the inside networks: its nodes are not looked at"
-                self._context.problems.add(arrival.address, text)
-        return inside
-
     async def _inspect(self, places: set[HostPort]) -> dict[HostPort, NodeInfo]:
         """What nodes say of themselves, where one answers with a pid."""
-        found = await asyncio.gather(*map(self._nodes.inspect, places))
+        found = await asyncio.gather(*map(self._context.nodes.inspect, places))
         infos = zip(places, found, strict=True)
         return {place: info for place, info in infos if info and info.pid is not None}
 
     async def _take_in(
-        self,
-        located: Mapping[HostPort, list[DirectNode]],
-        infos: Mapping[HostPort, NodeInfo],
-        adoption: Adoption,
-    ) -> None:
-        """Give each a port and register all of them anew."""
+        self, located: Mapping[HostPort, list[DirectNode]], infos: Mapping[HostPort, NodeInfo]
+    ) -> int:
+        """Give each a port and register all of them anew; how many names could be."""
         former: dict[str, tuple[Endpoint, str]] = {}
         endpoints: dict[Endpoint, NodeInfo] = {}
         try:
             for place, nodes in located.items():
                 endpoint = await self._make_endpoint(place, nodes, infos[place])
                 if endpoint is None:
-                    adoption.doubts |= {node.caller_id: NO_PORT for node in nodes}
+                    for node in nodes:
+                        self._report(node.caller_id, NO_PORT)
                     continue
                 endpoints[endpoint] = infos[place]
                 former |= {node.caller_id: (endpoint, node.uri) for node in nodes}
@@ -166,9 +148,10 @@ class Adopter:
         finally:
             for endpoint in endpoints:
                 endpoint.release()
-        adoption.names += [name for name, (e, _) in former.items() if name in e.caller_ids]
-        for name in adoption.names:
-            log.info("%s adopted: %s", name, self._advertised(former[name][0]))
+        adopted = {name: e for name, (e, _) in former.items() if name in e.caller_ids}
+        for name, endpoint in adopted.items():
+            log.info("%s adopted: %s", name, self._advertised(endpoint))
+        return len(adopted)
 
     async def _make_endpoint(
         self, place: HostPort, nodes: Sequence[DirectNode], info: NodeInfo
@@ -198,6 +181,10 @@ class Adopter:
                 type_ = info.by_kind.get(held.kind, {}).get(held.name, held.type)
                 self._context.registry.register(endpoint, replace(held, type=type_, since=now))
         return endpoint
+
+    def _report(self, name: str, why: str) -> None:
+        log.warning("%s: %s", name, why)
+        self._context.problems.add(name, why)
 
     async def _look_up(self, caller_id: str) -> str | None:
         return (await look_up_nodes(self._context.upstream, [caller_id])).get(caller_id)

@@ -1,4 +1,4 @@
-"""Which endpoints the news of containers concerns."""
+"""Which nodes are gone or have moved, as the news of containers say and the nodes themselves."""
 
 from dataclasses import replace
 
@@ -7,24 +7,15 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.upkeep.containers import policy
+from rosproxy.ros1.upkeep.policy import liveness
 from tests.unit.builders import add_node, add_registration, make_addressing
-
-
-def test_the_endpoints_at_an_address() -> None:
-    addressing = make_addressing()
-    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.5:40002/")
-    named = add_node(addressing, "http://c1:40001/", "10.0.0.6")
-    assert policy.at(addressing.registry, ["10.0.0.5"]) == [first, second]
-    assert policy.at(addressing.registry, {"10.0.0.6", "c1"}) == [named]
-    assert policy.at(addressing.registry, []) == []
 
 
 def test_only_who_answers_is_alive() -> None:
     addressing = make_addressing()
     found = [add_node(addressing, f"http://10.0.0.5:4000{n}/") for n in range(3)]
     probes = [ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT]
-    assert policy.dead(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
+    assert liveness.dead(dict(zip(found, probes, strict=True)), 0.0) == found[1:]
 
 
 def test_restarted_container_keeps_its_new_node() -> None:
@@ -40,7 +31,7 @@ def test_restarted_container_keeps_its_new_node() -> None:
     answers = dict.fromkeys((fresh, old, calling), ProbeResult.SILENT) | {
         ended: ProbeResult.REFUSED
     }
-    assert policy.dead(answers, 7.0) == [old, ended]
+    assert liveness.dead(answers, 7.0) == [old, ended]
 
 
 def test_who_may_have_moved() -> None:
@@ -55,7 +46,7 @@ def test_who_may_have_moved() -> None:
         same.place.address: same.place.address,
         "10.0.0.99": "10.0.0.100",
     }
-    found = policy.movable(addressing.registry, news, addressing.networks)
+    found = liveness.movable(addressing.registry, news, addressing.networks)
     assert found == {moved: "10.0.0.9"}
 
 
@@ -73,7 +64,7 @@ def test_who_may_have_moved() -> None:
 def test_the_place_of_a_node_that_has_moved(uri: str, stale: bool, confirmed: bool) -> None:
     endpoint = add_node(make_addressing(), uri, "10.0.0.5", True, confirmed)
     expected = Place("10.0.0.9", named=False, confirmed=confirmed, stale=stale)
-    assert policy.new_place(endpoint, "10.0.0.9") == expected
+    assert liveness.new_place(endpoint, "10.0.0.9") == expected
 
 
 def endpoint_with(pid: int | None, *topics: str) -> Endpoint:
@@ -107,4 +98,4 @@ def test_whether_it_is_the_same_process(
     known: int | None, topics: list[str], pid: int | None, said: set[str], same: bool
 ) -> None:
     endpoint = endpoint_with(known, *topics)
-    assert policy.is_same_process(endpoint, pid, said) is same
+    assert liveness.is_same_process(endpoint, pid, said) is same

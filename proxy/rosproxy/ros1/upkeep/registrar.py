@@ -1,9 +1,10 @@
 """Keeping the master right: registering nodes again, and unregistering those that are gone.
 
-Everything that the proxy itself registers or unregisters goes through the `Registrar`; the rooms
+Everything that the proxy itself registers or unregisters goes through the `Registrar`; the modules
 beside this one decide when. `Registrar.register` is the way for all of it: it asks the master who
 has each name now, leaves a name to whoever else has it, frees one that the master has by a former
-URI of the same node, makes the calls, and hands subscribers the publishers that the replies name.
+URI of the same node, makes the calls, and hands subscribers the publishers that the replies name,
+as the master does with ``publisherUpdate``.
 """
 
 import asyncio
@@ -11,21 +12,24 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from rosproxy.ros1.clients.master import CALLER_ID
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.alias.alias import Alias
+from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.clients.master_graph import look_up_nodes, look_up_services, read_registrations
-from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
-from rosproxy.ros1.upkeep.registration import policy
-from rosproxy.ros1.upkeep.registration.policy import Held
+from rosproxy.ros1.upkeep.policy import registration as policy
+from rosproxy.ros1.upkeep.policy.registration import Held
 
 log = logging.getLogger(__name__)
 
 Former = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
+PARALLEL_CALLS = 32
 SETTLE_TIME = 2.0
 """Seconds in which the master's news of a publisher that is registered anew come in."""
 
@@ -33,8 +37,20 @@ SETTLE_TIME = 2.0
 class Registrar:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, nodes: NodeClient, updates: PublisherUpdates) -> None:
-        self._context, self._nodes, self._updates = context, nodes, updates
+    def __init__(self, context: Context, alias: Alias) -> None:
+        self._context, self._alias = context, alias
+        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
+
+    async def update(self, subscriber: str, topic: str, publishers: Sequence[str]) -> bool:
+        """Hand the node at a slave URI the publishers of a topic; whether it has answered.
+
+        All URIs are given as the master holds them.
+        """
+        endpoint = self._context.addressing.stands_for(subscriber)
+        if endpoint:
+            return await self._update_inside(endpoint, topic, publishers)
+        where = parse_slave_uri(subscriber)
+        return where is not None and await self._update(where, topic, publishers)
 
     async def register(self, held: Sequence[Held]) -> None:
         """Register again what the master has lost. Raises Unreachable, MasterError.
@@ -63,17 +79,16 @@ class Registrar:
         """
         await self._register(await self._free(former))
 
-    async def resettle(self, endpoints: Iterable[Endpoint]) -> None:
+    async def resettle(self, endpoints: Sequence[Endpoint]) -> None:
         """Register nodes anew that have moved to another address. Raises Unreachable, MasterError.
 
         Their own connections have lost their address: roscpp makes new ones if it is told that
         the publishers have gone before it is told that they are there.
         """
-        moved = list(endpoints)
-        topics = [(e, topic) for e in moved for topic in e.names(Kind.SUBSCRIBER)]
-        await asyncio.gather(*(self._updates.send_inside(e, t, []) for e, t in topics))
-        await self.register([(e, held) for e in moved for held in e.registrations.values()])
-        for endpoint in moved:
+        topics = [(e, topic) for e in endpoints for topic in e.names(Kind.SUBSCRIBER)]
+        await asyncio.gather(*(self._update_inside(e, topic, []) for e, topic in topics))
+        await self.register([(e, held) for e in endpoints for held in e.registrations.values()])
+        for endpoint in endpoints:
             endpoint.note_settled()
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
@@ -82,12 +97,7 @@ class Registrar:
         for held in found:
             self._context.registry.register(endpoint, held)
         if found:
-            log.info(
-                "%s: %d topics were not registered; they are now",
-                endpoint.label,
-                len(found),
-                extra=endpoint.log_fields,
-            )
+            _log(endpoint, "%s: %d topics were not registered; they are now", len(found))
             await self.register([(endpoint, held) for held in found])
 
     async def register_lost(self) -> None:
@@ -97,7 +107,7 @@ class Registrar:
         ours = {
             held: endpoint
             for endpoint, held in self._context.registry.registrations()
-            if endpoint.trusted and not endpoint.health.cleaned and not endpoint.health.down
+            if endpoint.answers and not endpoint.health.cleaned
         }
         lost = policy.lost(list(ours), state, started)
         unsettled = [e for e in self._context.registry if e.unsettled and not e.health.down]
@@ -113,19 +123,14 @@ class Registrar:
         await self._unregister(endpoint, held)
         endpoint.health.note_cleaned(started)
         self._context.metrics.cleanups.inc()
-        log.info(
-            "cleaned up %s: %d registrations taken back",
-            endpoint.label,
-            len(held),
-            extra=endpoint.log_fields,
-        )
+        _log(endpoint, "cleaned up %s: %d registrations taken back", len(held))
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
         """Register a node again that was cleaned up and answers after all, as process ``pid``.
 
         Raises Unreachable, MasterError.
         """
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         if info is None:
             return
         kept = policy.still_held(endpoint, info, pid == endpoint.health.pid)
@@ -134,12 +139,7 @@ class Registrar:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
         endpoint.health.note_back(pid)
         await self.register([(endpoint, held) for held in kept])
-        log.info(
-            "%s is back: %d registrations made again",
-            endpoint.label,
-            len(kept),
-            extra=endpoint.log_fields,
-        )
+        _log(endpoint, "%s is back: %d registrations made again", len(kept))
 
     async def unregister_left_over(self, endpoint: Endpoint) -> None:
         """Take back what a former process left: topics that the node there does not have.
@@ -147,7 +147,7 @@ class Registrar:
         Raises Unreachable.
         """
         started = self._context.now()
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
             endpoint.replace_tcpros_ports(info.tcpros_port)
             await self._forget(endpoint, policy.left_over(endpoint, info, started))
@@ -158,7 +158,7 @@ class Registrar:
         A service that it has unregistered stays until it ends: it can't be asked for those.
         """
         started = self._context.now()
-        info = await self._nodes.inspect(endpoint.slave)
+        info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
             await self._forget(endpoint, policy.vanished(endpoint, info, started))
             await self.register_missing(endpoint, info)
@@ -176,27 +176,42 @@ class Registrar:
         ]
         values = await self._context.upstream.multicall(calls)
         updates = (
-            self._updates.send_inside(endpoint, one.name, publishers)
+            self._update_inside(endpoint, one.name, publishers)
             for (endpoint, one), publishers in zip(wanted, values, strict=True)
             if one.kind is Kind.SUBSCRIBER and isinstance(publishers, list)
         )
         await asyncio.gather(*updates)
 
+    async def _update_inside(
+        self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
+    ) -> bool:
+        """The same for an endpoint's node, with URIs that it can use."""
+        asker = self._context.node_asker(endpoint)
+        imported = self._context.addressing.import_slaves(publishers, asker)
+        await self._alias.listen_for(publishers)
+        return await self._update(endpoint.slave, topic, imported)
+
+    async def _update(self, where: HostPort, topic: str, publishers: Sequence[str]) -> bool:
+        body = xmlrpc.dump_call("publisherUpdate", "/master", topic, list(publishers))
+        async with self._limit:
+            try:
+                timeout = self._context.settings.probe_timeout
+                await self._context.upstream.post_to_node(where, body, timeout)
+            except Unreachable as error:
+                log.debug("publisherUpdate of %s: %s", topic, error)
+                return False
+        return True
+
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
         for held in ended:
-            log.info(
-                "%s of %s is no longer at %s",
-                held.name,
-                held.caller_id,
-                endpoint.uri,
-                extra=endpoint.log_fields,
-            )
+            _log(endpoint, "%s no longer has %s of %s", held.name, held.caller_id)
             self._context.registry.unregister(held.kind, held.name, held.caller_id)
 
-    async def _unregister(self, endpoint: Endpoint, held: Sequence[Registration]) -> None:
-        addressing = self._context.addressing
-        uri, service = addressing.advertised_uri(endpoint), addressing.advertised_service(endpoint)
+    async def _unregister(self, endpoint: Endpoint, held: Iterable[Registration]) -> None:
+        """Take back what an endpoint's node holds by its advertised URI."""
+        uri = self._context.addressing.advertised_uri(endpoint)
+        service = self._context.addressing.advertised_service(endpoint)
         calls = [policy.unregister_call(one, uri, service) for one in held]
         await self._context.upstream.multicall(calls)
 
@@ -206,71 +221,69 @@ class Registrar:
         It has nodes that have moved by former advertised URIs: they hold what the registry has.
         Those that registered around the proxy it has by their own: what they hold it alone knows.
         """
-        registry, direct = self._context.registry, dict[str, str]()
+        registry, addressing = self._context.registry, self._context.addressing
         calls: list[policy.MethodCall] = []
+        direct: dict[str, tuple[Endpoint, str]] = {}
         for name, (endpoint, uri) in former.items():
             endpoint.note_former_uri(uri)
-            if self._context.addressing.identify(uri) is None:
-                direct[name] = uri
+            if addressing.identify(uri) is None:
+                direct[name] = endpoint, uri
                 endpoint.expect_updates(self._context.now() + SETTLE_TIME)
             else:
-                service = self._context.addressing.advertised_service(endpoint)
-                held = endpoint.registrations.values()
-                mine = [one for one in held if one.caller_id == name]
-                calls += [policy.unregister_call(one, uri, service) for one in mine]
+                service = addressing.advertised_service(endpoint)
+                held = _held_by(endpoint, name)
+                calls += [policy.unregister_call(one, uri, service) for one in held]
         await self._context.upstream.multicall(calls)
-        freed = {name: list[Registration]() for name in former if name not in direct}
-        for name, found in (await self._free_direct(direct)).items():
-            if found is None:
-                registry.drop_caller(former[name][0], name)
-            else:
-                freed[name] = found
-        for name, found in freed.items():
-            endpoint = former[name][0]
-            for one in found:
-                if one.key not in endpoint.registrations:
-                    registry.register(endpoint, replace(one, since=self._context.now()))
+        freed, known = await self._free_direct(direct)
+        for one in freed:
+            endpoint = former[one.caller_id][0]
+            if one.key not in endpoint.registrations:
+                registry.register(endpoint, replace(one, since=self._context.now()))
+        names = {name: endpoint for name, (endpoint, _) in former.items() if name not in known}
         return [
-            (former[name][0], one)
-            for name in freed
-            for one in former[name][0].registrations.values()
-            if one.caller_id == name
+            (endpoint, one) for name, endpoint in names.items() for one in _held_by(endpoint, name)
         ]
 
-    async def _free_direct(self, uris: Mapping[str, str]) -> dict[str, list[Registration] | None]:
+    async def _free_direct(self, former: Former) -> tuple[list[Registration], dict[str, str]]:
         """End everything that names hold which the master has by their nodes' own URIs.
 
-        What that was, of the names that are free now; None of those that are not, because of a
-        parameter subscription that the master does not tell of: they get back what they had. A
-        name that was registered otherwise meanwhile is left out. Raises Unreachable, MasterError.
+        What that was; and the names that the master knows still, with their URIs. It may have
+        another one by now. Else there is a parameter subscription, which the master does not
+        tell of, beside the one that every node has: such a name gets back what it had. Raises
+        Unreachable, MasterError.
         """
-        if not uris:
-            return {}
-        upstream = self._context.upstream
-        held = await read_registrations(upstream)
-        mine = (one for name in uris for one in held.get(name, []))
+        if not former:
+            return [], {}
+        upstream, uris = self._context.upstream, {name: uri for name, (_, uri) in former.items()}
+        state = await read_registrations(upstream)
+        mine = [one for name in uris for one in state.get(name, [])]
         services = await look_up_services(
             upstream, {one.name for one in mine if one.kind is Kind.SERVICE}
         )
-        release = {name: policy.release_calls(name, uri, CALLER_ID) for name, uri in uris.items()}
-        calls = policy.free_calls(uris, held, services)
-        values = await upstream.multicall([*calls, *(c for part in release.values() for c in part)])
-        found: dict[str, list[Registration] | None] = {}
-        stuck: dict[str, str] = {}
-        for place, (name, uri) in enumerate(uris.items()):
-            answers = values[len(calls) + 3 * place :][:3]
-            parameters = policy.released_parameters(answers)
-            if parameters is not None:
-                params = [Registration(Kind.PARAM, key, name) for key in parameters]
-                found[name] = [*held.get(name, []), *params]
-            elif answers[-1] == uri:
-                found[name], stuck[name] = None, uri
-        await upstream.multicall(policy.restore_calls(stuck, held, services))
-        for name, uri in stuck.items():
-            text = (
-                f"registered as {uri} around the proxy and can't be taken over: it is subscribed "
-                "to a parameter, which the master does not tell of. Restart its container"
-            )
-            log.warning("%s: %s", name, text)
-            self._context.problems.add(name, text)
-        return found
+        free = policy.free_calls(mine, uris, services)
+        values = await upstream.multicall([*free, *policy.release_calls(uris, CALLER_ID)])
+        params, known = policy.read_release(uris, values[len(free) :])
+        stuck = [name for name, uri in known.items() if uri == uris[name]]
+        restored = [one for one in mine if one.caller_id in stuck]
+        await upstream.multicall(policy.restore_calls(restored, uris, services))
+        for name in stuck:
+            self._give_up(former[name][0], name, uris[name])
+        return [one for one in [*mine, *params] if one.caller_id not in known], known
+
+    def _give_up(self, endpoint: Endpoint, name: str, uri: str) -> None:
+        self._context.registry.drop_caller(endpoint, name)
+        text = (
+            f"registered as {uri} around the proxy and can't be taken over: it is subscribed to a "
+            "parameter, which the master does not tell of. Restart its container"
+        )
+        log.warning("%s: %s", name, text)
+        self._context.problems.add(name, text)
+
+
+def _held_by(endpoint: Endpoint, name: str) -> list[Registration]:
+    return [one for one in endpoint.registrations.values() if one.caller_id == name]
+
+
+def _log(endpoint: Endpoint, text: str, *values: object) -> None:
+    """Log something of an endpoint, whose label comes first."""
+    log.info(text, endpoint.label, *values, extra=endpoint.log_fields)

@@ -6,17 +6,21 @@ addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All 
 they are.
 """
 
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import replace
 
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import MasterReply, Request
+from rosproxy.ros1.rewriting.master_api import Admission, MasterReply, Request
 from rosproxy.ros1.servers.admission import NodeAdmission
-from rosproxy.ros1.servers.needs import AliasPorts, Recovering, TakingOver
-from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
+from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.ros1.upkeep.recovery import Recovery
 
 
 class MasterApi:
@@ -30,39 +34,38 @@ class MasterApi:
         self,
         context: Context,
         admission: NodeAdmission,
-        alias: AliasPorts,
-        recovery: Recovering,
-        adopter: TakingOver,
+        alias: Alias,
+        recovery: Recovery,
+        adopter: Adopter,
     ) -> None:
         self._context, self._admission, self._alias = context, admission, alias
         self._recovery, self._adopter = recovery, adopter
 
     async def __call__(self, call: IncomingCall) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
-        self._refuse_loop(call)
+        if call.comes_from(self._context.instance):
+            what = "a node's address"
+            if call.loop_id == self._context.instance:
+                what = f"--master-uri {self._context.settings.master_uri}"
+            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
-        count = self._context.metrics.count
+        metrics = self._context.metrics
         try:
             request = master_api.read_request(call.body, asker)
         except xmlrpc.XmlRpcError:
-            count("master", "other", "malformed")
+            metrics.count("master", "other", "malformed")
             raise
-        try:
-            if request.plain:
-                reply = await self._context.upstream.post_to_master(request.body)
-            else:
-                reply = await self._rewrite(request)
-        except Unreachable:
-            count("master", request.method, "unreachable")
-            raise
-        count("master", request.method, "answered")
-        return reply
+        if request.plain:
+            reply = self._context.upstream.post_to_master(request.body)
+        else:
+            reply = self._rewrite(request)
+        return await counted(metrics, "master", request.method, reply)
 
     async def _rewrite(self, request: Request) -> bytes:
         """Admit, export, call the master, note, import."""
         await self._recovery.ensure()
         addressing = self._context.addressing
-        async with self._admission.of(request, self._adopter) as admissions:
+        async with self._admitted(request) as admissions:
             exported = master_api.export_request(request, admissions, addressing)
             if exported.body is None:
                 return exported.refused_reply()
@@ -71,6 +74,28 @@ class MasterApi:
             self._note(reply, request.asker.address)
             await self._alias.listen_for(reply.uris())
             return master_api.import_reply(reply, addressing)
+
+    @asynccontextmanager
+    async def _admitted(self, request: Request) -> AsyncIterator[Sequence[Admission]]:
+        """What becomes of each call of a request. Raises Unreachable.
+
+        Within the context their endpoints are *pending*: their leases do not end while the calls
+        are on their way.
+        """
+        self._context.refresh_networks(request.asker.address)
+        admissions: list[Admission] = []
+        try:
+            for call in request.calls:  # one after the other: they may register the same new node
+                admission = await self._admission.admit(call, request.asker) if call else None
+                admissions.append(admission)
+                if isinstance(admission, Endpoint):
+                    admission.hold()
+                    await self._adopter.take_over(admission, call.string(0) or "" if call else "")
+            yield admissions
+        finally:
+            for admission in admissions:
+                if isinstance(admission, Endpoint):
+                    admission.release()
 
     def _note(self, reply: MasterReply, source: str) -> None:
         """Take in what the master accepted.
@@ -87,27 +112,14 @@ class MasterApi:
                 own = source == fact.endpoint.place.address
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
 
-    def _refuse_loop(self, call: IncomingCall) -> None:
-        if not call.comes_from(self._context.instance):
-            return
-        what = "a node's address"
-        if call.loop_id == self._context.instance:
-            what = f"--master-uri {self._context.settings.master_uri}"
-        raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
 
-
-class PublishedMaster:
+async def serve_published(context: Context, address: str, call: IncomingCall) -> bytes:
     """The master itself for outside (``--publish-master``), where it runs inside.
 
-    What the master holds are outside addresses already; only its own URI is replaced.
+    What the master holds are outside addresses already; only its own URI is replaced. Raises
+    XmlRpcError, Unreachable.
     """
-
-    def __init__(self, context: Context, address: str) -> None:
-        self._context, self._address = context, address
-
-    async def __call__(self, call: IncomingCall) -> bytes:
-        """The master's reply to a call. Raises XmlRpcError, Unreachable."""
-        asker = Asker(call.source, call.local.host, master=self._address)
-        request = master_api.read_request(call.body, asker)
-        reply = await self._context.upstream.post_to_master(call.body)
-        return master_api.rename_master(request, reply, self._address)
+    asker = Asker(call.source, call.local.host, master=address)
+    request = master_api.read_request(call.body, asker)
+    reply = await context.upstream.post_to_master(call.body)
+    return master_api.rename_master(request, reply, address)

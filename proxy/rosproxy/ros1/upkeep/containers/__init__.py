@@ -1,1 +1,0 @@
-"""Containers that went, moved or arrived, as an operator tells it."""

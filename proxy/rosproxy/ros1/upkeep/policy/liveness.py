@@ -1,0 +1,100 @@
+"""When a node is probed, when it counts as gone or moved, and when its port is free again.
+
+An operator knows that a container is gone or has moved before any time-out can tell, but its
+events may be late, or about an address that another container has by now. So each is a hint, and
+the node itself is asked before anything is done.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
+from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.health import UNKNOWN_PID, ProbeResult
+from rosproxy.ros1.upkeep.policy.recovery import confirmed_by
+
+DIRECT_INTERVAL = 2.0
+"""Seconds between probes, at most, of a node that registered around the proxy."""
+FORGET_AFTER = 3600.0
+"""Seconds after which a node that was cleaned up while it was silent is forgotten."""
+NO_PATIENCE = 0.001
+"""Seconds: less than between any two probes. Zero would mean that nothing is ever cleaned up."""
+
+
+def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
+    """Whether it is time to probe a node; ``interval`` is that of idle nodes in seconds."""
+    return endpoint.health.due(now, min(interval, DIRECT_INTERVAL) if endpoint.direct else interval)
+
+
+def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
+    """Whether a node has been down for long enough (``after`` seconds; 0: never).
+
+    One that registered around the proxy has unregistered there as well, to no effect; so it
+    keeps nothing once it has ended.
+    """
+    if endpoint.direct and endpoint.health.refused:
+        after = min(after, NO_PATIENCE)
+    return endpoint.health.clean_up(now, after)
+
+
+def is_unused(endpoint: Endpoint) -> bool:
+    """Whether nobody needs an endpoint's port, so that the lease may end."""
+    if endpoint.connected or endpoint.pending:
+        return False
+    return endpoint.idle or endpoint.health.cleaned
+
+
+def lease_lasts(endpoint: Endpoint, linger: float) -> float:
+    """Seconds for which an unused lease lasts; a node that was just silent may come back."""
+    health = endpoint.health
+    return FORGET_AFTER if health.cleaned and not (health.refused or health.over) else linger
+
+
+def dead(answers: Mapping[Endpoint, ProbeResult], since: float) -> list[Endpoint]:
+    """Those of the endpoints at addresses that are gone whose node does not answer.
+
+    Where one answers, the address is in use again, or the event was late. One that is silent but
+    has registered ``since`` then is spared: a container that is restarted has its address
+    again, and a node that is just starting may take its time.
+    """
+
+    def is_spared(endpoint: Endpoint) -> bool:
+        held = endpoint.registrations.values()
+        return endpoint.pending > 0 or any(one.since >= since for one in held)
+
+    return [
+        endpoint
+        for endpoint, probe in answers.items()
+        if probe is ProbeResult.REFUSED or (probe is ProbeResult.SILENT and not is_spared(endpoint))
+    ]
+
+
+def movable(
+    endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
+) -> dict[Endpoint, str]:
+    """The endpoints at addresses that have changed, with their new one, if that is inside."""
+    found = {e: moved.get(e.place.address, "") for e in endpoints}
+    return {
+        e: new for e, new in found.items() if new != e.place.address and is_inside(new, networks)
+    }
+
+
+def new_place(endpoint: Endpoint, address: str) -> Place:
+    """Where a node is that has moved to another address.
+
+    Neighbours are sent through the proxy from now on, even if the node's host name leads there:
+    to a URI that they know already, rospy doesn't connect again.
+    """
+    host, before = endpoint.node.host, endpoint.place
+    stale = is_address(host) and not is_loopback(host) and host != address
+    return Place(address, named=False, confirmed=before.confirmed, stale=stale)
+
+
+def is_same_process(endpoint: Endpoint, pid: int | None, topics: set[str]) -> bool:
+    """Whether the node that answers elsewhere, with a pid and topics, is that of an endpoint.
+
+    In a container of its own every node has the same pid, so the topics must fit as well.
+    """
+    known = endpoint.health.pid
+    if pid is None or (known not in UNKNOWN_PID and known != pid):
+        return False
+    return confirmed_by(endpoint, topics) if endpoint.topics else known == pid

@@ -1,1 +1,0 @@
-"""Are the nodes alive? Dead ones are unregistered, and the ports that nobody uses are freed."""

@@ -1,1 +1,0 @@
-"""After a start: endpoints and leases rebuilt from what the master holds."""

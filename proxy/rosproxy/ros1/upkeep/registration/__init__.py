@@ -1,1 +1,0 @@
-"""Making and taking back registrations at the master on behalf of nodes."""

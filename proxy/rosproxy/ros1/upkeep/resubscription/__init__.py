@@ -1,1 +1,0 @@
-"""Subscribers whose connection was lost unnoticed are told of their publishers again."""
