@@ -168,7 +168,7 @@ class _Collector:
         """Ask the nodes and services that the user named."""
         scope, nodes = facts.scope, facts.nodes
         asked = await _gather(scope.nodes, lambda name: self._ask_node(facts, nodes[name]))
-        facts = replace(facts, nodes=nodes | asked)
+        facts = replace(facts, nodes={**nodes, **asked})
         apart = {
             (giver, topic)
             for topic, giver, taker in scope.pairs

@@ -18,7 +18,7 @@ from xmlrpc.client import Fault, dumps
 
 from rosproxy.ros1.protocol.xmlrpc import fast
 from rosproxy.ros1.protocol.xmlrpc import values as xmlrpc_values
-from rosproxy.ros1.protocol.xmlrpc.values import INTEGERS, SCALARS, text_of
+from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
 
 Value = xmlrpc_values.Value
 PARSE_ERROR = -32700
@@ -66,9 +66,16 @@ class Call:
     method: str
     params: list[Value]
 
-    def string(self, index: int) -> str | None:
+    def string_value(self, index: int | None) -> Value | None:
         """Parameter ``index`` if it is there and a string, else None."""
-        return self.params[index].string() if index < len(self.params) else None
+        if index is None or index >= len(self.params):
+            return None
+        return self.params[index] if self.params[index].kind == "string" else None
+
+    def string(self, index: int | None) -> str | None:
+        """The text of that."""
+        value = self.string_value(index)
+        return value.text if value else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,63 +231,46 @@ class _Parser:
     def _start(self, name: str, attributes: object) -> None:
         self._path.append(name)
         self._count += 1
+        self.root = self.root or name
         if len(self._path) > self.limits.depth:
             raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self.limits.depth} elements")
         if self._count > self.limits.elements:
             raise XmlRpcError(PARSE_ERROR, f"more than {self.limits.elements} elements")
-        handler = _STARTS.get(name)
-        if handler:
-            handler(self)
-        elif name in SCALARS:
-            self._start_scalar(name)
+        if name == "value":
+            self._start_value()
+        elif name in KINDS:
+            self._start_kind(name)
+        elif name in ("methodName", "name"):
+            self._inner = self._tag_end()
+        elif name == "fault":
+            self.fault = True
         elif self._path[-2:-1] == ["value"]:
             self._open[-1].kind = "other"
 
     def _end(self, name: str) -> None:
         self._path.pop()
-        handler = _ENDS.get(name)
-        if handler:
-            handler(self)
+        if name == "value":
+            self._end_value()
         elif name in SCALARS:
-            self._end_scalar()
-
-    def _start_root(self) -> None:
-        if len(self._path) == 1:
-            self.root = self._path[0]
-
-    def _start_fault(self) -> None:
-        self.fault = True
-
-    def _start_text(self) -> None:
-        self._inner = self._tag_end()
+            value = self._open[-1]
+            value.inner = (value.inner[0], max(value.inner[0], self._expat.CurrentByteIndex))
+        elif name == "methodName":
+            self.method = self._text().strip()
+        elif name == "name" and self._open and self._path[-1:] == ["member"]:
+            self._open[-1].members.append(self._text())
 
     def _start_value(self) -> None:
         inside = self._tag_end()
         outer = self._expat.CurrentByteIndex, inside
         self._open.append(Value(self.body, self._encoding, outer=outer, inner=(inside, -1)))
 
-    def _start_scalar(self, name: str) -> None:
-        value = self._holder(name)
-        value.kind = "int" if name in INTEGERS else "other"
-        value.kind = "string" if name == "string" else value.kind
-        value.inner = (self._tag_end(), -1)
-
-    def _start_array(self) -> None:
-        self._holder("array").kind = "array"
-
-    def _start_struct(self) -> None:
-        self._holder("struct").kind = "struct"
-
-    def _end_method(self) -> None:
-        self.method = text_of(self._slice(), self._encoding).strip()
-
-    def _end_name(self) -> None:
-        if self._open and self._path[-1:] == ["member"]:
-            self._open[-1].members.append(text_of(self._slice(), self._encoding))
-
-    def _end_scalar(self) -> None:
+    def _start_kind(self, name: str) -> None:
+        if not self._open or self._path[-2:-1] != ["value"]:
+            raise XmlRpcError(INVALID_REQUEST, f"<{name}> outside of a <value>")
         value = self._open[-1]
-        value.inner = (value.inner[0], max(value.inner[0], self._expat.CurrentByteIndex))
+        value.kind = KINDS[name]
+        if name in SCALARS:
+            value.inner = (self._tag_end(), -1)
 
     def _end_value(self) -> None:
         value = self._open.pop()
@@ -293,30 +283,10 @@ class _Parser:
             raise XmlRpcError(INVALID_REQUEST, "a struct member needs one name and one value")
         (self._open[-1].items if self._open else self.values).append(value)
 
-    def _holder(self, name: str) -> Value:
-        if not self._open or self._path[-2:-1] != ["value"]:
-            raise XmlRpcError(INVALID_REQUEST, f"<{name}> outside of a <value>")
-        return self._open[-1]
-
-    def _slice(self) -> bytes:
-        return self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
+    def _text(self) -> str:
+        """What the name element that ends here holds."""
+        raw = self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
+        return text_of(raw, self._encoding)
 
     def _tag_end(self) -> int:
         return next(_TAG.finditer(self.body, self._expat.CurrentByteIndex)).end()
-
-
-_STARTS = {
-    "methodCall": _Parser._start_root,
-    "methodResponse": _Parser._start_root,
-    "fault": _Parser._start_fault,
-    "methodName": _Parser._start_text,
-    "name": _Parser._start_text,
-    "value": _Parser._start_value,
-    "array": _Parser._start_array,
-    "struct": _Parser._start_struct,
-}
-_ENDS = {
-    "methodName": _Parser._end_method,
-    "name": _Parser._end_name,
-    "value": _Parser._end_value,
-}

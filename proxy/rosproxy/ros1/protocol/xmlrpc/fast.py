@@ -9,7 +9,7 @@ as long and decides what is an error.
 import re
 from collections.abc import Iterator
 
-from rosproxy.ros1.protocol.xmlrpc.values import INTEGERS, Kind, Value, text_of
+from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
 
 _PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
 _PROLOG = rb"(?:<\?xml version=(?:'1\.0'|\"1\.0\")\?>)?\s*"
@@ -39,8 +39,7 @@ _VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
 _ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
 """The groups of a token; the last one of a match tells what it is."""
 _END_OF_VALUE = len(b"</value>")
-_KINDS: dict[bytes, Kind] = {b"string": "string"}
-_KINDS.update((name.encode(), "int") for name in INTEGERS)
+_KINDS = {name.encode(): kind for name, kind in KINDS.items()}
 
 _Tokens = Iterator[re.Match[bytes]]
 
@@ -99,37 +98,39 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
     which = token.lastindex
     start, inside = token.span(_VALUE)
     if which == _TYPED and depth > 1:
-        kind = _KINDS.get(token[_TYPE], "other")
+        kind = _KINDS[token[_TYPE]]
         return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
     if which == _TEXT and depth:
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
     if depth < 4:
         raise _NotPlain
+    items, members = list[Value](), list[str]()
     if which == _ARRAY:
-        return _array(body, start, inside, tokens, depth - 3)
-    if which == _STRUCT:
-        return _struct(body, start, inside, tokens, depth - 3)
-    raise _NotPlain
+        kind, end = "array", _array(body, tokens, depth - 3, items)
+    elif which == _STRUCT:
+        kind, end = "struct", _struct(body, tokens, depth - 3, items, members)
+    else:
+        raise _NotPlain
+    inner = inside, end - _END_OF_VALUE
+    return Value(body, "utf-8", kind, (start, end), inner, items, members)
 
 
-def _array(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
-    items = list[Value]()
+def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
+    """Read items up to the end of their array; where that is."""
     for token in tokens:
         if token.lastindex == _ARRAY_END:
-            end = token.end()
-            inner = inside, end - _END_OF_VALUE
-            return Value(body, "utf-8", "array", (start, end), inner, items, [])
+            return token.end()
         items.append(_value(body, token, tokens, depth))
     raise _NotPlain
 
 
-def _struct(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
-    items, members = list[Value](), list[str]()
+def _struct(
+    body: bytes, tokens: _Tokens, depth: int, items: list[Value], members: list[str]
+) -> int:
+    """Read members up to the end of their struct; where that is."""
     for token in tokens:
         if token.lastindex == _STRUCT_END:
-            end = token.end()
-            inner = inside, end - _END_OF_VALUE
-            return Value(body, "utf-8", "struct", (start, end), inner, items, members)
+            return token.end()
         if token.lastindex != _NAME:
             break
         members.append(text_of(token[_NAME], "utf-8"))
