@@ -10,7 +10,7 @@ which lives on both sides, is a plain process without any restriction. A system 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
@@ -246,15 +246,10 @@ class Scenario:
         heard = len(self.far_listener.received)
         self.act = "restart: same command, no state on disk"
         self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
-        ready = monotonic()
-        answered = asyncio.create_task(self._first_answer())
-        try:
-            received = self.far_listener.received
-            await self._until(lambda: len(received) > heard, "messages flow again")
-            await self._until(answered.done, "the service answers again")
-        finally:
-            answered.cancel()
-        took = received[heard][1] - ready, answered.result() - ready
+        ready, received = monotonic(), self.far_listener.received
+        await self._until(lambda: len(received) > heard, "messages flow again")
+        await self._until(self._service_answers, "the service answers again")
+        took = received[heard][1] - ready, monotonic() - ready
         detail = (
             f"first message {took[0]:.2f} s, first service call {took[1]:.2f} s after it was ready;"
             f" the whole outage took {max(took) + ready - killed:.2f} s"
@@ -264,18 +259,15 @@ class Scenario:
         self._check(promise, max(took) < RECOVERY_SECONDS, detail)
         return killed
 
-    async def _first_answer(self) -> float:
-        """Call the inside adder from outside until it answers; return when it did."""
-        while True:
-            try:
-                await self.far_listener.add(self.master.uri, self.adder.service, 20, 22)
-            except CALL_ERRORS:
-                await asyncio.sleep(0.02)
-            else:
-                return monotonic()
+    async def _service_answers(self) -> bool:
+        """Whether outside gets an answer of the inside adder."""
+        with suppress(*CALL_ERRORS):
+            await self.far_listener.add(self.master.uri, self.adder.service, 20, 22)
+            return True
+        return False
 
     def _check_addresses(self, before: dict[str, str], after: dict[str, str]) -> None:
-        told = [", ".join(f"{name} {at}" for name, at in one.items()) for one in (before, after)]
+        told = [", ".join(map(" ".join, one.items())) for one in (before, after)]
         same = before == after and "another" not in told[0]
         detail = told[0] if same else f"before the kill: {told[0]}; afterwards: {told[1]}"
         self._check("the same ports serve the same nodes", same, detail)
@@ -306,9 +298,12 @@ class Scenario:
             task.cancel()
 
     async def _until(self, condition: Callable[[], Any], what: str) -> None:
-        """Wait until `condition` holds; raises DemoError after PATIENCE."""
+        """Wait until `condition`, maybe a coroutine function, holds; DemoError after PATIENCE."""
         end = monotonic() + PATIENCE
-        while not condition():
+        while True:
+            result = condition()
+            if await result if isinstance(result, Awaitable) else result:
+                return
             if monotonic() > end:
                 raise DemoError(f"{what}: not within {PATIENCE:g} s")
             await asyncio.sleep(0.01)

@@ -16,11 +16,10 @@ from xml.parsers import expat
 from xml.sax.saxutils import escape
 from xmlrpc.client import Fault, dumps
 
-from rosproxy.ros1.protocol.xmlrpc import fast
-from rosproxy.ros1.protocol.xmlrpc import values as xmlrpc_values
+from rosproxy.ros1.protocol.xmlrpc import fast, values
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
 
-Value = xmlrpc_values.Value
+Value = values.Value
 PARSE_ERROR = -32700
 """Fault code: not well formed (http://xmlrpc-epi.sourceforge.net/specs/rfc.fault_codes.php)."""
 INVALID_REQUEST = -32600
@@ -43,20 +42,6 @@ class XmlRpcError(ValueError):
     def __init__(self, code: int, message: str) -> None:
         super().__init__(message)
         self.code = code
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Bounds on a document: nesting depth and number of XML elements.
-
-    Elements take some 3 µs each, in which nothing else is served.
-    """
-
-    depth: int = 64
-    elements: int = 500_000
-
-
-DEFAULT_LIMITS = Limits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +103,17 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
     return b"".join([*parts, body[position:]])
 
 
-def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Call:
+def parse_call(body: bytes) -> Call:
     """Parse a ``methodCall``.
 
-    Raises XmlRpcError if the document is malformed, holds a DTD or entities, exceeds ``limits``
+    Raises XmlRpcError if the document is malformed, holds a DTD or entities, is too large or deep
     or is not a method call. Of what looks like several method names XmlRpc++ takes the first, even
     in a comment, and Python the last element: such a document is refused.
     """
-    plain = fast.call(body, limits.depth, limits.elements)
+    plain = fast.call(body)
     if plain is not None:
         return Call(*plain)
-    parser = _Parser(body, limits)
+    parser = _Parser(body)
     if parser.root != "methodCall" or not parser.method:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC call: no methodCall with a methodName")
     if body.count(b"<methodName") != 1:
@@ -136,24 +121,24 @@ def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Call:
     return Call(parser.method, parser.values)
 
 
-def parse_reply(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value | None:
+def parse_reply(body: bytes) -> Value | None:
     """Parse a ``methodResponse``; None if it is a fault.
 
-    Raises XmlRpcError if the document is malformed, exceeds ``limits`` or is not a response.
+    Raises XmlRpcError if the document is malformed, too large or deep, or is not a response.
     """
-    value, fault = parse_response(body, limits)
+    value, fault = parse_response(body)
     return None if fault else value
 
 
-def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[Value, bool]:
+def parse_response(body: bytes) -> tuple[Value, bool]:
     """Parse a ``methodResponse``: its value, and whether that is a fault.
 
     Raises XmlRpcError as ``parse_reply`` does.
     """
-    plain = fast.response(body, limits.depth, limits.elements)
+    plain = fast.response(body)
     if plain is not None:
         return plain, False
-    parser = _Parser(body, limits)
+    parser = _Parser(body)
     if parser.root != "methodResponse" or len(parser.values) != 1:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
     return parser.values[0], parser.fault
@@ -195,8 +180,8 @@ def python_value(value: Value) -> Any:
 class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
-    def __init__(self, body: bytes, limits: Limits) -> None:
-        self.body, self.limits = body, limits
+    def __init__(self, body: bytes) -> None:
+        self.body = body
         self.root, self.method, self.fault = "", "", False
         self.values: list[Value] = []
         self._encoding = "utf-8"
@@ -232,10 +217,10 @@ class _Parser:
         self._path.append(name)
         self._count += 1
         self.root = self.root or name
-        if len(self._path) > self.limits.depth:
-            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self.limits.depth} elements")
-        if self._count > self.limits.elements:
-            raise XmlRpcError(PARSE_ERROR, f"more than {self.limits.elements} elements")
+        if len(self._path) > values.MAX_DEPTH:
+            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {values.MAX_DEPTH} elements")
+        if self._count > values.MAX_ELEMENTS:
+            raise XmlRpcError(PARSE_ERROR, f"more than {values.MAX_ELEMENTS} elements")
         if name == "value":
             self._start_value()
         elif name in KINDS:

@@ -9,6 +9,7 @@ as long and decides what is an error.
 import re
 from collections.abc import Iterator
 
+from rosproxy.ros1.protocol.xmlrpc import values
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
 
 _PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
@@ -48,49 +49,46 @@ class _NotPlain(Exception):
     """A document of another form, or of none."""
 
 
-def call(body: bytes, depth: int, elements: int) -> tuple[str, list[Value]] | None:
-    """The method and parameters of a ``methodCall``, None if it is not of the plain form.
-
-    ``depth`` and ``elements`` are bounds as in `document.Limits`; None beyond them.
-    """
+def call(body: bytes) -> tuple[str, list[Value]] | None:
+    """The method and parameters of a ``methodCall``, None if it is not of the plain form."""
     head = _CALL.match(body)
-    if head is None or not _is_plain(body, elements):
+    if head is None or not _is_plain(body):
         return None
-    values = _params(body, head.end(), _CALL_END, depth - 3)
-    return None if values is None else (head[1].decode(), values)
+    params = _params(body, head.end(), _CALL_END)
+    return None if params is None else (head[1].decode(), params)
 
 
-def response(body: bytes, depth: int, elements: int) -> Value | None:
+def response(body: bytes) -> Value | None:
     """The value of a ``methodResponse``, None if it is a fault or not of the plain form."""
     head = _RESPONSE.match(body)
-    if head is None or not _is_plain(body, elements):
+    if head is None or not _is_plain(body):
         return None
-    values = _params(body, head.end(), _RESPONSE_END, depth - 3)
-    return values[0] if values is not None and len(values) == 1 else None
+    params = _params(body, head.end(), _RESPONSE_END)
+    return params[0] if params is not None and len(params) == 1 else None
 
 
-def _is_plain(body: bytes, elements: int) -> bool:
+def _is_plain(body: bytes) -> bool:
     return (
         not body.translate(None, _PLAIN)
         and b"]]>" not in body
-        and body.count(b"</") <= elements  # each is closed by a tag of its own
+        and body.count(b"</") <= values.MAX_ELEMENTS  # each is closed by a tag of its own
     )
 
 
-def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
-    tokens, values, place = _TOKEN.finditer(body, start), list[Value](), start
+def _params(body: bytes, start: int, end: re.Pattern[bytes]) -> list[Value] | None:
+    tokens, params, place = _TOKEN.finditer(body, start), list[Value](), start
     try:
         for token in tokens:
             if token.lastindex != _PARAM:
                 break
-            values.append(_value(body, next(tokens), tokens, depth))
+            params.append(_value(body, next(tokens), tokens, values.MAX_DEPTH - 3))
             last = next(tokens)
             if last.lastindex != _PARAM_END:
                 return None
             place = last.end()
     except (_NotPlain, StopIteration):
         return None
-    return values if end.match(body, place) else None
+    return params if end.match(body, place) else None
 
 
 def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> Value:
