@@ -204,7 +204,10 @@ def import_reply(reply: MasterReply, addressing: Addressing) -> bytes:
             asker = replace(asker, endpoint=result.endpoint)
         edits += _import_result(result, asker, addressing)
     if request.multicall and reply.value and reply.value.items:
-        edits += insert_items(reply.value, _refused_results(reply.exported))
+        outcomes = enumerate(reply.exported.outcomes)
+        refused = [(i, one.triple()) for i, one in outcomes if isinstance(one, Refusal)]
+        results = [(i, xmlrpc.dump_value([triple])) for i, triple in refused]
+        edits += insert_items(reply.value, results)
     return xmlrpc.apply(reply.body, edits)
 
 
@@ -237,11 +240,11 @@ def _holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None
     found, holder = row(call.method), addressing.registry.by_caller(_caller_id(call))
     if holder is None:
         return None
-    if found.caller_api is not None:
-        uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
-        return holder if uri == addressing.advertised_uri(holder) else None
-    uri = addressing.export_service(call.string(2) or "", _name(call), asker)
-    return holder if uri == addressing.advertised_service(holder) else None
+    if found.caller_api is None:
+        uri = addressing.export_service(call.string(found.service_api) or "", _name(call), asker)
+        return holder if uri == addressing.advertised_service(holder) else None
+    uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
+    return holder if uri == addressing.advertised_uri(holder) else None
 
 
 def _export_call(
@@ -260,14 +263,6 @@ def _export_call(
     if service_api:
         text = addressing.export_service(service_api.text, _name(call), asker)
         yield xmlrpc.replace(service_api, text)
-
-
-def _refused_results(exported: Exported) -> list[tuple[int, bytes]]:
-    return [
-        (i, xmlrpc.dump_value([outcome.triple()]))
-        for i, outcome in enumerate(exported.outcomes)
-        if isinstance(outcome, Refusal)
-    ]
 
 
 def _results(exported: Exported, value: Value) -> Iterator[Result]:
