@@ -136,10 +136,9 @@ class FakeNode:
     def run(self, method: str, params: tuple[Any, ...]) -> list[Any]:
         """Answer a slave API call: the ROS triple."""
         match method, params:
-            case "getPublications", _:
-                return [1, "topics", [list(item) for item in self.published.items()]]
-            case "getSubscriptions", _:
-                return [1, "topics", [list(item) for item in self.subscribed.items()]]
+            case (("getPublications" | "getSubscriptions"), _):
+                topics = self.published if method == "getPublications" else self.subscribed
+                return [1, "topics", [list(item) for item in topics.items()]]
             case "getPid", _:
                 return [1, "", self.pid]
             case "requestTopic", (_, str(topic), _):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, STDOUT, Process
 from collections import deque
@@ -66,20 +67,19 @@ class ProxyProcess:
 
     async def kill(self) -> None:
         """End it with SIGKILL."""
-        if self._process and self._reader:
-            with suppress(ProcessLookupError):
-                self._process.kill()
-            await self._reader
-            self.state = "killed"
+        await self._end(signal.SIGKILL)
+        self.state = "killed"
 
     async def stop(self) -> None:
         """Ask it to end, and kill it if it doesn't."""
+        await self._end(signal.SIGTERM)
+
+    async def _end(self, number: signal.Signals) -> None:
         if self._process and self._reader:
             with suppress(ProcessLookupError):
-                self._process.terminate()
-            try:
-                await asyncio.wait_for(self._process.wait(), STOP_SECONDS)
-            except TimeoutError:
+                self._process.send_signal(number)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._process.wait(), STOP_SECONDS)
                 self._process.kill()
             await self._reader
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from time import monotonic
 
 from rich.console import Console, Group
@@ -77,26 +77,24 @@ def counts_line(scenario: Scenario) -> str:
 
 async def show(scenario: Scenario, console: Console) -> None:
     """Draw until cancelled, and once more then."""
-    if console.is_terminal:
-        with Live(frame(scenario), console=console, auto_refresh=False) as live:
-            with suppress(asyncio.CancelledError):
-                while True:
-                    live.update(frame(scenario), refresh=True)
-                    await asyncio.sleep(0.2)
-            live.update(frame(scenario), refresh=True)
-        return
+    live = Live(console=console, auto_refresh=False) if console.is_terminal else None
     shown = 0
-    with suppress(asyncio.CancelledError):
-        while True:
-            shown = _print_events(scenario, console, shown)
-            console.out(counts_line(scenario), highlight=False)
-            await asyncio.sleep(1.0)
-    _print_events(scenario, console, shown)
+    with live or nullcontext():
+        with suppress(asyncio.CancelledError):
+            while True:
+                shown = _draw(scenario, live or console, shown)
+                await asyncio.sleep(0.2 if live else 1.0)
+        _draw(scenario, live or console, shown)
 
 
-def _print_events(scenario: Scenario, console: Console, shown: int) -> int:
-    for event in scenario.events[shown:]:
-        console.out(event_line(*event), highlight=False)
+def _draw(scenario: Scenario, on: Live | Console, shown: int) -> int:
+    """Draw anew, or print the events since the first `shown` ones; how many there are by now."""
+    if isinstance(on, Live):
+        on.update(frame(scenario), refresh=True)
+    else:
+        for event in scenario.events[shown:]:
+            on.out(event_line(*event), highlight=False)
+        on.out(counts_line(scenario), highlight=False)
     return len(scenario.events)
 
 

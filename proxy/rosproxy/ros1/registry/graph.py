@@ -17,10 +17,6 @@ _Table = list[tuple[str, list[str]]]
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
-class GraphError(ValueError):
-    """An answer of the master that does not have the form that it should have."""
-
-
 @dataclass(frozen=True, slots=True)
 class Graph:
     """What each node has registered, and each node's slave URI as far as known."""
@@ -65,14 +61,9 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
     """What each node has registered, from the values of getSystemState and getTopicTypes.
 
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
-    ``types`` is ``[[topic, type], …]``. Raises GraphError if ``state`` is not of that form.
+    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not of that form.
     """
-    try:
-        tables = msgspec.convert(state, tuple[_Table, _Table, _Table])
-    except msgspec.ValidationError:
-        form = "[[[name, [node, ...]], ...], ...]"
-        raise GraphError(f"getSystemState: not of the form {form}") from None
-    known = read_types(types)
+    tables, known = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
     found: dict[str, list[Registration]] = {}
     for kind, entries in zip(_STATE_KINDS, tables, strict=True):
         for name, nodes in entries:

@@ -189,10 +189,7 @@ class _Parser:
         self._open: list[Value] = []
         self._count = 0
         self._inner = 0
-        self._run()
-
-    def _run(self) -> None:
-        if b"\0" in self.body:
+        if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "neither UTF-8 nor another encoding without NUL bytes")
         self._expat = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
@@ -200,7 +197,7 @@ class _Parser:
         parser.StartDoctypeDeclHandler = self._doctype
         parser.XmlDeclHandler = self._declaration
         try:
-            parser.Parse(self.body, True)
+            parser.Parse(body, True)
         except expat.ExpatError as error:
             raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
 
