@@ -61,7 +61,7 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
     """What each node has registered, from the values of getSystemState and getTopicTypes.
 
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
-    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not of that form.
+    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not.
     """
     tables, known = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
     found: dict[str, list[Registration]] = {}
