@@ -7,6 +7,7 @@ import pytest
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach, SystemState
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import node as node_rules
+from rosproxy.net.addresses import HostPort
 from tests.unit.doctor.cases import (
     ANSWERED,
     INSIDE_URI,
@@ -18,7 +19,7 @@ from tests.unit.doctor.cases import (
     talker,
     without_proxy,
 )
-from tests.unit.status_json import make_node, make_status
+from tests.unit.status_json import HOST, make_node, make_status
 
 REFUSED, UNRESOLVABLE = Attempt(Reach.REFUSED), Attempt(Reach.UNRESOLVABLE)
 
@@ -46,6 +47,14 @@ def test_sound_nodes_are_counted() -> None:
         (Severity.OK, "inside nodes", "1 of 1 answer"),
         (Severity.OK, "nodes at the master", "2 registered, none with faults"),
     ]
+
+
+def test_an_address_of_the_proxy_is_of_its_host_and_range() -> None:
+    facts = make_facts()
+    ports = [port for port in (44999, 45000, 45099, 45100) if facts.ours(HostPort(HOST, port))]
+    assert ports == [45000, 45099]
+    assert not facts.ours(HostPort("192.168.0.9", 45000))
+    assert not without_proxy().ours(HostPort(HOST, 45000))
 
 
 def test_nobody_uses_the_proxy() -> None:

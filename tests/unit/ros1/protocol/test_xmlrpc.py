@@ -248,6 +248,12 @@ def test_depth_is_bounded() -> None:
         xmlrpc.parse_call(nested(100_000))
 
 
+def test_only_the_name_in_a_member_is_a_member_s() -> None:
+    member = "<member><name>a</name><value>1</value></member>"
+    body = raw_call(f"<value><struct><name>b</name>{member}<name>c</name></struct></value>")
+    assert xmlrpc.parse_call(body).params[0].members == ["a"]
+
+
 def test_the_number_of_elements_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     body = raw_call("<value>x</value>", "<value>x</value>")  # two of param and value, and three
     monkeypatch.setattr(values, "MAX_ELEMENTS", 7)
