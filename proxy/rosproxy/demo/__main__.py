@@ -15,13 +15,11 @@ from rich.console import Console
 from rosproxy.demo.scenario import Scenario
 from rosproxy.demo.screen import print_summary, show
 
-SHORTEST = 4
 INTERRUPTED = 130
 
 
-async def perform(seconds: float, console: Console) -> Scenario | None:
-    """Play to the end, or to the first signal: None; no process is left in either case."""
-    scenario = Scenario(seconds)
+async def perform(scenario: Scenario, console: Console) -> bool:
+    """Play to the end, or to the first signal: False; no process is left in either case."""
     playing = asyncio.create_task(scenario.play())
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -30,28 +28,17 @@ async def perform(seconds: float, console: Console) -> Scenario | None:
     try:
         await playing
     except asyncio.CancelledError:
-        return None
+        return False
     finally:
         showing.cancel()
         await showing
-    return scenario
-
-
-def as_json(scenario: Scenario) -> str:
-    """The outcome as a JSON document."""
-    fields = {
-        "ok": scenario.ok,
-        "seconds": round(scenario.clock(), 3),
-        "checks": [asdict(check) for check in scenario.checks],
-        "log": [] if scenario.ok else [*scenario.proxy.log],
-    }
-    return json.dumps(fields, indent=2)
+    return True
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=SHORTEST, max=3600),
+    type=click.FloatRange(min=4, max=3600),
     default=15,
     show_default=True,
     help="How long the demo takes, about.",
@@ -65,16 +52,19 @@ def main(seconds: float, quiet: bool) -> None:
     """
     # The inside names resolve nowhere; a resolver that is slow to say so must not slow us down.
     os.environ["RES_OPTIONS"] = "timeout:1 attempts:1"
-    console = Console(quiet=quiet)
-    scenario = asyncio.run(perform(seconds, console))
-    if scenario is None:
+    console, scenario = Console(quiet=quiet), Scenario(seconds)
+    if not asyncio.run(perform(scenario, console)):
         click.echo("interrupted; all processes ended", err=True)
         sys.exit(INTERRUPTED)
+    log = [] if scenario.ok else [*scenario.proxy.log]
     if quiet:
-        click.echo(as_json(scenario))
+        checks = [asdict(check) for check in scenario.checks]
+        took = round(scenario.clock(), 3)
+        outcome = {"ok": scenario.ok, "seconds": took, "checks": checks, "log": log}
+        click.echo(json.dumps(outcome, indent=2))
     else:
         print_summary(scenario, console)
-        for line in () if scenario.ok else scenario.proxy.log:
+        for line in log:
             click.echo(f"rosproxy: {line}", err=True)
     sys.exit(0 if scenario.ok else 1)
 

@@ -14,17 +14,20 @@ import socket
 import struct
 import xmlrpc.client
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 from urllib.parse import urlsplit
 
 Where = tuple[str, int]
 """Host and port."""
+Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
 CALL_SECONDS = 20.0
 """How long a call may take in all."""
+PORTS = range(15000, 32000)
+"""Where `free_ports` looks: below the ephemeral range."""
 
 
 class End(Enum):
@@ -45,9 +48,9 @@ class FakeRequest:
 
     verb: str
     path: str
-    headers: dict[str, str] = field(default_factory=dict)
-    body: bytes = b""
-    source: str = ""
+    headers: dict[str, str]
+    body: bytes
+    source: str
 
     @property
     def call(self) -> tuple[str, tuple[Any, ...]]:
@@ -81,14 +84,9 @@ def where(uri: str) -> Where:
     return parts.hostname, parts.port
 
 
-def bracketed(host: str) -> str:
-    """A host as it stands in a URI."""
-    return f"[{host}]" if ":" in host else host
-
-
 def is_free(port: int, address: str = "") -> bool:
     """Whether a port could be bound; 0 asks whether there is such an address."""
-    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
+    with socket.socket() as probe:
         try:
             probe.bind((address, port))
         except OSError:
@@ -96,15 +94,11 @@ def is_free(port: int, address: str = "") -> bool:
     return True
 
 
-PORTS = range(15000, 32000)
-"""Where `free_ports` looks: below the ephemeral range."""
-
-
-def free_ports(count: int, address: str = "") -> int:
+def free_ports(count: int) -> int:
     """The first of `count` ports in a row among `PORTS` that nobody uses."""
     while True:
         first = random.randrange(PORTS.start, PORTS.stop - count)  # noqa: S311
-        if all(is_free(port, address) for port in range(first, first + count)):
+        if all(map(is_free, range(first, first + count))):
             return first
 
 
@@ -117,12 +111,11 @@ async def call(
     """
     target = where(address) if isinstance(address, str) else address
     body = xmlrpc.client.dumps(params, method).encode()
-    host = host or f"{bracketed(target[0])}:{target[1]}"
-    head = f"POST / HTTP/1.1\r\nHost: {host}\r\nContent-Length: {len(body)}\r\n\r\n"
+    head = f"POST / HTTP/1.1\r\nHost: {host or authority(target)}\r\n"
     async with asyncio.timeout(CALL_SECONDS):
         reader, writer = await connect(target, source)
         try:
-            writer.write(head.encode() + body)
+            writer.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
             answer = (await reader.readuntil(b"\r\n\r\n")).lower()
             size = int(answer.partition(b"content-length:")[2].split(b"\r\n")[0])
             return xmlrpc.client.loads(await reader.readexactly(size))[0][0]
@@ -130,9 +123,13 @@ async def call(
             writer.close()
 
 
-async def connect(
-    address: Where, source: str = ""
-) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+def authority(address: Where) -> str:
+    """A host and port as they stand in a URI."""
+    host, port = address
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+async def connect(address: Where, source: str = "") -> Streams:
     """Open a connection, from `source` if it is of the same family. Raises OSError."""
     local = (source, 0) if source and ":" not in address[0] else None
     return await asyncio.open_connection(*address, local_addr=local)

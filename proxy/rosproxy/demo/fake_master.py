@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import asyncio
 import xmlrpc.client
-from collections import deque
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Any
+from xmlrpc.client import Fault
 
-from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, bracketed, call, value
+from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, authority, call, value
 
 Triple = tuple[int, str, Any]
 Provider = tuple[str, str]
@@ -48,16 +50,15 @@ class FakeMaster:
         self.calls_back = True
         self.requests: list[FakeRequest] = []
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
-        self._outbox: dict[str, deque[tuple[Any, ...]]] = {}
+        self._in_order: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._callbacks: set[asyncio.Task[None]] = set()
-        self._methods = self._graph_methods() | self._other_methods()
+        self._methods = self._table()
         self.forget()
 
     @property
     def uri(self) -> str:
         """Its URI."""
-        host, port = self.http.address
-        return f"http://{bracketed(host)}:{port}"
+        return f"http://{authority(self.http.address)}"
 
     async def start(self, address: str = "") -> None:
         """Listen; on the same port as before, and on the same address unless another is given."""
@@ -68,7 +69,6 @@ class FakeMaster:
         for task in self._callbacks:
             task.cancel()
         await asyncio.gather(*self._callbacks, return_exceptions=True)
-        self._outbox.clear()
         await self.http.stop()
 
     async def restart(self) -> None:
@@ -109,31 +109,14 @@ class FakeMaster:
             for kind, table in self.tables.items():
                 for key, providers in [*table.items()]:
                     self._keep(kind, key, [one for one in providers if one[0] != caller])
-            self._notify(
-                former, "shutdown", f"[{caller}] Reason: new node registered with same name"
-            )
+            reason = f"[{caller}] Reason: new node registered with same name"
+            self._notify(former, "shutdown", reason)
 
     def _keep(self, kind: str, key: str, providers: list[Provider]) -> None:
         if providers:
             self.tables[kind][key] = providers
         else:
             del self.tables[kind][key]
-
-    def _unregister(self, kind: str, key: str, caller: str, api: str) -> Triple:
-        providers = self.tables[kind].get(key, [])
-        if caller not in self.nodes:
-            return 1, f"[{caller}] is not a registered node", 0
-        if (caller, api) not in providers:
-            return 1, f"[{caller}] is not a known provider of [{key}]", 0
-        self._keep(kind, key, [one for one in providers if one != (caller, api)])
-        if not any(
-            one[0] == caller
-            for table in self.tables.values()
-            for row in table.values()
-            for one in row
-        ):
-            del self.nodes[caller]
-        return 1, f"Unregistered [{caller}] as provider of [{key}]", 1
 
     # Calling nodes back
 
@@ -142,27 +125,22 @@ class FakeMaster:
 
         Where ``uri`` is none, nobody is called: a real master has refused it before.
         """
-        if not isinstance(uri, str):
-            return
-        waiting = self._outbox.setdefault(uri, deque())
-        waiting.append((method, "/master", *params))
-        if len(waiting) == 1:
-            task = asyncio.ensure_future(self._call_back(uri, waiting))
+        if isinstance(uri, str) and self.calls_back:
+            task = asyncio.ensure_future(self._call_back(uri, method, params))
             self._callbacks.add(task)
             task.add_done_callback(self._callbacks.discard)
 
-    async def _call_back(self, uri: str, waiting: deque[tuple[Any, ...]]) -> None:
-        while waiting:
+    async def _call_back(self, uri: str, method: str, params: tuple[Any, ...]) -> None:
+        async with self._in_order[uri]:
             with suppress(*CALL_ERRORS):
-                await call(uri, *waiting[0], source=self.http.address[0])
-            waiting.popleft()
+                await call(uri, method, "/master", *params, source=self.http.address[0])
 
     def _announce_publishers(self, topic: str) -> None:
         for uri in self.holds("subscribers", topic):
             self._notify(uri, "publisherUpdate", topic, self.holds("publishers", topic))
 
     def _announce_param(self, key: str, held: Any, but_not: str = "") -> None:
-        for caller, uri in self.tables["params"].get(key, []) if self.calls_back else ():
+        for caller, uri in self.tables["params"].get(key, []):
             if caller != but_not:
                 self._notify(uri, "paramUpdate", key, held)
 
@@ -178,55 +156,44 @@ class FakeMaster:
             if method == "system.multicall":
                 return value([self._element(item) for item in params[0]])
             return value(self._run(method, params))
-        except xmlrpc.client.Fault as fault:
-            return value(fault)
         except ODD_PARAMETERS as error:
-            return value(xmlrpc.client.Fault(1, repr(error)))
+            return value(Fault(1, repr(error)))
 
     def _element(self, item: dict[str, Any]) -> Any:
-        try:
-            return [self._run(item["methodName"], tuple(item["params"]))]
-        except xmlrpc.client.Fault as fault:
-            return {"faultCode": fault.faultCode, "faultString": fault.faultString}
+        result = self._run(item["methodName"], tuple(item["params"]))
+        return vars(result) if isinstance(result, Fault) else [result]
 
-    def _run(self, method: str, params: tuple[Any, ...]) -> Triple:
+    def _run(self, method: str, params: tuple[Any, ...]) -> Triple | Fault:
         self.calls.append((method, params))
         if method not in self._methods:
-            raise xmlrpc.client.Fault(1, f'method "{method}" is not supported')
+            return Fault(1, f'method "{method}" is not supported')
         try:
             return self._methods[method](*params)
         except ODD_PARAMETERS as error:
             return -1, repr(error), 0
 
-    def _graph_methods(self) -> dict[str, Callable[..., Triple]]:
-        def unregister(kind: str) -> Callable[[str, str, str], Triple]:
-            return lambda caller, key, api: self._unregister(kind, key, caller, api)
-
+    def _table(self) -> dict[str, Callable[..., Triple]]:
         return {
             "registerPublisher": self._register_publisher,
             "registerSubscriber": self._register_subscriber,
             "registerService": self._register_service,
-            "unregisterPublisher": self._unregister_publisher,
-            "unregisterSubscriber": unregister("subscribers"),
-            "unregisterService": unregister("services"),
+            "subscribeParam": self._subscribe_param,
+            "unregisterPublisher": partial(self._unregister, "publishers"),
+            "unregisterSubscriber": partial(self._unregister, "subscribers"),
+            "unregisterService": partial(self._unregister, "services"),
+            "unsubscribeParam": lambda caller, api, key: self._unregister(
+                "params", caller, key, api
+            ),
             "lookupNode": self._look_up_node,
             "lookupService": self._look_up_service,
             "getSystemState": self._system_state,
             "getTopicTypes": lambda _: (1, "topic types", [[*item] for item in self.types.items()]),
-        }
-
-    def _other_methods(self) -> dict[str, Callable[..., Triple]]:
-        return {
             "getPid": lambda _: (1, "", self.pid),
             "getUri": lambda _: (1, self.uri, f"{self.uri}/"),
             "setParam": self._set_param,
             "getParam": self._get_param,
             "deleteParam": self._delete_param,
             "getParamNames": lambda _: (1, "parameter names", sorted(self.params)),
-            "subscribeParam": self._subscribe_param,
-            "unsubscribeParam": lambda caller, api, key: self._unregister(
-                "params", key, caller, api
-            ),
         }
 
     def _register_publisher(self, caller: str, topic: str, kind: str, api: str) -> Triple:
@@ -234,11 +201,8 @@ class FakeMaster:
         if kind != "*" or topic not in self.types:  # a publisher decides on the type
             self.types[topic] = kind
         self._announce_publishers(topic)
-        return (
-            1,
-            f"Registered [{caller}] as publisher of [{topic}]",
-            self.holds("subscribers", topic),
-        )
+        said = f"Registered [{caller}] as publisher of [{topic}]"
+        return 1, said, self.holds("subscribers", topic)
 
     def _register_subscriber(self, caller: str, topic: str, kind: str, api: str) -> Triple:
         self.register("subscribers", topic, caller, api)
@@ -246,16 +210,28 @@ class FakeMaster:
             self.types.setdefault(topic, kind)
         return 1, f"Subscribed to [{topic}]", self.holds("publishers", topic)
 
-    def _unregister_publisher(self, caller: str, topic: str, api: str) -> Triple:
-        answer = self._unregister("publishers", topic, caller, api)
-        if answer[2]:
-            self._announce_publishers(topic)
-        return answer
-
     def _register_service(self, caller: str, service: str, service_api: str, api: str) -> Triple:
         self._admit(caller, api)
         self.tables["services"][service] = [(caller, service_api)]
         return 1, f"Registered [{caller}] as provider of [{service}]", 1
+
+    def _subscribe_param(self, caller: str, api: str, key: str) -> Triple:
+        self.register("params", key, caller, api)
+        return 1, f"Subscribed to parameter [{key}]", self.params.get(key, UNSET)
+
+    def _unregister(self, kind: str, caller: str, key: str, api: str) -> Triple:
+        providers = self.tables[kind].get(key, [])
+        if caller not in self.nodes:
+            return 1, f"[{caller}] is not a registered node", 0
+        if (caller, api) not in providers:
+            return 1, f"[{caller}] is not a known provider of [{key}]", 0
+        self._keep(kind, key, [one for one in providers if one != (caller, api)])
+        left = [row for table in self.tables.values() for row in table.values()]
+        if not any(one[0] == caller for row in left for one in row):
+            del self.nodes[caller]
+        if kind == "publishers":
+            self._announce_publishers(key)
+        return 1, f"Unregistered [{caller}] as provider of [{key}]", 1
 
     def _look_up_node(self, _caller: str, node: str) -> Triple:
         uri = self.nodes.get(node)
@@ -284,7 +260,3 @@ class FakeMaster:
         del self.params[key]
         self._announce_param(key, UNSET)
         return 1, f"parameter {key} deleted", 0
-
-    def _subscribe_param(self, caller: str, api: str, key: str) -> Triple:
-        self.register("params", key, caller, api)
-        return 1, f"Subscribed to parameter [{key}]", self.params.get(key, UNSET)

@@ -22,7 +22,7 @@ from rosproxy.demo.fake_http import (
     FakeRequest,
     FakeTcpServer,
     Where,
-    bracketed,
+    authority,
     call,
     value,
 )
@@ -73,12 +73,12 @@ class FakeNode:
     @property
     def uri(self) -> str:
         """What it calls itself."""
-        return f"http://{bracketed(self.host)}:{self.slave.address[1]}/"
+        return f"http://{authority((self.host, self.slave.address[1]))}/"
 
     @property
     def service_api(self) -> str:
         """Where it says its services are."""
-        return f"rosrpc://{bracketed(self.host)}:{self.tcpros_port}"
+        return f"rosrpc://{authority((self.host, self.tcpros_port))}"
 
     @property
     def tcpros_port(self) -> int:
@@ -88,20 +88,12 @@ class FakeNode:
     async def start(self) -> None:
         """Listen; the slave API on the same port as before if there was one."""
         await self.slave.start(self.address, self.slave.address[1])
-        await self.start_tcpros()
-
-    async def start_tcpros(self) -> None:
-        """Listen for TCPROS on another port than before."""
         await self.tcpros.start(self.address)
 
     async def stop(self) -> None:
         """End, without a word to anybody."""
-        await self.stop_tcpros()
-        await self.slave.stop()
-
-    async def stop_tcpros(self) -> None:
-        """Close the TCPROS server and all its connections."""
         await self.tcpros.stop()
+        await self.slave.stop()
 
     async def call(self, master: Where | str, method: str, *params: Any) -> Any:
         """Call its master, under its own name and from its own address."""
@@ -143,20 +135,18 @@ class FakeNode:
 
     def run(self, method: str, params: tuple[Any, ...]) -> list[Any]:
         """Answer a slave API call: the ROS triple."""
-        lists = {"getPublications": self.published, "getSubscriptions": self.subscribed}
-        if method in lists:
-            return [1, "topics", [list(item) for item in lists[method].items()]]
-        if method == "getPid":
-            return [1, "", self.pid]
-        if method == "requestTopic" and len(params) == 3 and isinstance(params[1], str):
-            return self._request_topic(params[1])
+        match method, params:
+            case (("getPublications" | "getSubscriptions"), _):
+                topics = self.published if method == "getPublications" else self.subscribed
+                return [1, "topics", [list(item) for item in topics.items()]]
+            case "getPid", _:
+                return [1, "", self.pid]
+            case "requestTopic", (_, str(topic), _):
+                if topic not in self.published:
+                    return [-1, f"Not a publisher of [{topic}]", []]
+                said = f"ready on {self.host}:{self.tcpros_port}"
+                return [1, said, ["TCPROS", self.host, self.tcpros_port]]
         return [1, "", 0]
-
-    def _request_topic(self, topic: str) -> list[Any]:
-        if topic not in self.published:
-            return [-1, f"Not a publisher of [{topic}]", []]
-        where = f"{self.host}:{self.tcpros_port}"
-        return [1, f"ready on {where}", ["TCPROS", self.host, self.tcpros_port]]
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         header = await read_header(reader)

@@ -10,12 +10,11 @@ from __future__ import annotations
 import asyncio
 import os
 import struct
-from collections.abc import Callable
 from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from rosproxy.demo.fake_http import Where, call, connect, where
+from rosproxy.demo.fake_http import Streams, Where, connect, where
 from rosproxy.demo.fake_master import CALL_ERRORS
 from rosproxy.demo.fake_node import STRING, FakeNode, Header, read_header
 from rosproxy.ros1.protocol.tcpros import encode_header
@@ -42,17 +41,7 @@ def in_words(problem: BaseException) -> str:
 
 
 class Player(FakeNode):
-    """A node that connects to others; `source_for` gives the address to leave from to a host."""
-
-    def __init__(
-        self,
-        name: str,
-        address: str,
-        host: str = "",
-        source_for: Callable[[str], str] | None = None,
-    ) -> None:
-        super().__init__(name, address, host)
-        self.source_for = source_for or (lambda _host: address)
+    """A node that connects to others."""
 
     async def register(self, master: str) -> None:
         """Register at the master; like every ROS node, as a publisher of /rosout."""
@@ -60,17 +49,14 @@ class Player(FakeNode):
 
     async def ask(self, uri: str, method: str, *params: Any) -> Any:
         """The value of a ROS call under this node's name. Raises Refused, and CALL_ERRORS."""
-        source = self.source_for(where(uri)[0])
-        code, message, held = await call(uri, method, self.name, *params, source=source)
+        code, message, held = await self.call(uri, method, *params)
         if code != 1:
             raise Refused(f"{method}: {message}")
         return held
 
-    async def greet(
-        self, address: Where, **fields: str
-    ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    async def greet(self, address: Where, **fields: str) -> Streams:
         """Open a TCPROS connection and exchange headers. Raises Refused, and CALL_ERRORS."""
-        reader, writer = await connect(address, self.source_for(address[0]))
+        reader, writer = await connect(address, self.address)
         try:
             writer.write(encode_header({"callerid": self.name, **fields}))
             answer = await read_header(reader)
@@ -98,7 +84,7 @@ class Player(FakeNode):
 class Talker(Player):
     """Publishes numbers from 1 on; `sent` are those that a subscriber was connected for."""
 
-    def __init__(self, *who: Any, topic: str) -> None:
+    def __init__(self, *who: str, topic: str) -> None:
         super().__init__(*who)
         self.topic = topic
         self.stream = self._admit
@@ -137,7 +123,7 @@ class Talker(Player):
 class Listener(Player):
     """Subscribes; `received` are the numbers with their times, `problem` why nothing comes."""
 
-    def __init__(self, *who: Any, topic: str) -> None:
+    def __init__(self, *who: str, topic: str) -> None:
         super().__init__(*who)
         self.topic = topic
         self.received: list[tuple[int, float]] = []
@@ -207,7 +193,7 @@ class Listener(Player):
 class Adder(Player):
     """Offers a service that adds two integers; `answered` counts the calls."""
 
-    def __init__(self, *who: Any, service: str) -> None:
+    def __init__(self, *who: str, service: str) -> None:
         super().__init__(*who)
         self.service = service
         self.stream = self._answer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, STDOUT, Process
 from collections import deque
@@ -30,30 +31,23 @@ def clean_environment(**more: str) -> dict[str, str]:
 
 
 class ProxyProcess:
-    """A proxy with the given options; leaving the context ends it.
+    """A proxy with the given `options`.
 
     `state` is one of "not started", "starting", "ready", "killed", "ended"; `log` holds its last
     lines.
     """
 
-    def __init__(self, options: Sequence[str]) -> None:
-        self.options = options
+    def __init__(self) -> None:
+        self.options: Sequence[str] = ()
         self.state = "not started"
         self.log: deque[str] = deque(maxlen=40)
         self._process: Process | None = None
         self._reader: asyncio.Task[None] | None = None
 
-    async def __aenter__(self) -> ProxyProcess:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.stop()
-
     async def start(self) -> float:
         """Start it and wait until it is ready; the seconds that took. Raises DemoError."""
         began = monotonic()
         self.state = "starting"
-        ready = asyncio.Event()
         # In a session of its own, so that Ctrl-C ends the demonstration and not the proxy.
         self._process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "rosproxy", "run", *self.options),
@@ -63,6 +57,7 @@ class ProxyProcess:
             start_new_session=True,
             env=clean_environment(PYTHONPATH=str(Path(__file__).parents[2])),
         )
+        ready = asyncio.Event()
         self._reader = asyncio.create_task(self._read(self._process, ready))
         with suppress(TimeoutError):
             await asyncio.wait_for(ready.wait(), START_SECONDS)
@@ -72,34 +67,30 @@ class ProxyProcess:
 
     async def kill(self) -> None:
         """End it with SIGKILL."""
-        if self._process is not None and self.state == "ready":
-            self._process.kill()
-            await self._wait("killed")
+        await self._end(signal.SIGKILL)
+        self.state = "killed"
 
     async def stop(self) -> None:
         """Ask it to end, and kill it if it doesn't."""
-        if self._process is None:
-            return
-        with suppress(ProcessLookupError):
-            self._process.terminate()
-        try:
-            await asyncio.wait_for(self._process.wait(), STOP_SECONDS)
-        except TimeoutError:
-            self._process.kill()
-        await self._wait("ended")
+        await self._end(signal.SIGTERM)
 
-    async def _wait(self, state: str) -> None:
-        if self._process is not None and self._reader is not None:
-            await self._process.wait()
+    async def _end(self, number: signal.Signals) -> None:
+        if self._process and self._reader:
+            with suppress(ProcessLookupError):
+                self._process.send_signal(number)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._process.wait(), STOP_SECONDS)
+                self._process.kill()
             await self._reader
-        self.state = state
 
     async def _read(self, process: Process, ready: asyncio.Event) -> None:
+        """Keep its log until it has ended."""
         if process.stdout is not None:
             async for line in process.stdout:
                 self.log.append(line.decode("utf-8", "replace").rstrip())
                 if " ready: " in self.log[-1]:
                     self.state = "ready"
                     ready.set()
+        await process.wait()
         self.state = "ended"
         ready.set()

@@ -2,16 +2,15 @@
 
 All of 127.0.0.0/8 is loopback on Linux, so each side gets a network of its own there without root:
 outside is 127.0.1.0/24, inside is 127.0.2.0/24. As with NAT, inside nodes turn away every
-connection from an outside address, announce host names that no resolver knows, and leave for
-outside from the host's address. The proxy, which lives on both sides, is a plain process without
-any restriction. A system that knows 127.0.0.1 alone (macOS) has both sides there, and only the
-names are left to separate them.
+connection from an outside address, and announce host names that no resolver knows. The proxy,
+which lives on both sides, is a plain process without any restriction. A system that knows
+127.0.0.1 alone (macOS) has both sides there, and only the names are left to separate them.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
@@ -20,7 +19,7 @@ from typing import Any
 
 from rosproxy.demo.fake_http import free_ports, is_free, where
 from rosproxy.demo.fake_master import CALL_ERRORS, FakeMaster
-from rosproxy.demo.players import Actor, Adder, Listener, Player, Talker, in_words
+from rosproxy.demo.players import Actor, Adder, Listener, Talker, in_words
 from rosproxy.demo.proxy_process import DemoError, ProxyProcess
 
 PATIENCE = 30.0
@@ -46,10 +45,6 @@ class Layout:
     inside_network: str = "127.0.2.0/24"
     outside_network: str = "127.0.1.0/24"
 
-    def source_from_inside(self, host: str, own: str) -> str:
-        """The address from which an inside node leaves for `host`."""
-        return own if ip_address(host) in ip_network(self.inside_network) else self.host
-
     def admits(self, peer: str) -> bool:
         """Whether inside nodes take connections from `peer`."""
         return not self.outside_network or (
@@ -63,9 +58,7 @@ NAMES_ONLY = Layout(LOOPBACK, LOOPBACK, LOOPBACK, (LOOPBACK,) * 3, f"{LOOPBACK}/
 
 def detect() -> Layout:
     """Choose the best layout that this system can do."""
-    wanted = Layout()
-    addresses = (wanted.host, wanted.robot, wanted.proxy_inside, *wanted.inside)
-    return wanted if all(is_free(0, address) for address in addresses) else NAMES_ONLY
+    return Layout() if is_free(0, Layout.proxy_inside) else NAMES_ONLY
 
 
 @dataclass(frozen=True)
@@ -86,32 +79,31 @@ class Scenario:
     checks: list[Check] = field(default_factory=list)
     events: list[tuple[float, str]] = field(default_factory=list)
     act: str = ""
+    seen: dict[str, str] = field(default_factory=dict)
     began: float = field(default_factory=monotonic)
 
     def __post_init__(self) -> None:
-        robot = self.layout.robot
+        robot, (first, second, third) = self.layout.robot, self.layout.inside
         self.master = FakeMaster(robot)
-        self.talker = Talker("/inside/talker", *self._inside(0), topic="/from_inside")
-        self.listener = Listener("/inside/listener", *self._inside(1), topic="/from_outside")
-        self.adder = Adder("/inside/adder", *self._inside(2), service="/inside/add")
+        self.talker = Talker("/inside/talker", first, "talker.inside", topic="/from_inside")
+        self.listener = Listener(
+            "/inside/listener", second, "listener.inside", topic="/from_outside"
+        )
+        self.adder = Adder("/inside/adder", third, "adder.inside", service="/inside/add")
         self.far_talker = Talker("/outside/talker", robot, topic="/from_outside")
         self.far_listener = Listener("/outside/listener", robot, topic="/from_inside")
         self.far_adder = Adder("/outside/adder", robot, service="/outside/add")
         self.inside: list[Actor] = [self.talker, self.listener, self.adder]
         self.outside: list[Actor] = [self.far_talker, self.far_listener, self.far_adder]
         self.nodes = [*self.inside, *self.outside]
-        for number, node in enumerate(self.nodes):
-            node.pid = 101 + number
+        for pid, node in enumerate(self.nodes, 101):
+            node.pid = pid
         for node in self.inside:
             node.slave.admits = node.tcpros.admits = self.layout.admits
-        self.proxy = ProxyProcess(())
-        self.seen: dict[str, str] = {}
+        self.proxy = ProxyProcess()
+        self.first_port = free_ports(LEASES + 2)
+        self.inside_master = f"http://{self.layout.proxy_inside}:{self.first_port}/"
         self._talking: dict[Talker, asyncio.Task[None]] = {}
-
-    def _inside(self, number: int) -> tuple[str, str, Callable[[str], str]]:
-        """Address and host of an inside node, and where it leaves from."""
-        own, name = self.layout.inside[number], ("talker", "listener", "adder")[number]
-        return own, f"{name}.inside", lambda host: self.layout.source_from_inside(host, own)
 
     @property
     def ok(self) -> bool:
@@ -133,25 +125,12 @@ class Scenario:
                 await self._play(ending)
             except (DemoError, *CALL_ERRORS) as problem:
                 detail = in_words(problem)
-                self.checks.append(Check("the demonstration runs to its end", False, detail))
+                self._check("the demonstration runs to its end", False, detail)
                 self.tell(f"stopped: {detail}")
             self.act = "done"
 
     async def _play(self, ending: AsyncExitStack) -> None:
-        self.act = "the master and the outside nodes start"
-        if not self.layout.outside_network:
-            self.tell("no 127.0.2.x addresses here: the sides are separated by host names alone")
-        await self.master.start()
-        ending.push_async_callback(self.master.stop)
-        self.tell(f"ROS master at {self.master.uri}, outside")
-        self.proxy = await ending.enter_async_context(ProxyProcess(self.proxy_options()))
-        for node in self.nodes:
-            await node.start()
-            ending.push_async_callback(node.stop)
-        ending.callback(self._fall_silent)
-        for node in self.outside:
-            await node.register(self.master.uri)
-        self._let_talk(self.far_talker)
+        await self._start_outside(ending)
         await self._try_without_proxy()
         await self._connect_through_proxy()
         await self._traffic_until(self.seconds * 0.5)
@@ -165,6 +144,22 @@ class Scenario:
         self._check("service calls cross both ways after the restart", *calls)
         await self._count(killed)
 
+    async def _start_outside(self, ending: AsyncExitStack) -> None:
+        self.act = "the master and the outside nodes start"
+        if not self.layout.outside_network:
+            self.tell("no 127.0.2.x addresses here: the sides are separated by host names alone")
+        await self.master.start()
+        ending.push_async_callback(self.master.stop)
+        self.tell(f"ROS master at {self.master.uri}, outside")
+        ending.push_async_callback(self.proxy.stop)
+        for node in self.nodes:
+            await node.start()
+            ending.push_async_callback(node.stop)
+        ending.callback(self._fall_silent)
+        for node in self.outside:
+            await node.register(self.master.uri)
+        self._let_talk(self.far_talker)
+
     async def _try_without_proxy(self) -> None:
         self.act = "without rosproxy: inside registers at the master"
         talker, listener = self.talker, self.far_listener
@@ -175,24 +170,19 @@ class Scenario:
         told = f"{talker.uri}: {listener.problem}"
         reached = bool(listener.received)
         if self.layout.outside_network:
-            address = talker.address, talker.slave.address[1]
-            reached |= await self._reaches(listener, address)
-            told += f"; {address[0]}:{address[1]}: {'reached' if reached else 'turned away'}"
+            address = f"{talker.address}:{talker.slave.address[1]}"
+            with suppress(*CALL_ERRORS):
+                await listener.ask(f"http://{address}/", "getPid")
+                reached = True
+            told += f"; {address}: {'reached' if reached else 'turned away'}"
         self.tell(f"without rosproxy: {told}")
         self._check("without the proxy nothing crosses", not reached, told)
         await talker.call(self.master.uri, "unregisterPublisher", talker.topic, talker.uri)
         self._talking.pop(talker).cancel()
 
-    async def _reaches(self, node: Player, address: tuple[str, int]) -> bool:
-        try:
-            await node.ask(f"http://{address[0]}:{address[1]}/", "getPid")
-        except CALL_ERRORS:
-            return False
-        return True
-
     def proxy_options(self) -> list[str]:
-        """The command line of the proxy, with ports that are free now."""
-        first = free_ports(LEASES + 2)
+        """The command line of the proxy."""
+        first = self.first_port
         return [
             f"--master-uri={self.master.uri}",
             f"--advertise-host={self.layout.host}",
@@ -205,9 +195,10 @@ class Scenario:
 
     async def _connect_through_proxy(self) -> None:
         self.act = "rosproxy and the inside nodes start"
+        self.proxy.options = self.proxy_options()
         self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
         for node in self.inside:
-            await node.register(self._inside_master())
+            await node.register(self.inside_master)
         self.seen = {node.name: f"{node.host}:{node.slave.address[1]}" for node in self.outside}
         self.seen |= await self._addresses_of_inside()
         self._let_talk(self.talker)
@@ -215,10 +206,6 @@ class Scenario:
         await self._until(lambda: all(one.received for one in listeners), "both sides hear")
         self.tell("both listeners hear the other side")
         await self._call_both_ways()
-
-    def _inside_master(self) -> str:
-        port = next(o for o in self.proxy.options if o.startswith("--master-port=")).split("=")[1]
-        return f"http://{self.layout.proxy_inside}:{port}/"
 
     async def _traffic_until(self, moment: float) -> None:
         self.act = "messages cross the boundary in both directions"
@@ -229,7 +216,7 @@ class Scenario:
         told = []
         for way, caller, master, service in (
             ("outside calls inside", self.far_listener, self.master.uri, self.adder.service),
-            ("inside calls outside", self.listener, self._inside_master(), self.far_adder.service),
+            ("inside calls outside", self.listener, self.inside_master, self.far_adder.service),
         ):
             try:
                 result = f"2 + 3 = {await caller.add(master, service, 2, 3)}"
@@ -259,15 +246,10 @@ class Scenario:
         heard = len(self.far_listener.received)
         self.act = "restart: same command, no state on disk"
         self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
-        ready = monotonic()
-        answered = asyncio.create_task(self._first_answer())
-        try:
-            received = self.far_listener.received
-            await self._until(lambda: len(received) > heard, "messages flow again")
-            await self._until(answered.done, "the service answers again")
-        finally:
-            answered.cancel()
-        took = received[heard][1] - ready, answered.result() - ready
+        ready, received = monotonic(), self.far_listener.received
+        await self._until(lambda: len(received) > heard, "messages flow again")
+        await self._until(self._service_answers, "the service answers again")
+        took = received[heard][1] - ready, monotonic() - ready
         detail = (
             f"first message {took[0]:.2f} s, first service call {took[1]:.2f} s after it was ready;"
             f" the whole outage took {max(took) + ready - killed:.2f} s"
@@ -277,18 +259,15 @@ class Scenario:
         self._check(promise, max(took) < RECOVERY_SECONDS, detail)
         return killed
 
-    async def _first_answer(self) -> float:
-        """Call the inside adder from outside until it answers; return when it did."""
-        while True:
-            try:
-                await self.far_listener.add(self.master.uri, self.adder.service, 20, 22)
-            except CALL_ERRORS:
-                await asyncio.sleep(0.02)
-            else:
-                return monotonic()
+    async def _service_answers(self) -> bool:
+        """Whether outside gets an answer of the inside adder."""
+        with suppress(*CALL_ERRORS):
+            await self.far_listener.add(self.master.uri, self.adder.service, 20, 22)
+            return True
+        return False
 
     def _check_addresses(self, before: dict[str, str], after: dict[str, str]) -> None:
-        told = [", ".join(f"{name} {at}" for name, at in one.items()) for one in (before, after)]
+        told = [", ".join(map(" ".join, one.items())) for one in (before, after)]
         same = before == after and "another" not in told[0]
         detail = told[0] if same else f"before the kill: {told[0]}; afterwards: {told[1]}"
         self._check("the same ports serve the same nodes", same, detail)
@@ -296,22 +275,17 @@ class Scenario:
     async def _count(self, killed: float) -> None:
         self.act = "the talkers stop; counting"
         self._fall_silent()
-        await self._arrivals(killed)
-        self._check(
-            "every message inside to outside arrived once",
-            *count(self.talker, self.far_listener, killed),
-        )
-        self._check(
-            "every message outside to inside arrived once",
-            *count(self.far_talker, self.listener, killed),
-        )
-
-    async def _arrivals(self, killed: float) -> None:
-        """Give what is on the way time to arrive, and what would arrive twice a moment to."""
-        pairs = (self.talker, self.far_listener), (self.far_talker, self.listener)
+        pairs = {
+            "inside to outside": (self.talker, self.far_listener),
+            "outside to inside": (self.far_talker, self.listener),
+        }
         with suppress(DemoError):  # the count tells what is missing
-            await self._until(lambda: all(count(*pair, killed)[0] for pair in pairs), "all arrive")
-        await asyncio.sleep(0.2)
+            await self._until(
+                lambda: all(count(*pair, killed)[0] for pair in pairs.values()), "all arrive"
+            )
+        await asyncio.sleep(0.2)  # in which what would arrive twice arrives
+        for way, pair in pairs.items():
+            self._check(f"every message {way} arrived once", *count(*pair, killed))
 
     def _check(self, promise: str, kept: bool, detail: str) -> None:
         self.checks.append(Check(promise, kept, detail))
@@ -324,9 +298,12 @@ class Scenario:
             task.cancel()
 
     async def _until(self, condition: Callable[[], Any], what: str) -> None:
-        """Wait until `condition` holds; raises DemoError after PATIENCE."""
+        """Wait until `condition`, maybe a coroutine function, holds; DemoError after PATIENCE."""
         end = monotonic() + PATIENCE
-        while not condition():
+        while True:
+            result = condition()
+            if await result if isinstance(result, Awaitable) else result:
+                return
             if monotonic() > end:
                 raise DemoError(f"{what}: not within {PATIENCE:g} s")
             await asyncio.sleep(0.01)
@@ -335,14 +312,10 @@ class Scenario:
 def count(talker: Talker, listener: Listener, killed: float) -> tuple[bool, str]:
     """Whether each message arrived once, but for those on the way as the proxy was killed."""
     received = [number for number, _ in listener.received]
-    missing = talker.sent.keys() - set(received)
-    cut_off = {
-        number
-        for number in missing
-        if -IN_FLIGHT_SECONDS <= talker.sent[number] - killed <= IN_FLIGHT_SECONDS
-    }
-    lost, twice = len(missing - cut_off), len(received) - len(set(received))
-    strange = len(set(received) - talker.sent.keys())
+    missing = talker.sent.keys() - {*received}
+    cut_off = {n for n in missing if abs(talker.sent[n] - killed) <= IN_FLIGHT_SECONDS}
+    lost, twice = len(missing - cut_off), len(received) - len({*received})
+    strange = {*received} - talker.sent.keys()
     told = f"sent {len(talker.sent)}, received {len(received)}"
     if cut_off:
         told += f", {len(cut_off)} on the way when the proxy was killed"

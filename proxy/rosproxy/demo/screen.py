@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from time import monotonic
 
 from rich.console import Console, Group
@@ -23,19 +23,18 @@ def state_of(node: Actor) -> str:
         return "stopped"
     if isinstance(node, Adder):
         return "1 call" if node.answered == 1 else f"{node.answered} calls"
+    if isinstance(node, Listener):
+        return "connected" if node.connected else node.problem or "no publisher"
+    unheard = node.number - len(node.sent)
+    state = "connected" if node.subscribers else "nobody listens"
+    return f"{state}, {unheard} unheard" if unheard else state
+
+
+def moments_of(node: Talker | Listener) -> list[float]:
+    """When a node sent or received its messages."""
     if isinstance(node, Talker):
-        unheard = node.number - len(node.sent)
-        state = "connected" if node.subscribers else "nobody listens"
-        return f"{state}, {unheard} unheard" if unheard else state
-    return "connected" if node.connected else node.problem or "no publisher"
-
-
-def rate_of(node: Actor) -> int:
-    """How many messages it sent or received in the last second."""
-    if isinstance(node, Adder):
-        return 0
-    moments = [*node.sent.values()] if isinstance(node, Talker) else [t for _, t in node.received]
-    return sum(moment > monotonic() - 1 for moment in moments[-100:])
+        return [*node.sent.values()]
+    return [moment for _, moment in node.received]
 
 
 def frame(scenario: Scenario) -> Group:
@@ -49,13 +48,14 @@ def frame(scenario: Scenario) -> Group:
     table.add_column("STATE", no_wrap=True)
     for node in scenario.nodes:
         _, side, name = node.name.split("/")
-        table.add_row(
-            *(side, name, f"{node.host}:{node.slave.address[1]}", scenario.seen.get(node.name)),
-            str(len(node.sent)) if isinstance(node, Talker) else "",
-            str(len(node.received)) if isinstance(node, Listener) else "",
-            "" if isinstance(node, Adder) else f"{rate_of(node)}/s",
-            Text(state_of(node)),
-        )
+        counts = ["", "", ""]
+        if not isinstance(node, Adder):
+            moments = moments_of(node)
+            counts[isinstance(node, Listener)] = str(len(moments))
+            counts[2] = f"{sum(moment > monotonic() - 1 for moment in moments[-100:])}/s"
+        address = f"{node.host}:{node.slave.address[1]}"
+        seen = scenario.seen.get(node.name)
+        table.add_row(side, name, address, seen, *counts, Text(state_of(node)))
     events = [Text(event_line(*event)) for event in scenario.events[-EVENTS_SHOWN:]]
     return Group(Text(title, style="bold"), "", table, "", *events)
 
@@ -67,36 +67,34 @@ def event_line(moment: float, text: str) -> str:
 
 def counts_line(scenario: Scenario) -> str:
     """Where the play is and what has been counted so far."""
-    counts = []
-    for node in scenario.nodes:
-        if not isinstance(node, Adder):
-            number = len(node.sent) if isinstance(node, Talker) else len(node.received)
-            counts.append(f"{node.name[1:].replace('/', ' ')}: {number} ({state_of(node)})")
+    counts = [
+        f"{node.name[1:].replace('/', ' ')}: {len(moments_of(node))} ({state_of(node)})"
+        for node in scenario.nodes
+        if not isinstance(node, Adder)
+    ]
     return event_line(scenario.clock(), f"[{scenario.act}] {'  '.join(counts)}")
 
 
 async def show(scenario: Scenario, console: Console) -> None:
     """Draw until cancelled, and once more then."""
-    if console.is_terminal:
-        with Live(frame(scenario), console=console, auto_refresh=False) as live:
-            with suppress(asyncio.CancelledError):
-                while True:
-                    live.update(frame(scenario), refresh=True)
-                    await asyncio.sleep(0.2)
-            live.update(frame(scenario), refresh=True)
-        return
+    live = Live(console=console, auto_refresh=False) if console.is_terminal else None
     shown = 0
-    with suppress(asyncio.CancelledError):
-        while True:
-            shown = _print_events(scenario, console, shown)
-            console.out(counts_line(scenario), highlight=False)
-            await asyncio.sleep(1.0)
-    _print_events(scenario, console, shown)
+    with live or nullcontext():
+        with suppress(asyncio.CancelledError):
+            while True:
+                shown = _draw(scenario, live or console, shown)
+                await asyncio.sleep(0.2 if live else 1.0)
+        _draw(scenario, live or console, shown)
 
 
-def _print_events(scenario: Scenario, console: Console, shown: int) -> int:
-    for event in scenario.events[shown:]:
-        console.out(event_line(*event), highlight=False)
+def _draw(scenario: Scenario, on: Live | Console, shown: int) -> int:
+    """Draw anew, or print the events since the first `shown` ones; how many there are by now."""
+    if isinstance(on, Live):
+        on.update(frame(scenario), refresh=True)
+    else:
+        for event in scenario.events[shown:]:
+            on.out(event_line(*event), highlight=False)
+        on.out(counts_line(scenario), highlight=False)
     return len(scenario.events)
 
 
@@ -104,9 +102,8 @@ def print_summary(scenario: Scenario, console: Console) -> None:
     """Print what was shown, and what did not work."""
     console.out("")
     for check in scenario.checks:
-        word, style = ("ok    ", "green") if check.kept else ("FAILED", "red")
-        console.print(
-            Text.assemble((word, style), f"  {check.promise}: {check.detail}"), soft_wrap=True
-        )
+        word = ("ok    ", "green") if check.kept else ("FAILED", "red")
+        text = Text.assemble(word, f"  {check.promise}: {check.detail}")
+        console.print(text, soft_wrap=True)
     kept = sum(check.kept for check in scenario.checks)
     console.out(f"\n{kept} of {len(scenario.checks)} promises kept")

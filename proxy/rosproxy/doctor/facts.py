@@ -1,20 +1,22 @@
 """What the doctor has gathered, before any judgement.
 
 `rosproxy.doctor.collect` fills in a `DoctorFacts`, and the rules read it. What could not be found
-out is None, empty or ``UNTRIED``: rules say nothing about it. `scope` finds out which nodes and
-which pairs of publisher and subscriber the names mean that the user asked for.
+out is None, empty or ``UNTRIED``: rules say nothing about it. What does not fit in the replies of
+the master and of nodes is dropped. `scope` finds out which nodes and which pairs of publisher and
+subscriber the names mean that the user asked for.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
+from typing import Any
 
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
-from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.registry.graph import read_types
 
 
 class Reach(Enum):
@@ -69,6 +71,31 @@ class SlaveReport:
     peers: frozenset[tuple[str, str, str]] = frozenset()
 
 
+def slave_report(publications: Any, subscriptions: Any, bus: Any) -> SlaveReport:
+    """The replies to ``getPublications``, ``getSubscriptions`` and ``getBusInfo``.
+
+    A row of the last is ``[id, peer, direction, transport, topic, connected, ...]``.
+    """
+    rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5 and row[5]]
+    return SlaveReport(
+        read_types(publications),
+        read_types(subscriptions),
+        frozenset((str(row[2]), str(row[4]), str(row[1])) for row in rows),
+    )
+
+
+def data_port(answer: Any) -> HostPort | None:
+    """The reply to ``requestTopic``: where to connect to, None if that is no TCPROS address."""
+    match answer:
+        case ["TCPROS", str(host), int(port)] if 0 < port < 65536:
+            return HostPort(host, port)
+    return None
+
+
+def _items(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
 @dataclass(frozen=True, slots=True)
 class NodeFacts:
     """A node that the master knows.
@@ -93,9 +120,9 @@ class NodeFacts:
 class SystemState:
     """The master's state: who publishes, subscribes to and provides what."""
 
-    publishers: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    subscribers: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    services: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    publishers: dict[str, list[str]] = field(default_factory=dict)
+    subscribers: dict[str, list[str]] = field(default_factory=dict)
+    services: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def topics(self) -> set[str]:
@@ -106,14 +133,22 @@ class SystemState:
         """The publishers and the subscribers of a topic."""
         return [*self.publishers.get(topic, ()), *self.subscribers.get(topic, ())]
 
-    def lonely(self, topic: str) -> bool:
-        """Whether a topic lacks publishers or subscribers."""
-        return not (self.publishers.get(topic) and self.subscribers.get(topic))
-
     def names(self) -> set[str]:
         """All nodes."""
         tables = (self.publishers, self.subscribers, self.services)
         return {name for table in tables for names in table.values() for name in names}
+
+
+def system_state(state: Any) -> SystemState:
+    """The reply to ``getSystemState``: publishers, subscribers, services."""
+    found = SystemState()
+    tables = (found.publishers, found.subscribers, found.services)
+    for table, rows in zip(tables, _items(state), strict=False):
+        for row in _items(rows):
+            match row:
+                case [str(name), list(nodes)]:
+                    table[name] = [str(node) for node in nodes]
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +185,12 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
         for subscriber in graph.subscribers.get(topic, ())
         if _asked_for({publisher, subscriber}, {*nodes})
     ]
-    lonely = [topic for topic in candidates if graph.lonely(topic)]
-    if not topics:
-        lonely = [topic for topic in lonely if {*nodes} & {*graph.sides(topic)}]
+    lonely = [
+        topic
+        for topic in candidates
+        if not (graph.publishers.get(topic) and graph.subscribers.get(topic))
+        and (topics or {*nodes} & {*graph.sides(topic)})
+    ]
     unknown = [name for name in names if name not in {*nodes, *topics, *services}]
     asked = {*nodes, *(node for name in services for node in graph.services[name])}
     sides = {node for _, *both in pairs for node in both}
@@ -194,32 +232,34 @@ class DoctorFacts:
     names: tuple[str, ...] = ()
     data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = field(default_factory=dict)
 
+    @property
+    def proxy(self) -> ProxyStatus:
+        """What the proxy said, and its defaults where it could not be asked."""
+        return self.status or ProxyStatus()
+
+    @property
+    def system(self) -> SystemState:
+        """What the master said, and an empty state where it did not say any."""
+        return self.graph or SystemState()
+
     @cached_property
     def scope(self) -> Scope:
         """What the names asked for lead to."""
-        return scope(self.graph or SystemState(), self.names)
+        return scope(self.system, self.names)
 
     @cached_property
     def leases(self) -> dict[int, EndpointStatus]:
         """The nodes of ``status`` by the port that outside sees."""
-        if self.status is None:
-            return {}
-        found = ((parse_slave_uri(n.advertised_uri), n) for n in self.status.nodes)
+        found = ((parse_slave_uri(n.advertised_uri), n) for n in self.proxy.nodes)
         return {where.port: node for where, node in found if where}
 
-    @cached_property
-    def advertised(self) -> PortRange | None:
-        """The range of ports that outside sees, if the proxy could be asked."""
-        if self.status is None:
-            return None
-        first, _, last = self.status.ports.advertise.partition("-")
-        return PortRange(int(first), int(last)) if first.isdecimal() and last.isdecimal() else None
+    def lease(self, where: HostPort | None) -> EndpointStatus | None:
+        """Who is behind an address from the master, if this proxy gave it."""
+        return self.leases.get(where.port) if where and self.ours(where) else None
 
     def ours(self, where: HostPort | None) -> bool:
         """Whether an address from the master is one that this proxy gives to inside nodes."""
-        return bool(
-            where
-            and self.advertised
-            and where.host == self.advertise_host
-            and where.port in self.advertised
-        )
+        first, _, last = self.proxy.ports.advertise.partition("-")
+        if where is None or not (first.isdecimal() and last.isdecimal()):
+            return False
+        return where.host == self.advertise_host and int(first) <= where.port <= int(last)

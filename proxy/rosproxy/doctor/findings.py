@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from enum import IntEnum
+from functools import partial
 from typing import Any
 
 from rosproxy.telemetry.text import clean, plural, wrap
@@ -32,6 +33,19 @@ class DoctorFinding:
     fix: str = ""
 
 
+ok = partial(DoctorFinding, Severity.OK)
+note = partial(DoctorFinding, Severity.INFO)
+warning = partial(DoctorFinding, Severity.WARNING)
+error = partial(DoctorFinding, Severity.ERROR)
+
+_WORDS = {
+    Severity.OK: "ok",
+    Severity.INFO: "note",
+    Severity.WARNING: "WARNING",
+    Severity.ERROR: "ERROR",
+}
+
+
 def failed(findings: Sequence[DoctorFinding]) -> bool:
     """Whether anything is wrong."""
     return any(finding.severity is Severity.ERROR for finding in findings)
@@ -58,31 +72,17 @@ def _grouped(findings: Sequence[DoctorFinding], columns: int) -> Iterator[str]:
         alike.setdefault((finding.check, finding.fix), []).append(finding)
     for (check, fix), group in alike.items():
         for finding in group[:MOST_ALIKE]:
-            yield from _block(finding, columns)
+            subject = f"{clean(finding.subject)}: " if finding.subject else ""
+            first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
+            yield from wrap(subject + clean(finding.text), columns, INDENT, first)
         if len(group) > MOST_ALIKE:
             yield f"{INDENT}... and {len(group) - MOST_ALIKE} more like this ({check}): see --json"
         yield from wrap(clean(fix), columns, f"{INDENT}  ", f"{INDENT}> ")
 
 
-def _block(finding: DoctorFinding, columns: int) -> list[str]:
-    subject = f"{clean(finding.subject)}: " if finding.subject else ""
-    first = f"{_WORDS[finding.severity]:<{len(INDENT)}}"
-    return wrap(subject + clean(finding.text), columns, INDENT, first)
-
-
-_WORDS = {
-    Severity.OK: "ok",
-    Severity.INFO: "note",
-    Severity.WARNING: "WARNING",
-    Severity.ERROR: "ERROR",
-}
-
-
 def _summary(findings: Sequence[DoctorFinding]) -> str:
-    errors, warnings = (
-        sum(f.severity is severity for f in findings)
-        for severity in (Severity.ERROR, Severity.WARNING)
-    )
+    severities = [finding.severity for finding in findings]
+    errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
     if not errors and not warnings:
         return "Nothing wrong was found."
     return f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."

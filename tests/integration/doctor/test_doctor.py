@@ -271,7 +271,7 @@ async def test_services(proxy: Proxy, node: FakeNode) -> None:
     (found,) = [f for f in await examine(proxy, "/add") if f.check == "pair"]
     assert found.severity is Severity.OK
     assert node.headers[-1]["probe"] == "1"
-    await node.stop_tcpros()
+    await node.tcpros.stop()
     found = next(f for f in await faults(proxy, "/add") if f.check == "pair")
     assert "connection refused" in found.text
 

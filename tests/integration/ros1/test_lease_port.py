@@ -126,7 +126,7 @@ async def test_a_client_that_leaves_inside_its_header_is_survived(proxy, node):
 async def test_a_service_on_a_port_of_its_own_is_found(proxy, make_node):
     node, other_port = await make_node(), FakeNode("/talker", NODE)
     await node.publish(proxy.master)
-    await other_port.start_tcpros()
+    await other_port.tcpros.start(other_port.address)
     try:
         uri = f"rosrpc://{NODE}:{other_port.tcpros_port}"
         await node.call(proxy.master, "registerService", "/add", uri, node.uri)
@@ -149,14 +149,14 @@ async def test_a_node_that_only_serves_is_reached_without_a_request_topic(proxy,
 async def test_a_tcpros_port_that_changed_is_asked_for_anew(proxy, node):
     await node.publish(proxy.master)
     await rpc(proxy.uri(node), "requestTopic", "/outside", "/chatter", [["TCPROS"]])
-    await node.stop_tcpros()
-    await node.start_tcpros()
+    await node.tcpros.stop()
+    await node.tcpros.start(node.address)
     assert (await greet(proxy.lease(node), topic_header()))["callerid"] == "/talker"
 
 
 async def test_a_node_without_tcpros_is_a_reset(proxy, node):
     await node.publish(proxy.master)
-    await node.stop_tcpros()
+    await node.tcpros.stop()
     async with connect(proxy.lease(node)) as wire:
         await wire.send(topic_header())
         assert await wire.end() == "reset"

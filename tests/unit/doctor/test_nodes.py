@@ -7,6 +7,7 @@ import pytest
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach, SystemState
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import node as node_rules
+from rosproxy.net.addresses import HostPort
 from tests.unit.doctor.cases import (
     ANSWERED,
     INSIDE_URI,
@@ -18,9 +19,9 @@ from tests.unit.doctor.cases import (
     talker,
     without_proxy,
 )
-from tests.unit.status_json import make_node, make_status
+from tests.unit.status_json import HOST, make_node, make_status
 
-REFUSED = Attempt(Reach.REFUSED)
+REFUSED, UNRESOLVABLE = Attempt(Reach.REFUSED), Attempt(Reach.UNRESOLVABLE)
 
 
 def check(facts: DoctorFacts) -> list[DoctorFinding]:
@@ -48,6 +49,14 @@ def test_sound_nodes_are_counted() -> None:
     ]
 
 
+def test_an_address_of_the_proxy_is_of_its_host_and_range() -> None:
+    facts = make_facts()
+    ports = [port for port in (44999, 45000, 45099, 45100) if facts.ours(HostPort(HOST, port))]
+    assert ports == [45000, 45099]
+    assert not facts.ours(HostPort("192.168.0.9", 45000))
+    assert not without_proxy().ours(HostPort(HOST, 45000))
+
+
 def test_nobody_uses_the_proxy() -> None:
     found = only(check(make_facts(status=make_status(), nodes={})))
     assert (found.severity, found.text) == (
@@ -57,18 +66,13 @@ def test_nobody_uses_the_proxy() -> None:
     assert "ROS_MASTER_URI=http://PROXY:11311" in found.fix
 
 
-def test_a_node_that_listens_on_loopback_only() -> None:
-    found = inside(uri="http://127.0.0.1:40001/", state="refused")
+@pytest.mark.parametrize(("host", "state"), [("127.0.0.1", "refused"), ("localhost", "ok")])
+def test_a_node_that_listens_on_loopback_only(host: str, state: str) -> None:
+    """A roscpp node answers probes all the same: only its TCPROS server is on loopback."""
+    found = inside(uri=f"http://{host}:40001/", state=state)
     assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
     assert "listens on loopback only" in found.text
     assert found.fix.startswith("where it runs: unset ROS_IP ROS_HOSTNAME, or ROS_IP=10.0.0.5;")
-
-
-def test_a_roscpp_node_on_loopback_answers_probes_and_is_a_fault_all_the_same() -> None:
-    """Its slave API listens everywhere, its TCPROS server on loopback only."""
-    found = inside(uri="http://localhost:40001/", state="ok")
-    assert (found.severity, found.subject) == (Severity.ERROR, "/talker")
-    assert "listens on loopback only" in found.text
 
 
 def test_a_node_on_the_proxys_own_machine_may_give_loopback() -> None:
@@ -127,43 +131,63 @@ def test_nodes_that_share_a_lease_are_sound() -> None:
     assert not faults(make_facts(status=status, nodes=nodes))
 
 
-def test_a_node_that_is_gone() -> None:
-    found = outside(attempt=REFUSED)
-    assert (found.check, found.text) == (
-        "stale registration",
-        "registered as http://192.168.0.9:35001/, but gone: connection refused",
-    )
-    assert found.fix == "rosnode cleanup (answer y)"
-
-
-def test_a_port_that_somebody_else_has_by_now() -> None:
-    found = outside(attempt=Attempt(Reach.STRANGER, "HTTP status 404"))
-    assert "but gone: something else answers (HTTP status 404)" in found.text
-
-
-def test_a_node_that_is_cut_off() -> None:
-    found = outside(attempt=Attempt(Reach.SILENT))
-    assert "no answer at http://192.168.0.9:35001/" in found.text
-    assert "nc -vz 192.168.0.9 35001" in found.fix
-
-
-def test_a_host_name_that_is_unknown_here() -> None:
-    found = outside(uri="http://laptop:4000/", attempt=Attempt(Reach.UNRESOLVABLE))
-    assert "the host name laptop can't be resolved here" in found.text
-    assert "ROS_IP=ADDRESS" in found.fix
-    assert "docker run --add-host laptop:ADDRESS" in found.fix
-
-
-def test_a_container_that_uses_the_real_master() -> None:
-    found = outside(uri="http://3f2a9c1b7d10:4000/", attempt=Attempt(Reach.UNRESOLVABLE))
-    assert "looks like a container that uses the real master, past the proxy" in found.text
-    assert "ROS_MASTER_URI=http://PROXY:11311" in found.fix
-
-
-def test_a_node_in_an_inside_network_that_has_registered_past_the_proxy() -> None:
-    found = outside(uri="http://10.0.0.7:4000/", addresses=("10.0.0.7",))
-    assert found.severity is Severity.WARNING
-    assert "registered past it" in found.text
+@pytest.mark.parametrize(
+    ("changes", "severity", "text", "fix"),
+    [
+        (
+            {"attempt": REFUSED},
+            Severity.ERROR,
+            "registered as http://192.168.0.9:35001/, but gone: connection refused",
+            "rosnode cleanup (answer y)",
+        ),
+        (
+            {"attempt": Attempt(Reach.STRANGER, "HTTP status 404")},
+            Severity.ERROR,
+            "but gone: something else answers (HTTP status 404)",
+            "rosnode cleanup (answer y)",
+        ),
+        (
+            {"attempt": Attempt(Reach.SILENT)},
+            Severity.ERROR,
+            "no answer at http://192.168.0.9:35001/",
+            "nc -vz 192.168.0.9 35001",
+        ),
+        (
+            {"uri": "http://laptop:4000/", "attempt": UNRESOLVABLE},
+            Severity.ERROR,
+            "the host name laptop can't be resolved here",
+            "ROS_IP=ADDRESS, then restart it; or make laptop known to proxy and inside nodes: "
+            "docker run --add-host laptop:ADDRESS",
+        ),
+        (
+            {"uri": "http://3f2a9c1b7d10:4000/", "attempt": UNRESOLVABLE},
+            Severity.ERROR,
+            "looks like a container that uses the real master, past the proxy",
+            "ROS_MASTER_URI=http://PROXY:11311",
+        ),
+        (
+            {"uri": "http://10.0.0.7:4000/", "addresses": ("10.0.0.7",)},
+            Severity.WARNING,
+            "registered past it",
+            "ROS_MASTER_URI=http://PROXY:11311",
+        ),
+        (
+            {"uri": "http://robot-host:47000/10.0.0.5:40001/", "attempt": REFUSED},
+            Severity.ERROR,
+            "registered through a rosproxy",
+            "if this proxy had robot-host:47000 before",
+        ),
+        ({"uri": ""}, Severity.ERROR, "no usable address for it: ''", "restart it"),
+    ],
+)
+def test_an_outside_node_that_cannot_be_reached(
+    changes: dict[str, Any], severity: Severity, text: str, fix: str
+) -> None:
+    found = outside(**changes)
+    assert (found.severity, found.subject) == (severity, "/listener")
+    assert (found.check == "stale registration") is ("but gone" in text)
+    assert text in found.text
+    assert fix in found.fix
 
 
 def test_no_such_suspicion_where_the_master_is_in_that_network_too() -> None:
@@ -182,16 +206,6 @@ def test_an_outside_node_that_calls_itself_loopback(host: str) -> None:
 def test_loopback_is_fine_where_all_is_on_one_machine() -> None:
     nodes = by_name(listener(uri="http://localhost:4000/"))
     assert not faults(make_facts(nodes=nodes, master=make_master(addresses=("127.0.0.1",))))
-
-
-def test_an_address_that_is_none() -> None:
-    assert "no usable address for it: ''" in outside(uri="").text
-
-
-def test_a_node_left_from_other_settings_of_the_proxy() -> None:
-    found = outside(uri="http://robot-host:47000/10.0.0.5:40001/", attempt=REFUSED)
-    assert "registered through a rosproxy" in found.text
-    assert "if this proxy had robot-host:47000 before" in found.fix
 
 
 def test_cleaning_up_is_no_advice_while_the_proxy_is_down() -> None:
@@ -224,7 +238,7 @@ def test_names_leave_out_what_is_said_of_others() -> None:
 
 
 def test_a_proxy_whose_advertised_name_is_unknown_here() -> None:
-    nodes = by_name(talker(attempt=Attempt(Reach.UNRESOLVABLE)))
+    nodes = by_name(talker(attempt=UNRESOLVABLE))
     assert "--advertise-host ADDRESS" in only(check(without_proxy(nodes=nodes))).fix
 
 

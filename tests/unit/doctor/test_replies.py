@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.doctor.facts import SlaveReport, SystemState
-from rosproxy.doctor.replies import data_port, slave_report, system_state
+from rosproxy.doctor.facts import SlaveReport, SystemState, data_port, slave_report, system_state
 from rosproxy.net.addresses import HostPort
 
 

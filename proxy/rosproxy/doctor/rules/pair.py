@@ -1,10 +1,10 @@
 """The names asked for: which publisher and subscriber are not connected, and why."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from difflib import get_close_matches
 
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach
-from rosproxy.doctor.findings import DoctorFinding, Severity
+from rosproxy.doctor.findings import DoctorFinding, error, note, ok
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, size
@@ -14,14 +14,12 @@ PAIR, ANY = "pair", "*"
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about the names asked for."""
-    if facts.names and facts.graph is None:
+    if not facts.names:
+        return
+    if facts.graph is None:
         text = "nothing can be said: the master does not answer"
-        yield DoctorFinding(Severity.INFO, PAIR, ", ".join(facts.names), text)
-    elif facts.names:
-        yield from _named(facts)
-
-
-def _named(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+        yield note(PAIR, ", ".join(facts.names), text)
+        return
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
     yield from (_lonely(facts, topic) for topic in scope.lonely)
@@ -29,49 +27,41 @@ def _named(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     yield from (_service(facts, service) for service in scope.services)
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
     if scope.named and len(together) > 1 and not scope.pairs:
-        yield _nothing_common(together)
+        text = "none publishes what another of them subscribes to"
+        fix = f"compare: rosnode info {' '.join(together)}; look for namespaces and remappings"
+        yield error(PAIR, " and ".join(together), text, fix)
 
 
 def _unknown(facts: DoctorFacts, name: str) -> DoctorFinding:
-    graph = facts.graph
-    known = sorted(graph.names() | graph.topics | {*graph.services}) if graph else []
+    graph = facts.system
+    known = sorted(graph.names() | graph.topics | {*graph.services})
     alike = get_close_matches(name, known, 3, 0.7)
     alike += [other for other in known if other.endswith(name) and other not in alike][:3]
     hint = f"; there is {listed(alike)}" if alike else ""
     text = f"the master knows no node, topic or service of this name{hint}"
     fix = "rosnode list; rostopic list; look for a namespace or a remapping too many"
-    return DoctorFinding(Severity.ERROR, PAIR, name, text, fix)
+    return error(PAIR, name, text, fix)
 
 
 def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
-    graph = facts.graph
-    publishers = graph.publishers.get(topic, ()) if graph else ()
-    sides = graph.sides(topic) if graph else ()
-    who, lacks = ("published", "subscribes to") if publishers else ("subscribed to", "publishes")
-    text = f"{who} by {listed(sides)}; nobody {lacks} it"
-    others = sorted(graph.topics - {topic}) if graph else []
+    graph = facts.system
+    published = bool(graph.publishers.get(topic))
+    who, lacks = ("published", "subscribes to") if published else ("subscribed to", "publishes")
+    text = f"{who} by {listed(graph.sides(topic))}; nobody {lacks} it"
+    others = sorted(graph.topics - {topic})
     alike = [o for o in others if o.rpartition("/")[2] == topic.rpartition("/")[2]]
     fix = f"there is also {listed(alike)}: a namespace or remapping? " if alike else ""
     fix += f"rostopic info {topic}; after a restart of roscore, restart the nodes outside"
-    severity = Severity.ERROR if topic in facts.names else Severity.INFO
-    return DoctorFinding(severity, PAIR, topic, text, fix)
-
-
-def _nothing_common(names: Sequence[str]) -> DoctorFinding:
-    text = "none publishes what another of them subscribes to"
-    fix = f"compare: rosnode info {' '.join(names)}; look for namespaces and remappings"
-    return DoctorFinding(Severity.ERROR, PAIR, " and ".join(names), text, fix)
+    return (error if topic in facts.names else note)(PAIR, topic, text, fix)
 
 
 def _pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
     giver, taker = facts.nodes[publisher], facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
     if connected(topic, giver, taker):
-        return DoctorFinding(
-            Severity.OK, PAIR, label, "connected" + _traffic(facts, topic, giver, taker)
-        )
+        return ok(PAIR, label, "connected" + _traffic(facts, topic, giver, taker))
     text, fix = _why(facts, topic, giver, taker)
-    return DoctorFinding(Severity.ERROR, PAIR, label, f"not connected: {text}", fix)
+    return error(PAIR, label, f"not connected: {text}", fix)
 
 
 def connected(topic: str, giver: NodeFacts, taker: NodeFacts) -> bool:
@@ -86,18 +76,18 @@ def connected(topic: str, giver: NodeFacts, taker: NodeFacts) -> bool:
 
 
 def _traffic(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> str:
-    lease = facts.leases.get(giver.where.port) if giver.where and facts.ours(giver.where) else None
+    lease = facts.lease(giver.where)
     for connection in lease.connections if lease else ():
         if (connection.name, connection.caller_id) == (topic, taker.name):
-            rate = f"{size(connection.sent_rate)}/s just now"
-            return f", {size(connection.sent)} so far, {rate}"
+            sent, rate = size(connection.sent), size(connection.sent_rate)
+            return f", {sent} so far, {rate}/s just now"
     return ""
 
 
 def _why(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> tuple[str, str]:
     """Why a pair is not connected, the most certain reason first, and what mends it."""
     for node in (giver, taker):
-        if unreachable(facts, node):
+        if _unreachable(facts, node):
             return f"{node.name} can't be reached from here", "see what is said of it"
     offered = giver.report.publishes.get(topic) if giver.report else ANY
     wanted = taker.report.subscribes.get(topic) if taker.report else ANY
@@ -110,12 +100,11 @@ def _why(facts: DoctorFacts, topic: str, giver: NodeFacts, taker: NodeFacts) -> 
     return _why_no_transport(facts, topic, giver, taker)
 
 
-def unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
-    """Whether a node can't be reached, as far as is known."""
-    if facts.ours(node.where) and node.where:
-        lease = facts.leases.get(node.where.port)
+def _unreachable(facts: DoctorFacts, node: NodeFacts) -> bool:
+    if facts.ours(node.where):
+        lease = facts.lease(node.where)
         return lease is None or lease.state not in ("ok", "new")
-    return node.attempt.failed or (node.where is None)
+    return node.attempt.failed or node.where is None
 
 
 def _why_no_transport(
@@ -144,12 +133,11 @@ def _why_no_transport(
 
 def _service(facts: DoctorFacts, service: str) -> DoctorFinding:
     uri, attempt = facts.service_uris.get(service, ""), facts.services.get(service, Attempt())
-    providers = listed(facts.graph.services.get(service, ())) if facts.graph else ""
-    if not attempt.failed:
-        text = f"{providers} provides it at {uri}: {attempt.reach.value}"
-        return DoctorFinding(Severity.OK, PAIR, service, text)
+    providers = listed(facts.system.services.get(service, ()))
     text = f"{providers} provides it at {uri}: {attempt.reach.value}"
+    if not attempt.failed:
+        return ok(PAIR, service, text)
     fix = f"restart {providers}; if it is gone: rosnode cleanup"
     if attempt.reach is Reach.UNRESOLVABLE:
         fix = f"where {providers} runs: ROS_IP=ADDRESS, then restart it"
-    return DoctorFinding(Severity.ERROR, PAIR, service, text, fix)
+    return error(PAIR, service, text, fix)

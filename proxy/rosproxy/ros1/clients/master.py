@@ -180,7 +180,7 @@ def _value(method: str, reply: Any) -> Any:
 
 
 def _result_of(result: Any) -> Any:
-    triple = result[0] if isinstance(result, list) and len(result) == 1 else None
-    if not isinstance(triple, list) or len(triple) != 3 or triple[0] != 1:
-        return None
-    return triple[2]
+    match result:
+        case [[1, _, value]]:
+            return value
+    return None

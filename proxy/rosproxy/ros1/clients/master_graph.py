@@ -3,9 +3,11 @@
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 
+import msgspec
+
 from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError
 from rosproxy.ros1.registry.endpoint import Registration
-from rosproxy.ros1.registry.graph import Graph, GraphError, read_state
+from rosproxy.ros1.registry.graph import Graph, read_state
 
 
 async def read_registrations(upstream: MasterClient) -> dict[str, list[Registration]]:
@@ -15,8 +17,8 @@ async def read_registrations(upstream: MasterClient) -> dict[str, list[Registrat
     )
     try:
         return read_state(state, types)
-    except GraphError as error:
-        raise MasterError(str(error)) from None
+    except msgspec.ValidationError as error:
+        raise MasterError(f"getSystemState: {error}") from None
 
 
 async def read_graph(upstream: MasterClient) -> Graph:

@@ -60,37 +60,11 @@ MASTER_METHODS: dict[str, Row] = {
 
 NO_ROW = Row()
 
-_SLAVE_METHODS = frozenset(
-    {
-        "getBusInfo",
-        "getBusStats",
-        "getMasterUri",
-        "getName",
-        "getPid",
-        "getPublications",
-        "getSubscriptions",
-        "getUri",
-        "paramUpdate",
-        "publisherUpdate",
-        "requestTopic",
-        "shutdown",
-    }
-)
-_OTHER_MASTER_METHODS = frozenset(
-    {
-        "deleteParam",
-        "getParam",
-        "getParamNames",
-        "getPublishedTopics",
-        "getSystemState",
-        "getTopicTypes",
-        "hasParam",
-        "searchParam",
-        "setParam",
-        "system.multicall",
-    }
-)
-KNOWN_METHODS = _SLAVE_METHODS | _OTHER_MASTER_METHODS | frozenset(MASTER_METHODS)
+_PARAMETERS = {"deleteParam", "getParam", "getParamNames", "hasParam", "searchParam", "setParam"}
+_GRAPH = {"getPublishedTopics", "getSystemState", "getTopicTypes", "system.multicall"}
+_NODES = {"getBusInfo", "getBusStats", "getMasterUri", "getName", "getPid", "shutdown"}
+_TOPICS = {"getPublications", "getSubscriptions", "publisherUpdate", "requestTopic", "paramUpdate"}
+KNOWN_METHODS = frozenset(MASTER_METHODS).union(_PARAMETERS, _GRAPH, _NODES, _TOPICS)
 """The methods of both APIs, those of slaves as well."""
 
 

@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 
+_Table = list[tuple[str, list[str]]]
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
-
-
-class GraphError(ValueError):
-    """An answer of the master that does not have the form that it should have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +61,11 @@ def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:
     """What each node has registered, from the values of getSystemState and getTopicTypes.
 
     ``state`` is ``[publishers, subscribers, services]``, each ``[[name, [node, …]], …]``, and
-    ``types`` is ``[[topic, type], …]``. Raises GraphError if ``state`` is not of that form.
+    ``types`` is ``[[topic, type], …]``. Raises msgspec.ValidationError if ``state`` is not.
     """
-    if not _is_state(state):
-        raise GraphError("getSystemState: not of the form [[[name, [node, ...]], ...], ...]")
-    known = read_types(types)
+    tables, known = msgspec.convert(state, tuple[_Table, _Table, _Table]), read_types(types)
     found: dict[str, list[Registration]] = {}
-    for kind, entries in zip(_STATE_KINDS, state, strict=True):
+    for kind, entries in zip(_STATE_KINDS, tables, strict=True):
         for name, nodes in entries:
             for node in nodes:
                 held = Registration(kind, name, node, known.get(name, "*"))
@@ -84,16 +81,3 @@ def read_types(rows: Any) -> dict[str, str]:
             case [str(name), str(type_)]:
                 held[name] = type_
     return held
-
-
-def _is_state(state: Any) -> bool:
-    if not (isinstance(state, list) and len(state) == 3):
-        return False
-    return all(isinstance(entries, list) and all(map(_is_entry, entries)) for entries in state)
-
-
-def _is_entry(entry: Any) -> bool:
-    match entry:
-        case [str(), list(nodes)]:
-            return all(isinstance(node, str) for node in nodes)
-    return False

@@ -24,13 +24,12 @@ class Registry:
         self.pool = PortPool(ports)
         self.by_port: dict[int, Endpoint] = {}
         self._by_key: dict[tuple[str, int], Endpoint] = {}
-        self._by_uri: dict[str, list[Endpoint]] = {}
+        self._by_uri: dict[str, dict[int, Endpoint]] = {}
         self._by_caller: dict[str, Endpoint] = {}
         self._services: dict[str, tuple[Endpoint, Registration]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[tuple[str, int], int] = {}
         self._former: dict[int, Endpoint] = {}
-        self._former_uris: dict[str, dict[int, Endpoint]] = {}
 
     def __iter__(self) -> Iterator[Endpoint]:
         """All endpoints; safe against changes while iterating."""
@@ -50,11 +49,17 @@ class Registry:
         One that is there already takes on what came from the node's own address: nobody can rename
         somebody else's. Raises RangeExhausted if it needs a port and none can be had.
         """
-        endpoint = self._by_key.get((place.address, node.port))
+        key = place.address, node.port
+        endpoint = self._by_key.get(key)
         if endpoint is None:
-            endpoint = self._add(uri, node, place, self._port_for(place, node))
+            port = self.pool.take(prefer=self._last_port.get(key))
+            if port is None:
+                raise self.exhausted()
+            endpoint = self._add(uri, node, place, port)
         elif place.confirmed or not endpoint.place.confirmed:
-            self._rename(endpoint, uri, node, place)
+            self._forget_uri(endpoint)
+            endpoint.uri, endpoint.node, endpoint.place = uri, node, place
+            self._by_uri.setdefault(uri, {})[endpoint.port] = endpoint
         self._admit(endpoint, uri, source)
         return endpoint
 
@@ -72,11 +77,9 @@ class Registry:
         for key in list(endpoint.registrations):
             self._drop(endpoint, key)
         del self.by_port[endpoint.port], self._by_key[endpoint.key]
-        self._forget_uri(endpoint)
         for admission in endpoint.admissions:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
-        self._former_uris.setdefault(endpoint.uri, {})[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
 
     def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
@@ -125,7 +128,10 @@ class Registry:
         if other and other is not endpoint:
             self.drop_caller(other, held.caller_id)
         if held.kind is Kind.SERVICE:
-            self._replace_service(endpoint, held)
+            before = self._services.get(held.name)
+            if before and before[1].key != held.key:
+                self._drop(before[0], before[1].key)
+            self._services[held.name] = (endpoint, held)
         if held.key not in endpoint.registrations:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.registrations[held.key] = held
@@ -149,8 +155,8 @@ class Registry:
         Those removed come last, until somebody else has their port: a node that was handed their
         URI may still send it back.
         """
-        former = self._former_uris.get(uri)
-        return self._by_uri.get(uri, []) + (list(former.values()) if former else [])
+        same = self._by_uri.get(uri, {}).values()
+        return sorted(same, key=lambda endpoint: endpoint.port in self._former)
 
     def at(self, address: str, port: int) -> Endpoint | None:
         """The endpoint of the slave API at an address and port."""
@@ -200,17 +206,11 @@ class Registry:
             del self._admitted[uri, address]
         return [*uris, endpoint.uri]
 
-    def _port_for(self, place: Place, node: HostPort) -> int:
-        port = self.pool.take(prefer=self._last_port.get((place.address, node.port)))
-        if port is None:
-            raise self.exhausted()
-        return port
-
     def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port)
         self.by_port[port] = self._by_key[endpoint.key] = endpoint
         self._remember(endpoint)
-        self._by_uri.setdefault(uri, []).append(endpoint)
+        self._by_uri.setdefault(uri, {})[port] = endpoint
         return endpoint
 
     def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
@@ -223,33 +223,17 @@ class Registry:
         """Note who has a port now, in place of who had it last."""
         former = self._former.pop(endpoint.port, None)
         if former is not None:
-            self._forget_former(former)
+            self._forget_uri(former)
         former = former or endpoint
         if self._last_port.get(former.key) == endpoint.port:
             del self._last_port[former.key]
         self._last_port[endpoint.key] = endpoint.port
 
-    def _forget_former(self, former: Endpoint) -> None:
-        same = self._former_uris[former.uri]
-        del same[former.port]
-        if not same:
-            del self._former_uris[former.uri]
-
-    def _rename(self, endpoint: Endpoint, uri: str, node: HostPort, place: Place) -> None:
-        self._forget_uri(endpoint)
-        endpoint.uri, endpoint.node, endpoint.place = uri, node, place
-        self._by_uri.setdefault(uri, []).append(endpoint)
-
     def _forget_uri(self, endpoint: Endpoint) -> None:
-        same = [other for other in self._by_uri.pop(endpoint.uri) if other is not endpoint]
-        if same:
-            self._by_uri[endpoint.uri] = same
-
-    def _replace_service(self, endpoint: Endpoint, held: Registration) -> None:
-        before = self._services.get(held.name)
-        if before and before[1].key != held.key:
-            self._drop(before[0], before[1].key)
-        self._services[held.name] = (endpoint, held)
+        same = self._by_uri[endpoint.uri]
+        del same[endpoint.port]
+        if not same:
+            del self._by_uri[endpoint.uri]
 
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         if endpoint.registrations.pop(key, None) is None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortMap
-from rosproxy.net.addresses import HostPort, Network, as_ip
+from rosproxy.net.addresses import HostPort, Network, is_inside
 from rosproxy.ros1.protocol.uris import (
     InsidePath,
     inside_path,
@@ -71,12 +71,10 @@ class Addressing:
     def export_slave(self, uri: str, asker: Asker) -> str:
         """The outside form of a slave URI that an inside node gave."""
         where = parse_slave_uri(uri)
-        if where is None:
-            return uri
-        endpoint = self._own(uri, asker)
+        endpoint = self._own(uri, asker) if where else None
         if endpoint:
             return self.advertised_uri(endpoint)
-        if self._is_relayed(where, asker):
+        if where and self._is_relayed(where, asker):
             return uri.replace(str(where), str(self.outside(where.port)), 1)
         return uri
 
@@ -103,15 +101,13 @@ class Addressing:
 
     def import_service(self, uri: str, service: str, asker: Asker) -> str:
         """The form of a service URI from outside that an inside node can use."""
-        where = parse_service_uri(uri)
-        port = self._listening(where)
-        endpoint = self.registry.by_port.get(port) if port else None
-        if endpoint is None or port is None:
+        endpoint = self._endpoint_at(parse_service_uri(uri))
+        if endpoint is None:
             return uri
         literal = self._service_literal(endpoint, service)
         if literal and self._direct(endpoint, asker):
             return literal
-        return service_uri(HostPort(asker.proxy, port))
+        return service_uri(HostPort(asker.proxy, endpoint.port))
 
     def handed_out(self, uri: str, asker: Asker) -> bool:
         """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
@@ -139,22 +135,20 @@ class Addressing:
             return True
         if asker.address == endpoint.place.address:
             return not endpoint.place.stale
-        return endpoint.place.named and self._neighbours(asker.address, endpoint.place.address)
-
-    def _neighbours(self, one: str, other: str) -> bool:
-        first, second = as_ip(one), as_ip(other)
-        if first is None or second is None:
-            return False
-        return any(first in network and second in network for network in self.networks)
+        shared = [n for n in self.networks if is_inside(asker.address, [n])]
+        return endpoint.place.named and is_inside(endpoint.place.address, shared)
 
     def _path(self, endpoint: Endpoint) -> str:
         return inside_path(endpoint.node, endpoint.place.address)
 
     def stands_for(self, uri: str) -> Endpoint | None:
         """The endpoint that an advertised slave URI stands for."""
-        port = self._listening(parse_slave_uri(uri))
-        endpoint = self.registry.by_port.get(port) if port else None
+        endpoint = self._endpoint_at(parse_slave_uri(uri))
         return endpoint if endpoint and self.advertised_uri(endpoint) == uri else None
+
+    def _endpoint_at(self, where: HostPort | None) -> Endpoint | None:
+        port = self._listening(where)
+        return self.registry.by_port.get(port) if port else None
 
     def _listening(self, where: HostPort | None) -> int | None:
         if where is None or where.host != self.host:

@@ -23,6 +23,7 @@ from rosproxy.ros1.protocol.xmlrpc.multicall import (
 )
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,18 +152,17 @@ def read_request(body: bytes, asker: Asker) -> Request:
     """Parse a request. Raises XmlRpcError if it is none."""
     call = xmlrpc.parse_call(body)
     if call.method != MULTICALL:
-        return Request(body, (call,), False, _named(asker, _caller_id(call)))
+        return Request(body, (call,), False, replace(asker, caller_id=_caller_id(call)))
     calls = tuple(inner_calls(call))
     caller_id = next((_caller_id(inner) for inner in calls if inner), "")
-    return Request(body, calls, True, _named(asker, caller_id), inner_items(call))
+    return Request(body, calls, True, replace(asker, caller_id=caller_id), inner_items(call))
 
 
 def registering_uri(call: Call | None) -> str | None:
     """The slave URI that a call registers, if it is a complete registration."""
-    found = row(call.method) if call else NO_ROW
-    if call is None or found.registers is None or found.caller_api is None:
+    if call is None or row(call.method).registers is None:
         return None
-    return call.string(found.caller_api)
+    return call.string(row(call.method).caller_api)
 
 
 def export_request(
@@ -173,8 +173,7 @@ def export_request(
     ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
     registration instead.
     """
-    asker, edits = request.asker, list[Edit]()
-    outcomes: list[Admission] = []
+    asker, edits, outcomes = request.asker, list[Edit](), list[Admission]()
     for call, admission in zip(request.calls, admissions, strict=True):
         outcome = admission
         if call and row(call.method).unregisters:
@@ -200,13 +199,15 @@ def import_reply(reply: MasterReply, addressing: Addressing) -> bytes:
     edits: list[Edit] = []
     request = reply.exported.request
     for result in reply.results:
-        if row(result.call.method).reply is not Reply.OTHER:
-            asker = request.asker
-            if result.endpoint and result.endpoint is not asker.endpoint:
-                asker = replace(asker, endpoint=result.endpoint)
-            edits += _import_result(result, asker, addressing)
+        asker = request.asker
+        if result.endpoint:
+            asker = replace(asker, endpoint=result.endpoint)
+        edits += _import_result(result, asker, addressing)
     if request.multicall and reply.value and reply.value.items:
-        edits += insert_items(reply.value, _refused_results(reply.exported))
+        outcomes = enumerate(reply.exported.outcomes)
+        refused = [(i, one.triple()) for i, one in outcomes if isinstance(one, Refusal)]
+        results = [(i, xmlrpc.dump_value([triple])) for i, triple in refused]
+        edits += insert_items(reply.value, results)
     return xmlrpc.apply(reply.body, edits)
 
 
@@ -225,10 +226,6 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
     return xmlrpc.apply(reply, edits)
 
 
-def _named(asker: Asker, caller_id: str) -> Asker:
-    return Asker(asker.address, asker.proxy, caller_id, asker.master, asker.endpoint)
-
-
 def _caller_id(call: Call) -> str:
     return call.string(0) or ""
 
@@ -243,49 +240,29 @@ def _holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None
     found, holder = row(call.method), addressing.registry.by_caller(_caller_id(call))
     if holder is None:
         return None
-    if found.caller_api is not None:
-        uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
-        return holder if uri == addressing.advertised_uri(holder) else None
-    uri = addressing.export_service(call.string(2) or "", _name(call), asker)
-    return holder if uri == addressing.advertised_service(holder) else None
+    if found.caller_api is None:
+        uri = addressing.export_service(call.string(found.service_api) or "", _name(call), asker)
+        return holder if uri == addressing.advertised_service(holder) else None
+    uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
+    return holder if uri == addressing.advertised_uri(holder) else None
 
 
 def _export_call(
     call: Call, admission: Admission, asker: Asker, addressing: Addressing
-) -> list[Edit]:
-    found, edits = row(call.method), []
-    caller_api = _string_at(call, found.caller_api)
-    service_api = _string_at(call, found.service_api)
-    if caller_api and isinstance(admission, Endpoint):
-        edits.append(xmlrpc.replace(caller_api, addressing.advertised_uri(admission)))
-    elif caller_api:
-        edits.append(xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, asker)))
-    if service_api and isinstance(admission, Endpoint):
-        edits += _export_service_api(service_api, admission, addressing)
-    elif service_api:
+) -> Iterator[Edit]:
+    caller_api = call.string_value(row(call.method).caller_api)
+    service_api = call.string_value(row(call.method).service_api)
+    if isinstance(admission, Endpoint):
+        if caller_api:
+            yield xmlrpc.replace(caller_api, addressing.advertised_uri(admission))
+        if service_api and parse_service_uri(service_api.text):
+            yield xmlrpc.replace(service_api, addressing.advertised_service(admission))
+        return
+    if caller_api:
+        yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, asker))
+    if service_api:
         text = addressing.export_service(service_api.text, _name(call), asker)
-        edits.append(xmlrpc.replace(service_api, text))
-    return edits
-
-
-def _export_service_api(value: Value, endpoint: Endpoint, addressing: Addressing) -> list[Edit]:
-    if parse_service_uri(value.text) is None:
-        return []
-    return [xmlrpc.replace(value, addressing.advertised_service(endpoint))]
-
-
-def _string_at(call: Call, index: int | None) -> Value | None:
-    if index is None or call.string(index) is None:
-        return None
-    return call.params[index]
-
-
-def _refused_results(exported: Exported) -> list[tuple[int, bytes]]:
-    return [
-        (i, xmlrpc.dump_value([outcome.triple()]))
-        for i, outcome in enumerate(exported.outcomes)
-        if isinstance(outcome, Refusal)
-    ]
+        yield xmlrpc.replace(service_api, text)
 
 
 def _results(exported: Exported, value: Value) -> Iterator[Result]:
@@ -296,54 +273,44 @@ def _results(exported: Exported, value: Value) -> Iterator[Result]:
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, Refusal)]
     for (call, endpoint), triple in zip(sent, triples, strict=False):
-        if call and triple and triple.kind == "array" and len(triple.items) == 3:
+        if call and triple and ros_triple(triple):
             yield Result(call, triple, endpoint)
 
 
 def _import_result(result: Result, asker: Asker, addressing: Addressing) -> list[Edit]:
-    triple, kind = result.triple, row(result.call.method).reply
-    text = triple.items[2].string()
+    held, kind = result.triple.items[2], row(result.call.method).reply
+    text = held.string()
     if not result.accepted:
         return []
     if kind is Reply.SLAVE_URIS:
-        return _import_each(triple.items[2], asker, addressing)
-    if text is None or kind is Reply.OTHER:
-        return []
-    return _import_one(triple, text, _imported(result.call, text, asker, addressing))
-
-
-def _imported(call: Call, text: str, asker: Asker, addressing: Addressing) -> str:
-    kind = row(call.method).reply
-    if kind is Reply.SLAVE_URI:
-        return addressing.import_slave(text, asker)
-    if kind is Reply.SERVICE_URI:
-        return addressing.import_service(text, _name(call), asker)
-    return f"http://{asker.master}/" if asker.master else text
-
-
-def _import_each(held: Value, asker: Asker, addressing: Addressing) -> list[Edit]:
-    return [
-        xmlrpc.replace(item, addressing.import_slave(item.text, asker))
-        for item in held.items
-        if item.kind == "string"
-    ]
+        return [
+            xmlrpc.replace(item, addressing.import_slave(item.text, asker))
+            for item in held.items
+            if item.kind == "string"
+        ]
+    if text and kind is Reply.SLAVE_URI:
+        return _import_one(result.triple, text, addressing.import_slave(text, asker))
+    if text and kind is Reply.SERVICE_URI:
+        uri = addressing.import_service(text, _name(result.call), asker)
+        return _import_one(result.triple, text, uri)
+    if text and kind is Reply.MASTER_URI and asker.master:
+        return _import_one(result.triple, text, f"http://{asker.master}/")
+    return []
 
 
 def _import_one(triple: Value, before: str, after: str) -> list[Edit]:
     """Replace the value, and the same text where the status message quotes it (lookupService)."""
     edits = [xmlrpc.replace(triple.items[2], after)]
     message = triple.items[1].string()
-    if message and before and before in message:
+    if message and before in message:
         edits.append(xmlrpc.replace(triple.items[1], message.replace(before, after)))
     return edits
 
 
 def _registration(call: Call, now: float) -> Registration | None:
     found, caller_id = row(call.method), _caller_id(call)
-    kind = found.registers or found.unregisters
-    name = call.string(found.name) if found.name is not None else None
+    kind, name = found.registers or found.unregisters, call.string(found.name)
     if kind is None or not name:
         return None
-    type_ = (call.string(found.type) if found.type is not None else None) or "*"
-    service_api = call.string(found.service_api) if found.service_api is not None else None
-    return Registration(kind, resolve_name(name, caller_id), caller_id, type_, service_api, now)
+    name, type_ = resolve_name(name, caller_id), call.string(found.type) or "*"
+    return Registration(kind, name, caller_id, type_, call.string(found.service_api), now)

@@ -64,17 +64,16 @@ def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -
 
 def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing) -> bytes:
     """The reply for outside: addresses exported."""
-    triple = _triple(reply)
+    triple = ros_triple(xmlrpc.parse_reply(reply))
     if triple is None:
         return reply
-    if call.method == "requestTopic":
-        edits = _export_topic(triple, visit)
+    edits: list[Edit] = []
+    if call.method == "requestTopic" and _is_tcpros(triple):
+        edits = send_to(triple, visit.reached)
     elif call.method == "getBusInfo":
         edits = _export_bus_info(triple, visit, addressing)
     elif call.method in _URI_REPLIES:
         edits = _export_uri(call.method, triple, visit, addressing)
-    else:
-        edits = []
     return xmlrpc.apply(reply, edits)
 
 
@@ -100,7 +99,7 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
 
 def topic_port(call: Call, reply: bytes) -> TopicPort | None:
     """The port that a reply to ``requestTopic`` names, if it is one for TCPROS."""
-    triple, topic = _triple(reply), call.string(1)
+    triple, topic = ros_triple(xmlrpc.parse_reply(reply)), call.string(1)
     said = tcpros_address(triple) if triple else None
     return TopicPort(topic, said.port) if topic and said else None
 
@@ -125,13 +124,9 @@ def send_to(triple: Value, where: HostPort) -> list[Edit]:
     _, host, port = protocol.items
     edits = [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
     before = f"{host.text}:{port.text}"
-    if message.kind == "string" and before in message.text:
+    if before in (message.string() or ""):
         edits.append(xmlrpc.replace(message, message.text.replace(before, str(where))))
     return edits
-
-
-def _triple(reply: bytes) -> Value | None:
-    return ros_triple(xmlrpc.parse_reply(reply))
 
 
 def _is_tcpros(triple: Value) -> bool:
@@ -139,27 +134,23 @@ def _is_tcpros(triple: Value) -> bool:
     return len(protocol) == 3 and protocol[0].string() == "TCPROS"
 
 
-def _export_topic(triple: Value, visit: Visit) -> list[Edit]:
-    return send_to(triple, visit.reached) if _is_tcpros(triple) else []
-
-
 def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
-    edits = []
-    for row in triple.items[2].items:
-        peer = row.items[1].string() if len(row.items) > 1 else None
-        if peer and parse_slave_uri(peer):
-            edits.append(xmlrpc.replace(row.items[1], addressing.export_slave(peer, visit.node)))
-    return edits
+    peers = [row.items[1] for row in triple.items[2].items if len(row.items) > 1]
+    return [
+        xmlrpc.replace(peer, addressing.export_slave(peer.text, visit.node))
+        for peer in peers
+        if parse_slave_uri(peer.string() or "")
+    ]
 
 
 def _export_uri(method: str, triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
     held, message = triple.items[2], triple.items[1]
-    if held.kind != "string" or not held.text:
+    if not held.string():
         return []
     after = visit.master_uri
     if method == "getUri":
         after = addressing.export_slave(held.text, visit.node)
     edits = [xmlrpc.replace(held, after)]
-    if message.kind == "string" and message.text == held.text:
+    if message.string() == held.text:
         edits.append(xmlrpc.replace(message, after))
     return edits

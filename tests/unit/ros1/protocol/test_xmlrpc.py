@@ -3,7 +3,8 @@
 import pytest
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.document import Edit, Limits, XmlRpcError
+from rosproxy.ros1.protocol.xmlrpc import values
+from rosproxy.ros1.protocol.xmlrpc.document import Edit, XmlRpcError
 from tests.unit.builders import DIALECTS, cpp_call, py_call, py_reply, python_values, raw_call
 
 URI = "http://10.0.0.5:40001/"
@@ -247,11 +248,19 @@ def test_depth_is_bounded() -> None:
         xmlrpc.parse_call(nested(100_000))
 
 
-def test_the_number_of_elements_is_bounded() -> None:
+def test_only_the_name_in_a_member_is_a_member_s() -> None:
+    member = "<member><name>a</name><value>1</value></member>"
+    body = raw_call(f"<value><struct><name>b</name>{member}<name>c</name></struct></value>")
+    assert xmlrpc.parse_call(body).params[0].members == ["a"]
+
+
+def test_the_number_of_elements_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     body = raw_call("<value>x</value>", "<value>x</value>")  # two of param and value, and three
-    assert xmlrpc.parse_call(body, Limits(elements=7)).params
+    monkeypatch.setattr(values, "MAX_ELEMENTS", 7)
+    assert xmlrpc.parse_call(body).params
+    monkeypatch.setattr(values, "MAX_ELEMENTS", 6)
     with pytest.raises(XmlRpcError, match="more than 6 elements"):
-        xmlrpc.parse_call(body, Limits(elements=6))
+        xmlrpc.parse_call(body)
 
 
 @pytest.mark.parametrize(

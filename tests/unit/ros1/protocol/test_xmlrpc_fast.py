@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import fast
-from rosproxy.ros1.protocol.xmlrpc.document import DEFAULT_LIMITS, Call, Limits, Value, XmlRpcError
+from rosproxy.ros1.protocol.xmlrpc import values as bounds
+from rosproxy.ros1.protocol.xmlrpc.document import Call, Value, XmlRpcError
 from tests.unit.builders import cpp_call, cpp_reply, py_call, py_reply
 
-BOUNDS = DEFAULT_LIMITS.depth, DEFAULT_LIMITS.elements
 TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E, exclude_characters="&<>"))
 VALUES = st.recursive(
     TEXT | st.integers(-(2**31), 2**31 - 1) | st.booleans() | st.floats(allow_nan=False),
@@ -49,8 +49,8 @@ def read(body: bytes) -> tuple[str, Any]:
 
 
 def plainly(body: bytes) -> Call | Value | None:
-    found = fast.call(body, *BOUNDS)
-    return Call(*found) if found else fast.response(body, *BOUNDS)
+    found = fast.call(body)
+    return Call(*found) if found else fast.response(body)
 
 
 @given(st.lists(VALUES, max_size=4))
@@ -97,41 +97,33 @@ def test_soup_between_sound_tags_is_read_as_by_expat(soup: str, root: str) -> No
 
 
 @pytest.mark.parametrize("depth", range(1, 16))
-def test_depth_is_bounded_as_by_expat(depth: int) -> None:
+def test_depth_is_bounded_as_by_expat(depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounds, "MAX_DEPTH", depth)
     body = py_call("x", [["deep"]])
-    limits = Limits(depth=depth)
-
-    def parsed() -> Any:
-        try:
-            return xmlrpc.parse_call(body, limits)
-        except XmlRpcError as error:
-            return error.code
-
-    found = parsed()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fast, "call", lambda *_: None)
-        assert parsed() == found
+    assert read(body) == by_expat(body)
+    assert (read(body)[0] == "refused") is (depth < 11)
 
 
-def test_elements_are_bounded() -> None:
+def test_elements_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     body = py_call("x", ["y"] * 100)
-    elements = body.count(b"</")
-    assert fast.call(body, 64, elements) is not None
-    assert fast.call(body, 64, elements - 1) is None
+    monkeypatch.setattr(bounds, "MAX_ELEMENTS", body.count(b"</"))
+    assert fast.call(body) is not None
+    monkeypatch.setattr(bounds, "MAX_ELEMENTS", body.count(b"</") - 1)
+    assert fast.call(body) is None
     with pytest.raises(XmlRpcError, match="more than"):
-        xmlrpc.parse_call(body, Limits(elements=elements - 1))
+        xmlrpc.parse_call(body)
 
 
 @pytest.mark.parametrize("text", ["&lt;", "é", "\x00"])
 def test_what_needs_an_xml_parser_is_left_to_expat(text: str) -> None:
     body = f"<methodCall><methodName>x</methodName><params><param><value>{text}</value></param>"
     body += "</params></methodCall>"
-    assert fast.call(body.encode(), *BOUNDS) is None
+    assert fast.call(body.encode()) is None
 
 
 def test_spaces_cost_no_more_than_their_number() -> None:
     """Each token begins with any number of them: they must not be tried again and again."""
     spaces = b" " * 2_000_000
     body = dumps(("a",), "x").encode().replace(b"<param>", spaces + b"<param>" + spaces)
-    assert fast.call(body, *BOUNDS) is not None
-    assert fast.call(body.replace(b"</param>", b"</parm>"), *BOUNDS) is None
+    assert fast.call(body) is not None
+    assert fast.call(body.replace(b"</param>", b"</parm>")) is None

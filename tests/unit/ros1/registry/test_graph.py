@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
-from rosproxy.ros1.registry.graph import Graph, GraphError, read_state, read_types
+from rosproxy.ros1.registry.graph import Graph, read_state, read_types
 
 STATE = [[["/a", ["/n", "/m"]], ["/b", ["/n"]]], [["/a", ["/m"]]], [["/s", ["/n"]]]]
 TYPES = [["/a", "t/A"], ["/b", "*"], ["/unused", "t/U"]]
@@ -56,7 +57,7 @@ def test_slave_uris_by_topic() -> None:
     ],
 )
 def test_a_state_of_another_form_is_an_error(state: Any) -> None:
-    with pytest.raises(GraphError):
+    with pytest.raises(msgspec.ValidationError):
         read_state(state, [])
 
 

@@ -163,14 +163,19 @@ class Registries(RuleBasedStateMachine):
     def nobody_else_is_found(self) -> None:
         live = set(self.registry)
         assert set(self.registry._by_key.values()) == live
-        assert {e for found in self.registry._by_uri.values() for e in found} == live
+        former = set(self.registry._former.values())
+        by_uri = self.registry._by_uri.values()
+        assert all(by_uri)
+        assert sorted(e.port for found in by_uri for e in found.values()) == sorted(
+            e.port for e in live | former
+        )
         assert set(self.registry._admitted.values()) <= live
-        assert not set(self.registry._former.values()) & live
+        assert not former & live
         assert not set(self.registry._former) & set(self.registry.by_port)
-        for former in self.registry._former.values():
-            assert former in self.registry.by_uri(former.uri)
-        kept = [e for found in self.registry._former_uris.values() for e in found.values()]
-        assert sorted(e.port for e in kept) == sorted(self.registry._former)
+        for endpoint in live | former:
+            found = self.registry.by_uri(endpoint.uri)
+            assert [e in former for e in found] == sorted(e in former for e in found)
+            assert endpoint in found
         last = self.registry._last_port
         assert all(last[endpoint.key] == endpoint.port for endpoint in live)
         assert len(last) <= len(PORTS)

@@ -16,11 +16,10 @@ from xml.parsers import expat
 from xml.sax.saxutils import escape
 from xmlrpc.client import Fault, dumps
 
-from rosproxy.ros1.protocol.xmlrpc import fast
-from rosproxy.ros1.protocol.xmlrpc import values as xmlrpc_values
-from rosproxy.ros1.protocol.xmlrpc.values import INTEGERS, SCALARS, text_of
+from rosproxy.ros1.protocol.xmlrpc import fast, values
+from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
 
-Value = xmlrpc_values.Value
+Value = values.Value
 PARSE_ERROR = -32700
 """Fault code: not well formed (http://xmlrpc-epi.sourceforge.net/specs/rfc.fault_codes.php)."""
 INVALID_REQUEST = -32600
@@ -46,29 +45,22 @@ class XmlRpcError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """Bounds on a document: nesting depth and number of XML elements.
-
-    Elements take some 3 µs each, in which nothing else is served.
-    """
-
-    depth: int = 64
-    elements: int = 500_000
-
-
-DEFAULT_LIMITS = Limits()
-
-
-@dataclass(frozen=True, slots=True)
 class Call:
     """A method call: the method's name and its parameters."""
 
     method: str
     params: list[Value]
 
-    def string(self, index: int) -> str | None:
+    def string_value(self, index: int | None) -> Value | None:
         """Parameter ``index`` if it is there and a string, else None."""
-        return self.params[index].string() if index < len(self.params) else None
+        if index is None or index >= len(self.params):
+            return None
+        return self.params[index] if self.params[index].kind == "string" else None
+
+    def string(self, index: int | None) -> str | None:
+        """The text of that."""
+        value = self.string_value(index)
+        return value.text if value else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,17 +103,17 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
     return b"".join([*parts, body[position:]])
 
 
-def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Call:
+def parse_call(body: bytes) -> Call:
     """Parse a ``methodCall``.
 
-    Raises XmlRpcError if the document is malformed, holds a DTD or entities, exceeds ``limits``
+    Raises XmlRpcError if the document is malformed, holds a DTD or entities, is too large or deep
     or is not a method call. Of what looks like several method names XmlRpc++ takes the first, even
     in a comment, and Python the last element: such a document is refused.
     """
-    plain = fast.call(body, limits.depth, limits.elements)
+    plain = fast.call(body)
     if plain is not None:
         return Call(*plain)
-    parser = _Parser(body, limits)
+    parser = _Parser(body)
     if parser.root != "methodCall" or not parser.method:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC call: no methodCall with a methodName")
     if body.count(b"<methodName") != 1:
@@ -129,24 +121,24 @@ def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Call:
     return Call(parser.method, parser.values)
 
 
-def parse_reply(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value | None:
+def parse_reply(body: bytes) -> Value | None:
     """Parse a ``methodResponse``; None if it is a fault.
 
-    Raises XmlRpcError if the document is malformed, exceeds ``limits`` or is not a response.
+    Raises XmlRpcError if the document is malformed, too large or deep, or is not a response.
     """
-    value, fault = parse_response(body, limits)
+    value, fault = parse_response(body)
     return None if fault else value
 
 
-def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[Value, bool]:
+def parse_response(body: bytes) -> tuple[Value, bool]:
     """Parse a ``methodResponse``: its value, and whether that is a fault.
 
     Raises XmlRpcError as ``parse_reply`` does.
     """
-    plain = fast.response(body, limits.depth, limits.elements)
+    plain = fast.response(body)
     if plain is not None:
         return plain, False
-    parser = _Parser(body, limits)
+    parser = _Parser(body)
     if parser.root != "methodResponse" or len(parser.values) != 1:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
     return parser.values[0], parser.fault
@@ -188,8 +180,8 @@ def python_value(value: Value) -> Any:
 class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
-    def __init__(self, body: bytes, limits: Limits) -> None:
-        self.body, self.limits = body, limits
+    def __init__(self, body: bytes) -> None:
+        self.body = body
         self.root, self.method, self.fault = "", "", False
         self.values: list[Value] = []
         self._encoding = "utf-8"
@@ -197,10 +189,7 @@ class _Parser:
         self._open: list[Value] = []
         self._count = 0
         self._inner = 0
-        self._run()
-
-    def _run(self) -> None:
-        if b"\0" in self.body:
+        if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "neither UTF-8 nor another encoding without NUL bytes")
         self._expat = parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
@@ -208,7 +197,7 @@ class _Parser:
         parser.StartDoctypeDeclHandler = self._doctype
         parser.XmlDeclHandler = self._declaration
         try:
-            parser.Parse(self.body, True)
+            parser.Parse(body, True)
         except expat.ExpatError as error:
             raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
 
@@ -224,63 +213,46 @@ class _Parser:
     def _start(self, name: str, attributes: object) -> None:
         self._path.append(name)
         self._count += 1
-        if len(self._path) > self.limits.depth:
-            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self.limits.depth} elements")
-        if self._count > self.limits.elements:
-            raise XmlRpcError(PARSE_ERROR, f"more than {self.limits.elements} elements")
-        handler = _STARTS.get(name)
-        if handler:
-            handler(self)
-        elif name in SCALARS:
-            self._start_scalar(name)
+        self.root = self.root or name
+        if len(self._path) > values.MAX_DEPTH:
+            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {values.MAX_DEPTH} elements")
+        if self._count > values.MAX_ELEMENTS:
+            raise XmlRpcError(PARSE_ERROR, f"more than {values.MAX_ELEMENTS} elements")
+        if name == "value":
+            self._start_value()
+        elif name in KINDS:
+            self._start_kind(name)
+        elif name in ("methodName", "name"):
+            self._inner = self._tag_end()
+        elif name == "fault":
+            self.fault = True
         elif self._path[-2:-1] == ["value"]:
             self._open[-1].kind = "other"
 
     def _end(self, name: str) -> None:
         self._path.pop()
-        handler = _ENDS.get(name)
-        if handler:
-            handler(self)
+        if name == "value":
+            self._end_value()
         elif name in SCALARS:
-            self._end_scalar()
-
-    def _start_root(self) -> None:
-        if len(self._path) == 1:
-            self.root = self._path[0]
-
-    def _start_fault(self) -> None:
-        self.fault = True
-
-    def _start_text(self) -> None:
-        self._inner = self._tag_end()
+            value = self._open[-1]
+            value.inner = (value.inner[0], max(value.inner[0], self._expat.CurrentByteIndex))
+        elif name == "methodName":
+            self.method = self._text().strip()
+        elif name == "name" and self._open and self._path[-1:] == ["member"]:
+            self._open[-1].members.append(self._text())
 
     def _start_value(self) -> None:
         inside = self._tag_end()
         outer = self._expat.CurrentByteIndex, inside
         self._open.append(Value(self.body, self._encoding, outer=outer, inner=(inside, -1)))
 
-    def _start_scalar(self, name: str) -> None:
-        value = self._holder(name)
-        value.kind = "int" if name in INTEGERS else "other"
-        value.kind = "string" if name == "string" else value.kind
-        value.inner = (self._tag_end(), -1)
-
-    def _start_array(self) -> None:
-        self._holder("array").kind = "array"
-
-    def _start_struct(self) -> None:
-        self._holder("struct").kind = "struct"
-
-    def _end_method(self) -> None:
-        self.method = text_of(self._slice(), self._encoding).strip()
-
-    def _end_name(self) -> None:
-        if self._open and self._path[-1:] == ["member"]:
-            self._open[-1].members.append(text_of(self._slice(), self._encoding))
-
-    def _end_scalar(self) -> None:
+    def _start_kind(self, name: str) -> None:
+        if not self._open or self._path[-2:-1] != ["value"]:
+            raise XmlRpcError(INVALID_REQUEST, f"<{name}> outside of a <value>")
         value = self._open[-1]
-        value.inner = (value.inner[0], max(value.inner[0], self._expat.CurrentByteIndex))
+        value.kind = KINDS[name]
+        if name in SCALARS:
+            value.inner = (self._tag_end(), -1)
 
     def _end_value(self) -> None:
         value = self._open.pop()
@@ -293,30 +265,10 @@ class _Parser:
             raise XmlRpcError(INVALID_REQUEST, "a struct member needs one name and one value")
         (self._open[-1].items if self._open else self.values).append(value)
 
-    def _holder(self, name: str) -> Value:
-        if not self._open or self._path[-2:-1] != ["value"]:
-            raise XmlRpcError(INVALID_REQUEST, f"<{name}> outside of a <value>")
-        return self._open[-1]
-
-    def _slice(self) -> bytes:
-        return self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
+    def _text(self) -> str:
+        """What the name element that ends here holds."""
+        raw = self.body[self._inner : max(self._inner, self._expat.CurrentByteIndex)]
+        return text_of(raw, self._encoding)
 
     def _tag_end(self) -> int:
         return next(_TAG.finditer(self.body, self._expat.CurrentByteIndex)).end()
-
-
-_STARTS = {
-    "methodCall": _Parser._start_root,
-    "methodResponse": _Parser._start_root,
-    "fault": _Parser._start_fault,
-    "methodName": _Parser._start_text,
-    "name": _Parser._start_text,
-    "value": _Parser._start_value,
-    "array": _Parser._start_array,
-    "struct": _Parser._start_struct,
-}
-_ENDS = {
-    "methodName": _Parser._end_method,
-    "name": _Parser._end_name,
-    "value": _Parser._end_value,
-}

@@ -9,7 +9,8 @@ as long and decides what is an error.
 import re
 from collections.abc import Iterator
 
-from rosproxy.ros1.protocol.xmlrpc.values import INTEGERS, Kind, Value, text_of
+from rosproxy.ros1.protocol.xmlrpc import values
+from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
 
 _PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
 _PROLOG = rb"(?:<\?xml version=(?:'1\.0'|\"1\.0\")\?>)?\s*"
@@ -39,8 +40,7 @@ _VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
 _ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
 """The groups of a token; the last one of a match tells what it is."""
 _END_OF_VALUE = len(b"</value>")
-_KINDS: dict[bytes, Kind] = {b"string": "string"}
-_KINDS.update((name.encode(), "int") for name in INTEGERS)
+_KINDS = {name.encode(): kind for name, kind in KINDS.items()}
 
 _Tokens = Iterator[re.Match[bytes]]
 
@@ -49,49 +49,46 @@ class _NotPlain(Exception):
     """A document of another form, or of none."""
 
 
-def call(body: bytes, depth: int, elements: int) -> tuple[str, list[Value]] | None:
-    """The method and parameters of a ``methodCall``, None if it is not of the plain form.
-
-    ``depth`` and ``elements`` are bounds as in `document.Limits`; None beyond them.
-    """
+def call(body: bytes) -> tuple[str, list[Value]] | None:
+    """The method and parameters of a ``methodCall``, None if it is not of the plain form."""
     head = _CALL.match(body)
-    if head is None or not _is_plain(body, elements):
+    if head is None or not _is_plain(body):
         return None
-    values = _params(body, head.end(), _CALL_END, depth - 3)
-    return None if values is None else (head[1].decode(), values)
+    params = _params(body, head.end(), _CALL_END)
+    return None if params is None else (head[1].decode(), params)
 
 
-def response(body: bytes, depth: int, elements: int) -> Value | None:
+def response(body: bytes) -> Value | None:
     """The value of a ``methodResponse``, None if it is a fault or not of the plain form."""
     head = _RESPONSE.match(body)
-    if head is None or not _is_plain(body, elements):
+    if head is None or not _is_plain(body):
         return None
-    values = _params(body, head.end(), _RESPONSE_END, depth - 3)
-    return values[0] if values is not None and len(values) == 1 else None
+    params = _params(body, head.end(), _RESPONSE_END)
+    return params[0] if params is not None and len(params) == 1 else None
 
 
-def _is_plain(body: bytes, elements: int) -> bool:
+def _is_plain(body: bytes) -> bool:
     return (
         not body.translate(None, _PLAIN)
         and b"]]>" not in body
-        and body.count(b"</") <= elements  # each is closed by a tag of its own
+        and body.count(b"</") <= values.MAX_ELEMENTS  # each is closed by a tag of its own
     )
 
 
-def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
-    tokens, values, place = _TOKEN.finditer(body, start), list[Value](), start
+def _params(body: bytes, start: int, end: re.Pattern[bytes]) -> list[Value] | None:
+    tokens, params, place = _TOKEN.finditer(body, start), list[Value](), start
     try:
         for token in tokens:
             if token.lastindex != _PARAM:
                 break
-            values.append(_value(body, next(tokens), tokens, depth))
+            params.append(_value(body, next(tokens), tokens, values.MAX_DEPTH - 3))
             last = next(tokens)
             if last.lastindex != _PARAM_END:
                 return None
             place = last.end()
     except (_NotPlain, StopIteration):
         return None
-    return values if end.match(body, place) else None
+    return params if end.match(body, place) else None
 
 
 def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> Value:
@@ -99,37 +96,39 @@ def _value(body: bytes, token: re.Match[bytes], tokens: _Tokens, depth: int) -> 
     which = token.lastindex
     start, inside = token.span(_VALUE)
     if which == _TYPED and depth > 1:
-        kind = _KINDS.get(token[_TYPE], "other")
+        kind = _KINDS[token[_TYPE]]
         return Value(body, "utf-8", kind, (start, token.end()), token.span(_TYPED), [], [])
     if which == _TEXT and depth:
         return Value(body, "utf-8", "string", (start, token.end()), token.span(_TEXT), [], [])
     if depth < 4:
         raise _NotPlain
+    items, members = list[Value](), list[str]()
     if which == _ARRAY:
-        return _array(body, start, inside, tokens, depth - 3)
-    if which == _STRUCT:
-        return _struct(body, start, inside, tokens, depth - 3)
-    raise _NotPlain
+        kind, end = "array", _array(body, tokens, depth - 3, items)
+    elif which == _STRUCT:
+        kind, end = "struct", _struct(body, tokens, depth - 3, items, members)
+    else:
+        raise _NotPlain
+    inner = inside, end - _END_OF_VALUE
+    return Value(body, "utf-8", kind, (start, end), inner, items, members)
 
 
-def _array(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
-    items = list[Value]()
+def _array(body: bytes, tokens: _Tokens, depth: int, items: list[Value]) -> int:
+    """Read items up to the end of their array; where that is."""
     for token in tokens:
         if token.lastindex == _ARRAY_END:
-            end = token.end()
-            inner = inside, end - _END_OF_VALUE
-            return Value(body, "utf-8", "array", (start, end), inner, items, [])
+            return token.end()
         items.append(_value(body, token, tokens, depth))
     raise _NotPlain
 
 
-def _struct(body: bytes, start: int, inside: int, tokens: _Tokens, depth: int) -> Value:
-    items, members = list[Value](), list[str]()
+def _struct(
+    body: bytes, tokens: _Tokens, depth: int, items: list[Value], members: list[str]
+) -> int:
+    """Read members up to the end of their struct; where that is."""
     for token in tokens:
         if token.lastindex == _STRUCT_END:
-            end = token.end()
-            inner = inside, end - _END_OF_VALUE
-            return Value(body, "utf-8", "struct", (start, end), inner, items, members)
+            return token.end()
         if token.lastindex != _NAME:
             break
         members.append(text_of(token[_NAME], "utf-8"))

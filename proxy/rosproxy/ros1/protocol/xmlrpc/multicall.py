@@ -38,12 +38,9 @@ def inner_calls(call: Call) -> list[Call | None]:
 
 def single_call(call: Call) -> bytes:
     """One call of a multicall as a document of its own, its parameters as they were sent."""
-    params = b"".join(b"<param>" + value.raw + b"</param>" for value in call.params)
-    name = escape(call.method).encode()
-    return (
-        b"<?xml version='1.0'?><methodCall><methodName>" + name + b"</methodName>"
-        b"<params>" + params + b"</params></methodCall>"
-    )
+    params = b"".join(b"<param>%b</param>" % value.raw for value in call.params)
+    head = b"<methodName>%b</methodName>" % escape(call.method).encode()
+    return b"<?xml version='1.0'?><methodCall>%b<params>%b</params></methodCall>" % (head, params)
 
 
 def result_value(reply: bytes) -> bytes:
@@ -62,11 +59,8 @@ def fault_value(code: int, message: str) -> bytes:
 
 def results_reply(results: Iterable[bytes]) -> bytes:
     """The ``methodResponse`` of a multicall from its results, each a raw value."""
-    return (
-        b"<?xml version='1.0'?><methodResponse><params><param>"
-        + _array(results)
-        + b"</param></params></methodResponse>"
-    )
+    params = b"<params><param>%b</param></params>" % _array(results)
+    return b"<?xml version='1.0'?><methodResponse>%b</methodResponse>" % params
 
 
 def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edit]:
@@ -74,13 +68,10 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 
     Each insert is (index in the finished array, value); indices rise.
     """
-    edits = []
+    edits, items = [], array.items
     for done, (index, raw) in enumerate(inserts):
         before = index - done
-        if before < len(array.items):
-            place = array.items[before].outer[0]
-        else:
-            place = array.items[-1].outer[1]
+        place = items[before].outer[0] if before < len(items) else items[-1].outer[1]
         edits.append(Edit(place, place, raw))
     return edits
 
