@@ -33,7 +33,7 @@ CarryOut = Callable[[Action], Awaitable[None]]
 class _Failure:
     """What failed for a key, how often in a row, when to try again, and what to tell."""
 
-    actions: tuple[Action, ...]
+    actions: list[Action]
     count: int
     again: float
     problem: Problem
@@ -62,12 +62,7 @@ class Executor:
         self._refused: dict[Action, tuple[str, float]] = {}
 
     @property
-    def busy(self) -> bool:
-        """Whether anything is under way."""
-        return bool(self._busy)
-
-    @property
-    def subjects(self) -> frozenset[str]:
+    def busy(self) -> frozenset[str]:
         """What is being worked on, as problems name it."""
         return frozenset(map(_subject, self._busy))
 
@@ -100,44 +95,36 @@ class Executor:
             if key in by_key or self._over.get(key, 0.0) >= seen
         }
         for key in sorted(by_key, key=lambda key: key is not None):  # the uplink first
-            actions = _actions(by_key[key])
+            actions = [action for group in by_key[key] for action in group.actions]
             failure = self._failures.get(key)
             waiting = failure and failure.actions == actions and now < failure.again
             if actions and not waiting and key not in self._busy:
-                after = self._busy.get(None) if key else None
-                work = self._run(key, by_key[key], carry_out, after)
+                work = self._run(key, by_key[key], actions, carry_out)
                 name = f"work for {key.master_uri if key else 'the uplink'}"
                 self._busy[key] = self._tasks.spawn(work, name)
 
     async def _run(
-        self,
-        key: Key | None,
-        groups: list[Group],
-        carry_out: CarryOut,
-        after: "asyncio.Task[None] | None",
+        self, key: Key | None, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
-        """Carry out all groups, and note the first thing that goes wrong."""
+        """Carry out all groups, after the uplink's, and note the first thing that goes wrong."""
+        problem: Problem | None = None
         try:
-            if after is not None:
-                await asyncio.wait([after])
+            if key and None in self._busy:
+                await asyncio.wait([self._busy[None]])
             problems = [await self._group(group, carry_out) for group in groups]
-            self._note(key, groups, next((problem for problem in problems if problem), None))
+            problem = next(filter(None, problems), None)
         except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
             log.exception("work for %s failed", key)
             problem = Problem(_subject(key), f"the operator failed: {error!r}")
-            self._note(key, groups, problem)
         finally:
+            before = self._failures.pop(key, None)
+            if problem is not None:
+                count = before.count + 1 if before and before.actions == actions else 1
+                again = time.monotonic() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
+                self._failures[key] = _Failure(actions, count, again, problem)
             del self._busy[key]
             self._over[key] = time.monotonic()
             self._finished()
-
-    def _note(self, key: Key | None, groups: list[Group], problem: Problem | None) -> None:
-        before = self._failures.pop(key, None)
-        if problem is not None:
-            actions = _actions(groups)
-            count = before.count + 1 if before and before.actions == actions else 1
-            pause = BACK_OFF[min(count, len(BACK_OFF)) - 1]
-            self._failures[key] = _Failure(actions, count, time.monotonic() + pause, problem)
 
     async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
         """Carry a group out as far as possible; what went wrong.
@@ -148,42 +135,35 @@ class Executor:
         for action in group.actions:
             try:
                 await self._one(action, carry_out)
+            except PortTaken as error:
+                self._port_taken(getattr(action, "name", ""), error.port)
+                break
             except EngineError as error:
-                self._refuse(action, error)
-                if isinstance(error, PortTaken):
-                    self._port_taken(getattr(action, "name", ""), error.port)
-                    break
                 problem = Problem(_subject(group.key), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
 
     async def _one(self, action: Action, carry_out: CarryOut) -> None:
-        again = action in self._refused
-        log.log(logging.DEBUG if again else logging.INFO, "%s", action)
+        """Carry an action out, and log why it failed: once while it is tried again and again."""
+        before, _ = self._refused.get(action, (None, 0.0))
+        log.log(logging.INFO if before is None else logging.DEBUG, "%s", action)
         outcome = "failed"
         started = time.monotonic()
         try:
             await carry_out(action)
             outcome = "ok"
             self._refused.pop(action, None)
-        except PortTaken:
-            outcome = "taken"
+        except EngineError as error:
+            reason = str(error)
+            if isinstance(error, PortTaken):
+                outcome = reason = "taken"  # maybe another port each time
+            log.log(logging.DEBUG if reason == before else logging.WARNING, "%s: %s", action, error)
+            self._refused[action] = reason, time.monotonic()
             raise
         finally:
             self._counted(action, outcome)
             log.debug("%s: %s in %.3f s", action, outcome, time.monotonic() - started)
-
-    def _refuse(self, action: Action, error: EngineError) -> None:
-        """Log why an action failed, once while it is tried again and again."""
-        reason = type(error).__name__ if isinstance(error, PortTaken) else str(error)
-        again = self._refused.get(action, ("", 0.0))[0] == reason
-        log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", action, error)
-        self._refused[action] = reason, time.monotonic()
-
-
-def _actions(groups: Iterable[Group]) -> tuple[Action, ...]:
-    return tuple(action for group in groups for action in group.actions)
 
 
 def _subject(key: Key | None) -> str:

@@ -1,5 +1,7 @@
 """Looks at an engine that is given by the test, and what the controller makes of them."""
 
+from collections.abc import Iterator
+
 import pytest
 
 from rosproxy_operator.common.control_loop import LookFailed
@@ -12,7 +14,6 @@ from rosproxy_operator.docker.errors import Gone, Unavailable
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
-from rosproxy_operator.docker.settings import DockerSettings
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
 from tests.unit.operator.docker.builders import KEY, RANGE
@@ -44,6 +45,9 @@ class FakeEngine(DockerClient):
 
     def image_id(self, image: str) -> str:
         return ""
+
+    def events(self) -> Iterator[Json]:
+        return iter(())
 
     def add(self, row: Json, inspected: Json) -> None:
         self.rows.append(row)
@@ -93,7 +97,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies(engine: FakeEn
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
     access = look.access[name]
     assert (str(access.admin), access.token) == ("172.30.0.2:11312", "secret")
-    assert look.tokens == {name: "secret"}
+    assert look.tokens == {KEY: "secret"}
 
 
 async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine) -> None:
@@ -110,14 +114,19 @@ async def test_a_list_that_is_behind_the_inspection_makes_busy(engine: FakeEngin
     assert look.state.busy == {proxy_name(KEY)}
 
 
+def controlling(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> tuple[DockerController, DockerMetrics]:
+    monkeypatch.setattr(module, "DockerClient", lambda: engine)
+    metrics = DockerMetrics()
+    return DockerController(SETTINGS, 30.0, metrics), metrics
+
+
 async def test_once_tells_what_is_not_as_wanted(
     engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     del engine.rows[1:]
-    monkeypatch.setattr(module, "DockerClient", lambda: engine)
-    monkeypatch.setattr(engine, "events", lambda _: iter(()))
-    metrics = DockerMetrics()
-    controller = DockerController(DockerSettings(SETTINGS), metrics)
+    controller, metrics = controlling(engine, monkeypatch)
     problems = await controller.run_once(0.3)
     assert [problem.subject for problem in problems] == [
         f"proxy image {SETTINGS.image}",
@@ -130,8 +139,6 @@ async def test_once_tells_what_is_not_as_wanted(
 
 async def test_once_without_an_engine(engine: FakeEngine, monkeypatch: pytest.MonkeyPatch) -> None:
     engine.away = True
-    monkeypatch.setattr(module, "DockerClient", lambda: engine)
-    monkeypatch.setattr(engine, "events", lambda _: iter(()))
-    controller = DockerController(DockerSettings(SETTINGS), DockerMetrics())
+    controller, _ = controlling(engine, monkeypatch)
     with pytest.raises(LookFailed, match="no engine"):
         await controller.run_once(5.0)
