@@ -1,26 +1,8 @@
 """The Docker engine as far as the operator needs it: a thin layer over the SDK's APIClient.
 
-A socket proxy in front of the engine has to let exactly these through, with ``/v1.41`` (whatever
-version both sides know) before each path but the first::
-
-    GET /version
-    GET /events
-    GET /containers/json
-    GET /containers/[^/]+/json
-    GET /networks
-    GET /images/.+/json
-    POST /networks/create
-    POST /networks/[^/]+/connect
-    POST /networks/[^/]+/disconnect
-    POST /containers/create
-    POST /containers/[^/]+/start
-    POST /containers/[^/]+/restart
-    POST /containers/[^/]+/stop
-    POST /containers/[^/]+/unpause
-    POST /containers/[^/]+/rename
-    DELETE /containers/[^/]+
-
-``rosproxy-operator docker status`` and ``plan`` need the GETs alone.
+docs/reference/permissions.md lists what a socket proxy in front of the engine has to let through,
+with ``/v1.41`` (whatever version both sides know) before each path but the first; the GETs are
+enough for ``rosproxy-operator docker status`` and ``plan``.
 """
 
 import asyncio

@@ -2,9 +2,8 @@
 
 The way of a label, in one direction: the engine's events (`client`) tell that something has changed
 and wake the loop. A look lists everything anew and reads the labels (`snapshot`), decides
-(`planner.plan`), begins to carry out what was decided (`executor`, action by action `apply`), and
-brings the running proxies up to date (`proxy_sync`). Work goes on beside later looks; nothing here
-decides.
+(`planner.plan`), begins to carry out what was decided (`executor`), and brings the running proxies
+up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
 """
 
 import asyncio
@@ -21,10 +20,9 @@ from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
-from rosproxy_operator.docker.apply import DockerApplier
 from rosproxy_operator.docker.client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
-from rosproxy_operator.docker.executor import Executor
+from rosproxy_operator.docker.executor import DockerApplier, Executor
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name

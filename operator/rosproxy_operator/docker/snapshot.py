@@ -19,7 +19,6 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
-    Container,
     HostPorts,
     HostState,
     Key,
@@ -102,10 +101,11 @@ class Inspector:
         """The last known inspection of a container; None if there is none yet."""
         return self._known.get(container, (None, None))[1]
 
-    def fresh(self, container: str) -> bool:
-        """Whether that is of the state in which the list showed the container."""
-        known = self._known.get(container)
-        return known is not None and known[0] == self._marks.get(container)
+    def sure(self, row: Json) -> bool:
+        """Whether the list and the inspection of a container, which is newer, say the same."""
+        mark, inspected = self._known.get(row["Id"], (None, None))
+        fresh = mark == self._marks[row["Id"]]
+        return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
     async def update(self, rows: Iterable[Json], always: Collection[str], patience: float) -> None:
         """Inspect what is new or has changed in the list; wait for it for so many seconds.
@@ -119,7 +119,7 @@ class Inspector:
         self._known = {key: known for key, known in self._known.items() if key in self._marks}
         asked = []
         for key, mark in self._marks.items():
-            if key not in self._asking and not self.fresh(key):
+            if key not in self._asking and self._known.get(key, (None,))[0] != mark:
                 self._asking[key] = asyncio.create_task(self._inspect(key, mark))
                 asked.append(self._asking[key])
         if asked:
@@ -212,7 +212,7 @@ class DockerObserver:
                 sandboxes.append(Sandbox(own.key, container, own.range, own.fingerprint))
             else:
                 proxies.append(Proxy(own.key, container, own.range, own.fingerprint))
-            if own and not self._sure(container):
+            if own and not self._inspector.sure(row):
                 busy.add(container.name)
         return HostState(
             containers=tuple(containers),
@@ -227,11 +227,6 @@ class DockerObserver:
                 for end in engine_json.endpoints(row).values()
             ),
         )
-
-    def _sure(self, container: Container) -> bool:
-        """Whether the list and the inspection, which is newer, say the same."""
-        state = engine_json.dig(self._inspector.get(container.id), "State", "Status")
-        return self._inspector.fresh(container.id) and state == container.state
 
     async def _resolve(self, state: HostState, names: Collection[str]) -> dict[str, str]:
         """The addresses of masters' hosts, empty where unknown."""
@@ -272,14 +267,8 @@ def address_in(state: HostState, name: str, uplink: str) -> str:
     """The address of a host's name that no name server has: this host, or a container."""
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")
-    return next(
-        (
-            attachment.address
-            for container in state.containers
-            for attachment in container.attachments
-            if container.state in STARTED
-            and attachment.address
-            and name in {known.lower() for known in attachment.names}
-        ),
-        "",
-    )
+    for container in state.containers:
+        for place in container.attachments if container.state in STARTED else ():
+            if place.address and name in {known.lower() for known in place.names}:
+                return place.address
+    return ""
