@@ -1,10 +1,6 @@
 """What is called at an engine on loopback, and what is made of its answers."""
 
-import json
 import re
-import threading
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +29,7 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.specs import own_labels
 from rosproxy_operator.docker.snapshot import DockerSnapshot
 from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, observed
+from tests.unit.operator.docker.conftest import FakeEngine
 
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
 BOX = SandboxSpec("box", KEY, RANGE, "", SETTINGS.uplink)
@@ -51,56 +48,12 @@ ACTIONS: list[Action] = [
 ]
 
 
-class Handler(BaseHTTPRequestHandler):
-    """Notes each call and its body; refuses those that the server's ``refuses`` names."""
-
-    server: "FakeEngine"
-
-    def answer(self) -> None:
-        path = re.sub(r"^/v1\.41|\?.*$", "", self.path)
-        call = f"{self.command} {path}"
-        length = int(self.headers.get("Content-Length") or 0)
-        self.server.calls[call] = json.loads(self.rfile.read(length) or "null")
-        status, message = self.server.refuses.get(call, (200, ""))
-        found = {"message": message} if message else self.server.knows.get(path, {})
-        self.send_response(status)
-        self.end_headers()
-        self.wfile.write(json.dumps(found).encode())
-
-    do_GET = do_POST = do_DELETE = answer  # noqa: N815
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-class FakeEngine(ThreadingHTTPServer):
-    """An engine of API 1.41 with one container of the operator's own on two networks."""
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.calls: dict[str, Any] = {}
-        self.refuses: dict[str, tuple[int, str]] = {}
-        box = {
-            "Config": {"Labels": own_labels(BOX)},
-            "NetworkSettings": {"Networks": {"app": {}, SETTINGS.uplink: {}}},
-        }
-        self.knows: dict[str, Any] = {
-            "/version": {"ApiVersion": "1.41"},
-            "/events": {"Action": "start"},
-            "/containers/json": [],
-            "/containers/box/json": box,
-            "/networks": [],
-            "/images/rosproxy:latest/json": {"Id": "sha256:1"},
-        }
-
-
-@pytest.fixture
-def engine(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeEngine]:
-    with FakeEngine() as engine:
-        threading.Thread(target=engine.serve_forever, args=(0.01,), daemon=True).start()
-        monkeypatch.setenv("DOCKER_HOST", f"tcp://127.0.0.1:{engine.server_port}")
-        yield engine
-        engine.shutdown()
+@pytest.fixture(autouse=True)
+def container_on_two_networks(engine: FakeEngine) -> None:
+    networks: dict[str, Any] = {"app": {}, SETTINGS.uplink: {}}
+    box = {"Config": {"Labels": own_labels(BOX)}, "NetworkSettings": {"Networks": networks}}
+    engine.knows["/containers/box/json"] = box
+    engine.knows["/images/rosproxy:latest/json"] = {"Id": "sha256:1"}
 
 
 async def carry_out(action: Action) -> None:
@@ -166,15 +119,8 @@ async def test_what_is_done_already_is_no_error(
 
 @pytest.mark.parametrize("action", ACTIONS)
 async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> None:
-    engine.refuses = dict.fromkeys(
-        ("POST /containers/create", "POST /networks/create"), (500, "no")
-    )
-    paths = ("start", "restart", "unpause", "rename")
-    engine.refuses |= {f"POST /containers/p/{path}": (500, "no") for path in paths}
-    engine.refuses |= {
-        f"POST /networks/app/{path}": (500, "no") for path in ("connect", "disconnect")
-    }
-    engine.refuses["DELETE /containers/box"] = (500, "no")
+    await carry_out(action)
+    engine.refuses = dict.fromkeys(engine.calls.keys() - {"GET /version"}, (500, "no"))
     with pytest.raises(EngineError, match="no"):
         await carry_out(action)
 
