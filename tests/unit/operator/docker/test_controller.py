@@ -12,7 +12,7 @@ from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
-from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
+from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
 from tests.unit.operator.docker.builders import KEY, RANGE
 from tests.unit.operator.docker.conftest import FakeEngine
@@ -45,13 +45,12 @@ def containers(engine: FakeEngine) -> None:
     engine.add(own(process, "p" * 64, f"container:{'b' * 64}", ""), token)
 
 
-async def look_once() -> DockerSnapshot:
-    masters = MasterResolver(lambda: None)
-    return await DockerObserver(DockerClient(), SETTINGS, masters, lambda: None).look(5.0)
+def observer() -> DockerObserver:
+    return DockerObserver(DockerClient(), SETTINGS, MasterResolver(lambda: None), lambda: None)
 
 
 async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
-    look = await look_once()
+    look = await observer().look(5.0)
     state, name = look.state, proxy_name(KEY)
     assert [container.name for container in state.containers] == ["talker"]
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
@@ -69,7 +68,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
 async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine) -> None:
     for row in engine.rows:
         del engine.knows[f"/containers/{row['Id']}/json"]
-    look = await look_once()
+    look = await observer().look(5.0)
     assert not look.state.containers
     assert look.state.busy == {proxy_name(KEY), sandbox_name(KEY)}
     assert look.state.unresolved == {"robot"}
@@ -77,8 +76,17 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
 
 async def test_a_list_that_is_behind_the_inspection_makes_busy(engine: FakeEngine) -> None:
     engine.knows[f"/containers/{'p' * 64}/json"]["State"] = {"Status": "exited"}
-    look = await look_once()
+    look = await observer().look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
+
+
+async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
+    looking = observer()
+    await looking.look(5.0)
+    del engine.knows[f"/containers/{'p' * 64}/json"]
+    look = await looking.look(5.0)
+    assert look.state.busy == {proxy_name(KEY)}
+    assert look.tokens == {KEY: "secret"}
 
 
 async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
