@@ -1,12 +1,13 @@
 """The command line ``rosproxy-operator``."""
 
+import contextlib
 import importlib.util
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -16,6 +17,7 @@ from rosproxy.cli.options import (
     GROUP_SETTINGS,
     HOST,
     PORT_RANGE,
+    Command,
     Commands,
     Parsed,
     Seconds,
@@ -24,10 +26,10 @@ from rosproxy.cli.options import (
 )
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.settings import read_bind, read_image
-from rosproxy_operator.docker.planner.model import MOST_PORTS
+from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
 from rosproxy_operator.docker.settings import (
     DEFAULT_ADMIN,
-    make_docker_settings,
+    make_plan_settings,
     read_shared_master_uri,
     read_uplink,
 )
@@ -42,15 +44,28 @@ from rosproxy_operator.kubernetes.settings import (
 )
 
 IMAGE = Parsed("image", read_image)
-MASTER_URI = Parsed("URI of a master", read_shared_master_uri)
 NAME = Parsed("namespace/name", read_name)
-NAMESPACE = Parsed("namespace", read_namespace)
-OBJECT_NAME = Parsed("name", read_object_name)
-UPLINK = Parsed("network", read_uplink)
 
 
-def _bind(example: HostPort, optional: bool = False) -> Parsed:
-    return Parsed("host:port", partial(read_bind, example, optional))
+def _bind_option(
+    name: str, example: HostPort, text: str, optional: bool = False
+) -> Callable[[Command], Command]:
+    """Where to listen: by default at the example, or if that is ``optional`` nowhere."""
+    kind = Parsed("address:port", partial(read_bind, example, optional))
+    return click.option(name, type=kind, default="none" if optional else str(example), help=text)
+
+
+def _admin_option(default: HostPort) -> Callable[[Command], Command]:
+    return _bind_option("--admin-bind", default, "Where /healthz, /readyz and /metrics are served.")
+
+
+def _image_option(text: str) -> Callable[[Command], Command]:
+    return click.option("--proxy-image", type=IMAGE, default="rosproxy:latest", help=text)
+
+
+_resync_option = click.option(
+    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
+)
 
 
 class OperatorCommands(Commands):
@@ -72,15 +87,13 @@ def main() -> None:
 )
 @click.option(
     "--master-uri",
-    type=MASTER_URI,
+    type=Parsed("URI", read_shared_master_uri),
     envvar=["ROSPROXY_MASTER_URI", "ROS_MASTER_URI"],
-    metavar="URI",
     help="The real ROS master of containers that name none.",
 )
 @click.option(
     "--advertise-host",
     type=HOST,
-    metavar="HOST",
     help="Name or address under which outside nodes and masters reach this host. Default: this "
     "host's address towards the master.",
 )
@@ -106,13 +119,7 @@ def main() -> None:
     metavar="ADDRESS",
     help="Address of this host on which ports are published (repeatable).",
 )
-@click.option(
-    "--proxy-image",
-    type=IMAGE,
-    default="rosproxy:latest",
-    metavar="IMAGE",
-    help="The proxies' image.",
-)
+@_image_option("The proxies' image.")
 @click.option(
     "--data-plane",
     type=click.Choice(["auto", "kernel", "splice", "copy"]),
@@ -131,23 +138,14 @@ def main() -> None:
     metavar="S",
     help="Time for which a proxy outlives its last container.",
 )
-@click.option(
-    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
-)
+@_resync_option
 @click.option(
     "--uplink",
-    type=UPLINK,
+    type=Parsed("network", read_uplink),
     default="0-rosproxy",
-    metavar="NETWORK",
     help="Network that is created for the proxies; it has to sort before all others.",
 )
-@click.option(
-    "--admin-bind",
-    type=_bind(DEFAULT_ADMIN),
-    default="127.0.0.1:11313",
-    metavar="ADDRESS:PORT",
-    help="Where /healthz, /readyz and /metrics are served.",
-)
+@_admin_option(DEFAULT_ADMIN)
 @log_options
 @click.option(
     "--once",
@@ -168,12 +166,12 @@ def docker(
 
     _need("docker", "docker")
     logs.set_up(log_format, log_level)
-    logging.getLogger("docker").setLevel(logging.INFO)  # the SDK tells of each request otherwise
-    logging.getLogger("urllib3").setLevel(logging.INFO)
+    for library in ("docker", "urllib3"):  # they tell of each request otherwise
+        logging.getLogger(library).setLevel(logging.INFO)
     with setting_errors():
-        context.obj = make_docker_settings(options)
+        context.obj = make_plan_settings(options)
     if context.invoked_subcommand is None:
-        _run(context.obj, once)
+        _run(context.obj, options["resync"], options["admin_bind"], once)
     elif once:
         raise click.UsageError(f"--once has no meaning for {context.invoked_subcommand}")
 
@@ -181,22 +179,21 @@ def docker(
 def _need(library: str, extra: str) -> None:
     """Say how to install a library that one kind of controller needs, if it is not there."""
     if importlib.util.find_spec(library) is None:
-        click.echo(
-            f"rosproxy-operator: the Python package {library} is not installed here: "
-            f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')",
-            err=True,
+        _fail(
+            f"the Python package {library} is not installed here: "
+            f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')"
         )
-        sys.exit(1)
 
 
-def _run(settings: Any, once: bool) -> None:
-    from rosproxy_operator.docker.run import run, run_once
+def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> None:
+    from rosproxy_operator.docker.controller import run, run_once
 
     if not once:
         with setting_errors():
-            run(settings)
+            run(settings, resync, admin)
         return
-    problems = _or_exit(lambda: run_once(settings))
+    with _one_line():
+        problems = run_once(settings, resync)
     for problem in problems:
         click.echo(f"rosproxy-operator: {problem.subject}: {problem.text}", err=True)
     sys.exit(1 if problems else 0)
@@ -206,45 +203,40 @@ def _run(settings: Any, once: bool) -> None:
 @click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
 @click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
 @click.pass_obj
-def status(settings: Any, as_json: bool, watch: bool) -> None:
+def status(settings: PlanSettings, as_json: bool, watch: bool) -> None:
     """Show the proxies, the labelled containers, their nodes, and what is wrong.
 
     Needs no running controller.
     """
     if as_json and watch:
         raise click.UsageError("--json or --watch, not both")
-    from rosproxy_operator.docker import run
+    from rosproxy_operator.docker.status import show_status, watch_status
 
     if watch:
-        run.watch_status(settings.plan)
+        watch_status(settings)
     else:
-        _or_exit(lambda: run.show_status(settings.plan, as_json))
+        with _one_line():
+            show_status(settings, as_json)
 
 
 @docker.command()
 @click.pass_obj
-def plan(settings: Any) -> None:
+def plan(settings: PlanSettings) -> None:
     """Show what the operator would do now, and change nothing."""
-    from rosproxy_operator.docker import run
+    from rosproxy_operator.docker.status import show_plan
 
-    _or_exit(lambda: run.show_plan(settings.plan))
+    with _one_line():
+        show_plan(settings)
 
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
 @click.option(
     "--namespace",
-    type=NAMESPACE,
+    type=Parsed("name", read_namespace),
     multiple=True,
-    metavar="NAME",
     help="Look after the RosProxies of this namespace only (repeatable). Default: of all.",
 )
-@click.option(
-    "--proxy-image",
-    type=IMAGE,
-    default="rosproxy:latest",
-    metavar="IMAGE",
-    help="Image of the proxies whose RosProxy names none.",
-)
+@_image_option("Image of the proxies whose RosProxy names none.")
 @click.option(
     "--proxy-image-pull-policy",
     type=click.Choice(["Always", "IfNotPresent", "Never"]),
@@ -264,32 +256,26 @@ def plan(settings: Any) -> None:
     metavar="A-B",
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
-@click.option(
-    "--resync", type=Seconds(1.0), default=30.0, metavar="S", help="Longest time between two looks."
-)
-@click.option(
+@_resync_option
+@_bind_option(
     "--webhook-bind",
-    type=_bind(DEFAULT_WEBHOOK, optional=True),
-    default="none",
-    metavar="ADDRESS:PORT",
-    help="Where the admission webhook is served that wires pods; none: it is not.",
+    DEFAULT_WEBHOOK,
+    "Where the admission webhook is served that wires pods; none: it is not.",
+    optional=True,
 )
 @click.option(
     "--webhook-service",
     type=NAME,
-    metavar="NAMESPACE/NAME",
     help="The webhook's Service: the names for which its certificate is made.",
 )
 @click.option(
     "--webhook-secret",
     type=NAME,
-    metavar="NAMESPACE/NAME",
     help="An existing Secret in which that certificate is kept over restarts.",
 )
 @click.option(
     "--webhook-configuration",
-    type=OBJECT_NAME,
-    metavar="NAME",
+    type=Parsed("name", read_object_name),
     help="The MutatingWebhookConfiguration into which its CA is written.",
 )
 @click.option(
@@ -297,19 +283,11 @@ def plan(settings: Any) -> None:
     metavar="DIR",
     help="Take the certificate from here instead (tls.crt, tls.key), anew when it changes.",
 )
-@click.option(
-    "--admin-bind",
-    type=_bind(CLUSTER_ADMIN),
-    default="0.0.0.0:11313",
-    metavar="ADDRESS:PORT",
-    help="Where /healthz, /readyz and /metrics are served.",
-)
-@click.option(
+@_admin_option(CLUSTER_ADMIN)
+@_bind_option(
     "--liveness-bind",
-    type=_bind(DEFAULT_LIVENESS),
-    default="0.0.0.0:8080",
-    metavar="ADDRESS:PORT",
-    help="Where /healthz is served for the kubelet: it fails when any part hangs.",
+    DEFAULT_LIVENESS,
+    "Where /healthz is served for the kubelet: it fails when any part hangs.",
 )
 @log_options
 def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
@@ -332,11 +310,8 @@ def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
 
     logs.set_up(log_format, log_level)
     quieten()
-    try:
+    with _one_line(ApiError):
         run(settings)
-    except ApiError as error:
-        click.echo(f"rosproxy-operator: {error}", err=True)
-        sys.exit(1)
 
 
 @main.command()
@@ -348,18 +323,21 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        reason = str(error) if "HTTP" in str(error) else f"no operator answers at {url}"
-        click.echo(f"rosproxy-operator: {reason}", err=True)
-        sys.exit(1)
+        _fail(error if "HTTP" in str(error) else f"no operator answers at {url}")
 
 
-def _or_exit(work: Callable[[], Any]) -> Any:
-    """Do something that may find no engine, and say so in one line."""
+@contextlib.contextmanager
+def _one_line(*more: type[Exception]) -> Iterator[None]:
+    """Tell in one line that the engine or the API server can't be asked."""
     from rosproxy_operator.common.control_loop import LookFailed
     from rosproxy_operator.docker.errors import EngineError
 
     try:
-        return work()
-    except (EngineError, LookFailed) as error:
-        click.echo(f"rosproxy-operator: {error}", err=True)
-        sys.exit(1)
+        yield
+    except (EngineError, LookFailed, *more) as error:
+        _fail(error)
+
+
+def _fail(reason: object) -> NoReturn:
+    click.echo(f"rosproxy-operator: {reason}", err=True)
+    sys.exit(1)

@@ -138,16 +138,6 @@ def test_reference_names_every_option_label_and_metric_of_docker() -> None:
     assert not [word for word in [*options, *LABELS, *own] if word not in text]
 
 
-def test_reference_lists_the_engine_calls() -> None:
-    from rosproxy_operator.docker import client
-
-    assert client.__doc__ is not None
-    calls = re.findall(r"^    ((?:GET|POST|DELETE) \S+)$", client.__doc__, re.M)
-    page = (REFERENCE / "permissions.md").read_text()
-    assert calls
-    assert re.findall(r"^(?:GET|POST|DELETE) \S+$", page, re.M) == calls
-
-
 def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
     from rosproxy_operator.cli import main
     from rosproxy_operator.common.metrics import ClusterMetrics

@@ -1,32 +1,17 @@
 """The Docker engine as far as the operator needs it: a thin layer over the SDK's APIClient.
 
-A socket proxy in front of the engine has to let exactly these through, with ``/v1.41`` (whatever
-version both sides know) before each path but the first::
-
-    GET /version
-    GET /events
-    GET /containers/json
-    GET /containers/[^/]+/json
-    GET /networks
-    GET /images/.+/json
-    POST /networks/create
-    POST /networks/[^/]+/connect
-    POST /networks/[^/]+/disconnect
-    POST /containers/create
-    POST /containers/[^/]+/start
-    POST /containers/[^/]+/restart
-    POST /containers/[^/]+/stop
-    POST /containers/[^/]+/unpause
-    POST /containers/[^/]+/rename
-    DELETE /containers/[^/]+
-
-``rosproxy-operator docker status`` and ``plan`` need the GETs alone.
+docs/reference/permissions.md lists what a socket proxy in front of the engine has to let through,
+with ``/v1.41`` (whatever version both sides know) before each path but the first; the GETs are
+enough for ``rosproxy-operator docker status`` and ``plan``.
 """
 
+import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Iterator, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import requests
@@ -34,7 +19,7 @@ from docker.errors import APIError, DockerException, TLSParameterError
 from docker.utils import kwargs_from_env
 
 import docker
-from rosproxy_operator.docker.errors import Gone, Unavailable, refusal, unreachable
+from rosproxy_operator.docker.errors import EngineError, Gone, Unavailable, refusal, unreachable
 
 Json = dict[str, Any]
 DEFAULT_SOCKET = "unix:///var/run/docker.sock"
@@ -42,8 +27,17 @@ READ_TIMEOUT = 20
 """Seconds that the engine has to answer a question."""
 WRITE_TIMEOUT = 300
 """Seconds that it has to do something: publishing or freeing 1000 ports takes it a minute."""
-STOP_TIMEOUT = 2
-"""Seconds that a process has to end before it is killed."""
+FILTERS = {
+    "type": ["container", "network", "image"],
+    "event": [
+        *("create", "start", "die", "destroy", "pause", "unpause", "rename"),
+        *("connect", "disconnect"),
+        *("tag", "untag", "pull", "load", "import", "delete"),
+    ],
+}
+"""What may change a plan. Health checks and ``docker exec`` are told often and change nothing."""
+PAUSES = (0.2, 0.5, 1.0, 2.0, 5.0)
+"""Seconds between attempts to listen to events again; the last one is repeated."""
 
 
 class DockerClient:
@@ -60,119 +54,64 @@ class DockerClient:
 
     def containers(self) -> list[Json]:
         """All containers, whatever their state, as the engine lists them."""
-        found: list[Json] = self._ask("containers", all=True)
-        return found
+        return list(self._call(READ_TIMEOUT, "containers", all=True))
 
     def container(self, name: str) -> Json:
         """Everything about a container, by id or name."""
-        found: Json = self._ask("inspect_container", name)
-        return found
+        return dict(self._call(READ_TIMEOUT, "inspect_container", name))
 
     def networks(self) -> list[Json]:
         """All networks."""
-        found: list[Json] = self._ask("networks")
-        return found
+        return list(self._call(READ_TIMEOUT, "networks"))
 
     def image_id(self, image: str) -> str:
         """The id of an image, empty if the host does not have it."""
         try:
-            return str(self._ask("inspect_image", image)["Id"])
+            return str(self._call(READ_TIMEOUT, "inspect_image", image)["Id"])
         except Gone:
             return ""
 
-    def events(self, filters: Mapping[str, list[str]]) -> Iterator[Json]:
-        """What happens from now on; ends when the connection does.
+    def events(self) -> Iterator[Json]:
+        """What happens from now on that may change a plan; ends when the connection does.
 
         The connection stands when this returns, so that whatever is listed after that has either
         happened before or is going to be told.
         """
         with self._translated():
-            client = self._connect()
-            stream: Iterator[Json] = client.events(filters=dict(filters), decode=True)
+            stream = self._connect().events(filters=FILTERS, decode=True)
         return self._each(stream)
 
-    def create_network(self, name: str, labels: Mapping[str, str]) -> None:
-        """Create a bridge network."""
-        self._do("create_network", name, driver="bridge", labels=dict(labels), check_duplicate=True)
-
-    def create_container(self, name: str, config: Mapping[str, Any]) -> None:
-        """Create a container from the engine's own description of one."""
-        self._do("create_container_from_config", dict(config), name)
-
-    def start(self, name: str) -> None:
-        """Start a container; one that runs is left alone."""
-        self._do("start", name)
-
-    def restart(self, name: str) -> None:
-        """End a container's process and start it again, or only start it."""
-        self._do("restart", name, timeout=STOP_TIMEOUT)
-
-    def stop(self, name: str) -> None:
-        """End a container's process; one that does not run is left alone."""
-        self._do("stop", name, timeout=STOP_TIMEOUT)
-
-    def unpause(self, name: str) -> None:
-        """Resume a container."""
-        self._do("unpause", name)
-
-    def rename(self, name: str, to: str) -> None:
-        """Rename a container."""
-        self._do("rename", name, to)
-
-    def remove(self, name: str) -> None:
-        """Kill and remove a container."""
-        self._do("remove_container", name, force=True)
-
-    def connect(self, name: str, network: str, aliases: tuple[str, ...]) -> None:
-        """Connect a container to a network under these names."""
-        self._do("connect_container_to_network", name, network, aliases=list(aliases))
-
-    def disconnect(self, name: str, network: str) -> None:
-        """Disconnect a container from a network, also from one that does not exist any more."""
-        self._do("disconnect_container_from_network", name, network, force=True)
-
-    def _ask(self, method: str, *arguments: Any, **more: Any) -> Any:
-        return self._call(READ_TIMEOUT, method, *arguments, **more)
-
-    def _do(self, method: str, *arguments: Any, **more: Any) -> None:
+    def do(self, method: str, *arguments: Any, **more: Any) -> None:
+        """Let the engine do something, by a method of the SDK's APIClient."""
         self._call(WRITE_TIMEOUT, method, *arguments, **more)
 
     def _call(self, within: int, method: str, *arguments: Any, **more: Any) -> Any:
         """Call the SDK by a client that nobody else uses now: they are not meant to be shared."""
         with self._translated():
-            client = self._idle.pop() if self._idle else self._connect()
+            try:
+                client = self._idle.pop()
+            except IndexError:
+                client = self._connect()
             client.timeout = within
             try:
-                result = getattr(client, method)(*arguments, **more)
-            except APIError:
+                return getattr(client, method)(*arguments, **more)
+            finally:
                 self._idle.append(client)
-                raise
-            self._idle.append(client)
-            return result
 
     def _connect(self) -> Any:
-        self._knock()
-        client = docker.APIClient(
-            version=self._version or "auto", timeout=READ_TIMEOUT, **kwargs_from_env()
-        )
-        self._version = client.api_version
-        return client
-
-    def _knock(self) -> None:
-        """Raise OSError if nobody listens at the socket; the SDK would leave one open each time."""
         if self.url.startswith("unix://"):
+            # Where nobody listens, the SDK would leave a socket open each time.
             with socket.socket(socket.AF_UNIX) as probe:
                 probe.settimeout(READ_TIMEOUT)
                 probe.connect(self.url.removeprefix("unix://"))
+        version = self._version or "auto"
+        client = docker.APIClient(version=version, timeout=READ_TIMEOUT, **kwargs_from_env())
+        self._version = client.api_version
+        return client
 
     def _each(self, stream: Iterator[Json]) -> Iterator[Json]:
         with self._translated():
             yield from stream
-
-    def _forget(self) -> None:
-        """Ask for the version anew: the next engine behind this address may be another one."""
-        self._version = None
-        self._idle.clear()
 
     @contextlib.contextmanager
     def _translated(self) -> Iterator[None]:
@@ -184,7 +123,32 @@ class DockerClient:
             what = f"{request.method} {request.path_url.partition('?')[0]}" if request else ""
             raise refusal(error.status_code or 0, str(error.explanation or error), what) from error
         except (DockerException, TLSParameterError, requests.RequestException, OSError) as error:
-            self._forget()
+            self._version = None  # the next engine behind this address may be another one
+            self._idle.clear()
             raise unreachable(self.url, error) from error
         except (ValueError, KeyError, TypeError) as error:
             raise Unavailable(f"what answers at {self.url} is no Docker engine: {error}") from error
+
+
+def listen(engine: DockerClient, tell: Callable[[bool], None]) -> None:
+    """Listen to the engine for good, in a thread of its own. Needs a running event loop.
+
+    ``tell`` is called in the event loop, with False when something has changed and with True after
+    each connect: the engine is there, and what happened before that was missed.
+    """
+    loop = asyncio.get_running_loop()
+
+    def work() -> None:
+        failures = 0
+        while not loop.is_closed():
+            # The looks tell of errors of the engine; the loop may have been closed meanwhile.
+            with contextlib.suppress(EngineError, RuntimeError):
+                events = engine.events()
+                failures = 0
+                loop.call_soon_threadsafe(tell, True)
+                for _ in events:
+                    loop.call_soon_threadsafe(tell, False)
+            time.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
+            failures += 1
+
+    threading.Thread(target=work, daemon=True, name="events").start()

@@ -1,30 +1,33 @@
 """Reconciling a Docker host: look, plan, carry out, tell. The loop around that is `ControlLoop`.
 
-The way of a label, in one direction: `events` tells that something has changed and wakes the loop.
-A look lists everything anew and reads the labels (`snapshot`), decides (`planner.plan`), begins to
-carry out what was decided (`executor`, action by action `apply`), and brings the running proxies up
-to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
+The way of a label, in one direction: the engine's events (`client`) tell that something has changed
+and wake the loop. A look lists everything anew and reads the labels (`snapshot`), decides
+(`planner.plan`), begins to carry out what was decided (`executor`), and brings the running proxies
+up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides.
 """
 
+import asyncio
 import logging
+import signal
 import time
 
+from rosproxy import __version__
+from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
+from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
-from rosproxy_operator.docker.apply import DockerApplier
-from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.client import DockerClient, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
-from rosproxy_operator.docker.events import Events
-from rosproxy_operator.docker.executor import Executor
+from rosproxy_operator.docker.executor import DockerApplier, Executor
+from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan, plan
 from rosproxy_operator.docker.planner.specs import proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import DockerProxySync
-from rosproxy_operator.docker.settings import DockerSettings
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 log = logging.getLogger(__name__)
@@ -36,27 +39,58 @@ SETTLED = 0.25
 lists them."""
 LONGEST_LOOK = 60.0
 """Seconds after which a look that has not ended is given up."""
+ONCE = 60.0
+"""Seconds within which ``--once`` has to reach what is wanted."""
+
+
+def run_once(settings: PlanSettings, resync: float) -> list[Problem]:
+    """Look and act until nothing is left to do; what is not as wanted. Raises LookFailed."""
+    return asyncio.run(DockerController(settings, resync, DockerMetrics()).run_once(ONCE))
+
+
+def run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
+    """Run the operator until a signal ends it; its proxies go on. Raises SettingError.
+
+    ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
+    serves its own health.
+    """
+    asyncio.run(_run(settings, resync, admin))
+
+
+async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    metrics = DockerMetrics()
+    controller = DockerController(settings, resync, metrics)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready)
+    await health.start(admin)
+    log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
+    running = asyncio.create_task(controller.run())
+    stopping = asyncio.create_task(stopped.wait())
+    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+    if running.done():
+        running.result()  # raises what it died of
+    running.cancel()
+    await asyncio.gather(running, stopping, health.stop(), return_exceptions=True)
 
 
 class DockerController:
     """Reconciles one engine's host. `run` it in an event loop."""
 
-    def __init__(self, settings: DockerSettings, metrics: DockerMetrics) -> None:
+    def __init__(self, settings: PlanSettings, resync: float, metrics: DockerMetrics) -> None:
         self._settings, self._metrics = settings, metrics
-        self._loop = loop = ControlLoop(
-            Pace("engine", settings.resync, DEBOUNCE, LONGEST_LOOK), metrics
-        )
+        pace = Pace("engine", resync, DEBOUNCE, LONGEST_LOOK)
+        self._loop = loop = ControlLoop(pace, metrics)
         self.dead, self.unready = loop.dead, loop.unready
         self._tasks = Tasks()
-        engine = DockerClient()
+        self._engine = engine = DockerClient()
         self._proxies = ProxyClient()
         self._masters = MasterResolver(loop.wake)
-        self._observer = DockerObserver(engine, settings.plan, self._masters, loop.wake)
-        self._applier = DockerApplier(engine, settings.plan, self._proxies)
+        self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
+        self._applier = DockerApplier(engine, settings, self._proxies)
         self._executor = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
-        uplink = settings.plan.uplink
-        self._proxy_sync = DockerProxySync(self._tasks, self._proxies, uplink, loop.wake)
-        self._events = Events(engine, self._connected, self._changed)
+        self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings.uplink, loop.wake)
         self._memory = DockerMemory()
         self._shown: list[Problem] = []
         self._log = ProblemLog()
@@ -64,7 +98,7 @@ class DockerController:
 
     async def run(self) -> None:
         """Look after the engine until cancelled. Proxies go on without an operator."""
-        self._events.start()
+        listen(self._engine, self._hear)
         self._tasks.repeat(self._masters.refresh, AGAIN_UNRESOLVED, "resolving masters")
         try:
             await self._loop.run(self.look)
@@ -76,7 +110,7 @@ class DockerController:
 
         Returns what is not as it should be. Raises LookFailed if the engine can't be reached.
         """
-        self._events.start()
+        listen(self._engine, self._hear)
         try:
             await self._loop.run_until(self.look, self._settled, seconds)
             return self._unsolved()
@@ -90,48 +124,38 @@ class DockerController:
             look = await self._observer.look()
         except EngineError as error:
             raise LookFailed(str(error), away=isinstance(error, Unavailable)) from error
-        planned = plan(look.state, look.labels, self._settings.plan, self._memory, time.monotonic())
-        self._metrics.look_time.observe(time.monotonic() - started)
-        self._memory = planned.memory
-        self._act(look, planned, started)
-        self._looked(look, planned)
-        times = [each for each in (planned.again_in, self._executor.again_in) if each is not None]
-        return min(times, default=None)
-
-    def _act(self, look: DockerSnapshot, planned: DockerPlan, seen: float) -> None:
-        """Begin what is to be done and told."""
+        planned = plan(look.state, look.labels, self._settings, self._memory, time.monotonic())
+        took = time.monotonic() - started
         log.debug(
             "looked in %.3f s: %d actions, again in %s s",
-            time.monotonic() - seen,
+            took,
             len(planned.actions),
             planned.again_in,
         )
+        self._memory, self._last = planned.memory, (look, planned)
         if look.state.busy and not self._observer.waiting:
             self._loop.wake_in(SETTLED)  # nobody is going to tell when the list is right
-        groups = planned.groups
-        self._executor.start(groups, lambda action: self._applier.carry_out(action, look), seen)
+        self._executor.start(
+            planned.groups, lambda action: self._applier.carry_out(action, look), started
+        )
         self._proxy_sync.update(look, planned.members)
-
-    def _looked(self, look: DockerSnapshot, planned: DockerPlan) -> None:
-        self._last = look, planned
         problems = self._current(look, planned)
         self._log.update(problems)
         metrics = self._metrics
+        metrics.look_time.observe(took)
         metrics.containers.set(sum(member.alive for member in planned.members))
         metrics.problems.set(len(problems))
         metrics.show_proxies(proxy.container.state for proxy in look.state.proxies)
+        times = (planned.again_in, self._executor.again_in)
+        return min((each for each in times if each is not None), default=None)
 
     def _current(self, look: DockerSnapshot, planned: DockerPlan) -> list[Problem]:
         """All problems; those of what is being worked on as they were before.
 
         What a look finds and plans in the midst of it is outdated a moment later.
         """
-        found = [
-            *planned.problems,
-            *self._executor.problems,
-            *self._proxy_sync.problems(look),
-        ]
-        busy = self._executor.subjects
+        found = [*planned.problems, *self._executor.problems, *self._proxy_sync.problems(look)]
+        busy = self._executor.busy
         self._shown = [
             *(problem for problem in found if problem.subject not in busy),
             *(problem for problem in self._shown if problem.subject in busy),
@@ -145,9 +169,8 @@ class DockerController:
         look, planned = self._last
         if self._executor.problems or self._proxy_sync.problems(look):
             return True
-        if look.state.busy or self._observer.waiting:
-            return False
-        return not planned.groups and not self._silent(planned)
+        waiting = look.state.busy or self._observer.waiting
+        return not waiting and not planned.groups and not self._silent(planned)
 
     def _silent(self, planned: DockerPlan) -> list[str]:
         """The proxies that are wanted and do not answer."""
@@ -171,14 +194,12 @@ class DockerController:
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:
-        ports = None if port is None else [port]
-        self._memory = self._memory.port_taken(name, ports, time.monotonic())
+        self._memory = self._memory.port_taken(name, [port] if port else None, time.monotonic())
 
-    def _connected(self) -> None:
-        self._loop.retry()
-        self._loop.wake_in(SETTLED)
-
-    def _changed(self) -> None:
+    def _hear(self, connected: bool) -> None:
+        """Take note of an event, or of a new connection: what happened before was missed."""
+        if connected:
+            self._loop.retry()
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

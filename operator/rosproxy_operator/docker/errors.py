@@ -3,7 +3,6 @@
 import errno
 import os
 import re
-from collections.abc import Iterator
 
 _PORT_TAKEN = re.compile(
     r"port is already allocated|address already in use|ports are not available"
@@ -11,6 +10,8 @@ _PORT_TAKEN = re.compile(
 _PORT = re.compile(r"(?:[0-9.]+|\[[0-9A-Fa-f:]*\]|::):([0-9]{1,5})\b")
 _FOREIGN_ADDRESS = re.compile(r"(\S+): bind: cannot assign requested address")
 _IDS = re.compile(r"\b[0-9a-f]{64}\b")
+_ENGINES_OWN = re.compile(r"endpoint|network|container")
+"""What the engine speaks of when it answers 403 itself; a proxy in front of it does not."""
 
 
 class EngineError(Exception):
@@ -26,12 +27,7 @@ class Conflict(EngineError):
 
 
 class Gone(EngineError):
-    """An object does not exist. ``kind`` is ``container``, ``network`` or ``image``."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message)
-        lowered = message.lower()
-        self.kind = next((k for k in ("network", "image") if k in lowered), "container")
+    """A container, network or image does not exist."""
 
 
 class PortTaken(EngineError):
@@ -50,12 +46,15 @@ def refusal(status: int, text: str, request: str) -> EngineError:
     if status == 409:
         return Conflict(message)
     if _PORT_TAKEN.search(message):
-        return PortTaken(message, _port_in(message))
+        # The endpoint's name before the ports may hold anything.
+        ports = map(int, _PORT.findall(message.rpartition("endpoint ")[2]))
+        return PortTaken(message, next(filter(None, ports), None))
     if foreign := _FOREIGN_ADDRESS.search(message):
-        text = f"--publish-address: {foreign[1].rpartition(':')[0]} is not an address of this host"
-        return EngineError(text)
-    if status in (401, 403, 404, 405) and not _is_engines(message):
-        return EngineError(
+        message = (
+            f"--publish-address: {foreign[1].rpartition(':')[0]} is not an address of this host"
+        )
+    elif status in (401, 403, 404, 405) and not _ENGINES_OWN.search(message):
+        message = (
             f"{request} is not allowed (HTTP {status}: {message[:100]}); "
             "let it through the proxy in front of the engine's socket"
         )
@@ -65,7 +64,10 @@ def refusal(status: int, text: str, request: str) -> EngineError:
 def unreachable(url: str, error: BaseException) -> Unavailable:
     """The error for an engine at ``url`` that can't be asked."""
     path = url.removeprefix("unix://")
-    number = next((e.errno for e in _chain(error) if isinstance(e, OSError) and e.errno), None)
+    chain = [error]  # requests and urllib3 wrap an OSError in two layers, the SDK in a third
+    while cause := chain[-1].__cause__ or chain[-1].__context__:
+        chain.append(cause)
+    number = next((e.errno for e in chain if isinstance(e, OSError) and e.errno), None)
     if number in (errno.EACCES, errno.EPERM):
         return Unavailable(
             f"no permission to use the Docker engine's socket {path}: run as root or with "
@@ -78,19 +80,7 @@ def unreachable(url: str, error: BaseException) -> Unavailable:
         )
     if number == errno.ECONNREFUSED:
         return Unavailable(f"no Docker engine answers at {url}: is it running?")
-    deepest = [*_chain(error)][-1]
-    return Unavailable(f"the Docker engine at {url} can't be asked: {str(deepest)[:200]}")
-
-
-def _port_in(message: str) -> int | None:
-    """The port in the message; not in the endpoint's name before it, which may hold anything."""
-    found = [int(port) for port in _PORT.findall(message.rpartition("endpoint ")[2])]
-    return next((port for port in found if port), None)
-
-
-def _is_engines(message: str) -> bool:
-    """Whether the engine itself says so: it has its reasons to answer 403."""
-    return re.search(r"endpoint|network|container", message) is not None
+    return Unavailable(f"the Docker engine at {url} can't be asked: {str(chain[-1])[:200]}")
 
 
 def _group(path: str) -> str:
@@ -98,13 +88,3 @@ def _group(path: str) -> str:
         return str(os.stat(path).st_gid)
     except OSError:
         return "GID"
-
-
-def _chain(error: BaseException) -> Iterator[BaseException]:
-    """The error, what it carries and what caused it; requests wraps OSErrors in two layers."""
-    yield error
-    inner = [a for a in error.args if isinstance(a, BaseException)]
-    inner += [e for e in (getattr(error, "reason", None),) if isinstance(e, BaseException)]
-    cause = error.__cause__ or error.__context__
-    for each in dict.fromkeys([*inner, *([cause] if cause else [])]):
-        yield from _chain(each)

@@ -1,30 +1,68 @@
-"""Work under way: the groups of a plan, each key's apart from the others'.
+"""Carrying out what was planned, each key's work apart from the others'.
 
 A key's work may take a minute (the engine publishes a thousand ports) or fail for ever; meanwhile
 looks go on and the other keys are served.
+
+Every action may be carried out twice, or after somebody else did it, or on something that has
+vanished meanwhile: that is no error, the next look sees what is left to do.
 """
 
 import asyncio
 import logging
+import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.errors import EngineError, PortTaken
-from rosproxy_operator.docker.planner.actions import Action, Connect, Disconnect
-from rosproxy_operator.docker.planner.model import Key
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.docker.client import DockerClient, Json
+from rosproxy_operator.docker.errors import Conflict, EngineError, Gone, PortTaken
+from rosproxy_operator.docker.planner.actions import (
+    Action,
+    Connect,
+    Create,
+    CreateNetwork,
+    CreateSandbox,
+    Disconnect,
+    Remove,
+    Rename,
+    Restart,
+    Start,
+    Unpause,
+)
+from rosproxy_operator.docker.planner.model import Key, PlanSettings
 from rosproxy_operator.docker.planner.plan import Group
-from rosproxy_operator.docker.planner.specs import proxy_name
+from rosproxy_operator.docker.planner.specs import (
+    MANAGED,
+    container_config,
+    proxy_name,
+    read_own,
+    sandbox_config,
+)
+from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
 
 BACK_OFF = (1.0, 2.0, 5.0, 15.0, 60.0)
 """Seconds until the same actions are tried again that have failed; the last is repeated."""
-
 QUIET = 120.0
 """Seconds without a failure after which the same one is worth a line in the log again."""
+STOP_TIMEOUT = 2
+"""Seconds that a process has to end before it is killed."""
+DONE: dict[type, tuple[str, ...]] = {
+    CreateNetwork: ("already exists",),
+    Start: ("is not running",),
+    Restart: (),
+    Unpause: ("is not paused",),
+    Rename: ("same name as its current name",),
+    Connect: ("already exists in network", "already attached"),
+    Disconnect: ("is not connected",),
+    Remove: ("is already in progress",),
+}
+"""What the engine says when there is nothing left to do; nor is there for what is gone."""
 
 CarryOut = Callable[[Action], Awaitable[None]]
 
@@ -33,7 +71,7 @@ CarryOut = Callable[[Action], Awaitable[None]]
 class _Failure:
     """What failed for a key, how often in a row, when to try again, and what to tell."""
 
-    actions: tuple[Action, ...]
+    actions: list[Action]
     count: int
     again: float
     problem: Problem
@@ -62,12 +100,7 @@ class Executor:
         self._refused: dict[Action, tuple[str, float]] = {}
 
     @property
-    def busy(self) -> bool:
-        """Whether anything is under way."""
-        return bool(self._busy)
-
-    @property
-    def subjects(self) -> frozenset[str]:
+    def busy(self) -> frozenset[str]:
         """What is being worked on, as problems name it."""
         return frozenset(map(_subject, self._busy))
 
@@ -100,44 +133,36 @@ class Executor:
             if key in by_key or self._over.get(key, 0.0) >= seen
         }
         for key in sorted(by_key, key=lambda key: key is not None):  # the uplink first
-            actions = _actions(by_key[key])
+            actions = [action for group in by_key[key] for action in group.actions]
             failure = self._failures.get(key)
             waiting = failure and failure.actions == actions and now < failure.again
             if actions and not waiting and key not in self._busy:
-                after = self._busy.get(None) if key else None
-                work = self._run(key, by_key[key], carry_out, after)
+                work = self._run(key, by_key[key], actions, carry_out)
                 name = f"work for {key.master_uri if key else 'the uplink'}"
                 self._busy[key] = self._tasks.spawn(work, name)
 
     async def _run(
-        self,
-        key: Key | None,
-        groups: list[Group],
-        carry_out: CarryOut,
-        after: "asyncio.Task[None] | None",
+        self, key: Key | None, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
-        """Carry out all groups, and note the first thing that goes wrong."""
+        """Carry out all groups, after the uplink's, and note the first thing that goes wrong."""
+        problem: Problem | None = None
         try:
-            if after is not None:
-                await asyncio.wait([after])
+            if key and None in self._busy:
+                await asyncio.wait([self._busy[None]])
             problems = [await self._group(group, carry_out) for group in groups]
-            self._note(key, groups, next((problem for problem in problems if problem), None))
+            problem = next(filter(None, problems), None)
         except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
             log.exception("work for %s failed", key)
             problem = Problem(_subject(key), f"the operator failed: {error!r}")
-            self._note(key, groups, problem)
         finally:
+            before = self._failures.pop(key, None)
+            if problem is not None:
+                count = before.count + 1 if before and before.actions == actions else 1
+                again = time.monotonic() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
+                self._failures[key] = _Failure(actions, count, again, problem)
             del self._busy[key]
             self._over[key] = time.monotonic()
             self._finished()
-
-    def _note(self, key: Key | None, groups: list[Group], problem: Problem | None) -> None:
-        before = self._failures.pop(key, None)
-        if problem is not None:
-            actions = _actions(groups)
-            count = before.count + 1 if before and before.actions == actions else 1
-            pause = BACK_OFF[min(count, len(BACK_OFF)) - 1]
-            self._failures[key] = _Failure(actions, count, time.monotonic() + pause, problem)
 
     async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
         """Carry a group out as far as possible; what went wrong.
@@ -148,43 +173,120 @@ class Executor:
         for action in group.actions:
             try:
                 await self._one(action, carry_out)
+            except PortTaken as error:
+                self._port_taken(getattr(action, "name", ""), error.port)
+                break
             except EngineError as error:
-                self._refuse(action, error)
-                if isinstance(error, PortTaken):
-                    self._port_taken(getattr(action, "name", ""), error.port)
-                    break
                 problem = Problem(_subject(group.key), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
 
     async def _one(self, action: Action, carry_out: CarryOut) -> None:
-        again = action in self._refused
-        log.log(logging.DEBUG if again else logging.INFO, "%s", action)
+        """Carry an action out, and log why it failed: once while it is tried again and again."""
+        before, _ = self._refused.get(action, (None, 0.0))
+        log.log(logging.INFO if before is None else logging.DEBUG, "%s", action)
         outcome = "failed"
         started = time.monotonic()
         try:
             await carry_out(action)
             outcome = "ok"
             self._refused.pop(action, None)
-        except PortTaken:
-            outcome = "taken"
+        except EngineError as error:
+            reason = str(error)
+            if isinstance(error, PortTaken):
+                outcome = reason = "taken"  # maybe another port each time
+            log.log(logging.DEBUG if reason == before else logging.WARNING, "%s: %s", action, error)
+            self._refused[action] = reason, time.monotonic()
             raise
         finally:
             self._counted(action, outcome)
             log.debug("%s: %s in %.3f s", action, outcome, time.monotonic() - started)
 
-    def _refuse(self, action: Action, error: EngineError) -> None:
-        """Log why an action failed, once while it is tried again and again."""
-        reason = type(error).__name__ if isinstance(error, PortTaken) else str(error)
-        again = self._refused.get(action, ("", 0.0))[0] == reason
-        log.log(logging.DEBUG if again else logging.WARNING, "%s: %s", action, error)
-        self._refused[action] = reason, time.monotonic()
-
-
-def _actions(groups: Iterable[Group]) -> tuple[Action, ...]:
-    return tuple(action for group in groups for action in group.actions)
-
 
 def _subject(key: Key | None) -> str:
     return f"proxy {proxy_name(key)}" if key else "uplink"
+
+
+class DockerApplier:
+    """Carries out actions, each in a thread."""
+
+    def __init__(self, engine: DockerClient, settings: PlanSettings, proxies: ProxyClient) -> None:
+        self._engine, self._settings, self._proxies = engine, settings, proxies
+
+    async def carry_out(self, action: Action, look: DockerSnapshot) -> None:
+        """Carry out an action that was planned from a look. Raises EngineError."""
+        if isinstance(action, Remove) and action.retire and action.name in look.access:
+            await self._retire(action.name, look.access[action.name])
+        await in_thread(self._do, action, look)
+
+    async def _retire(self, name: str, access: ProxyAccess) -> None:
+        try:
+            told = await self._proxies.retire(access.admin, access.token)
+            log.info("%s has unregistered %s nodes at its master", name, told.get("unregistered"))
+        except ProxyError as error:
+            log.warning("%s could not unregister its nodes at the master: %s", name, error)
+
+    def _do(self, action: Action, look: DockerSnapshot) -> None:
+        try:
+            self._call(action, look)
+        except EngineError as error:
+            done = DONE.get(type(action))
+            if done is None or not (
+                isinstance(error, Gone) or any(words in str(error) for words in done)
+            ):
+                raise
+            log.debug("nothing left to do: %s", error)
+
+    def _call(self, action: Action, look: DockerSnapshot) -> None:  # noqa: C901 - one case per action
+        do = self._engine.do
+        match action:
+            case CreateNetwork(name):
+                labels = {MANAGED: "true"}
+                do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
+            case CreateSandbox(spec):
+                self._create(spec.name, sandbox_config(spec, self._settings))
+            case Create(spec):
+                token = look.tokens.get(spec.key) or secrets.token_hex(16)
+                address = look.master_address(spec.key)
+                self._create(spec.name, container_config(spec, self._settings, token, address))
+            case Start(name):
+                do("start", name)
+            case Restart(name):
+                do("restart", name, timeout=STOP_TIMEOUT)
+            case Unpause(name):
+                do("unpause", name)
+            case Rename(name, to):
+                do("rename", name, to)
+            case Connect(name, network, aliases):
+                do("connect_container_to_network", name, network, aliases=list(aliases))
+            case Disconnect(name, network):  # also from one that does not exist any more
+                do("disconnect_container_from_network", name, network, force=True)
+            case Remove():
+                self._remove(action, look)
+
+    def _remove(self, action: Remove, look: DockerSnapshot) -> None:
+        name = action.name
+        if action.stop:
+            try:
+                self._engine.do("stop", name, timeout=STOP_TIMEOUT)
+            except EngineError as error:
+                log.debug("%s is killed, as it can't be stopped: %s", name, error)
+        # The engine lays the published ports anew over each network that a container still has
+        # when it ends, which takes 2 s per network.
+        networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
+        for network in networks:
+            if network != self._settings.uplink:
+                self._do(Disconnect(name, network), look)
+        self._engine.do("remove_container", name, force=True)
+
+    def _create(self, name: str, config: Json) -> None:
+        try:
+            self._engine.do("create_container_from_config", config, name)
+        except Conflict:
+            labels = self._engine.container(name)["Config"].get("Labels") or {}
+            if read_own(labels) is None:
+                raise EngineError(
+                    f"a container that is not this operator's is called {name}; "
+                    f"rename it (docker rename {name} …) or remove it"
+                ) from None

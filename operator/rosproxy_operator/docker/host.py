@@ -1,23 +1,26 @@
 """What the operating system knows of this host's ports and addresses."""
 
-import errno
 import socket
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import is_loopback
 from rosproxy.net.interfaces import address_towards
 
-USUAL_EPHEMERAL = PortRange(32768, 60999)
+_USUAL_EPHEMERAL = "32768 60999"
 _LISTEN = "0A"
 _ELSEWHERE = "192.0.2.1"
 """An address of no network (RFC 5737), to find out where connections to far hosts leave."""
 
 
 def ephemeral_ports() -> PortRange:
-    """The range from which the kernel takes ports for connections, in this network namespace."""
-    return parse_ephemeral(_text("/proc/sys/net/ipv4/ip_local_port_range"))
+    """The range from which the kernel takes ports for connections, in this network namespace.
+
+    The kernel's default if it can't be read.
+    """
+    text = _text("/proc/sys/net/ipv4/ip_local_port_range") or _USUAL_EPHEMERAL
+    return PortRange(*map(int, text.split()))
 
 
 def listening_ports() -> frozenset[int]:
@@ -25,34 +28,19 @@ def listening_ports() -> frozenset[int]:
     return parse_listening(_text("/proc/net/tcp")) | parse_listening(_text("/proc/net/tcp6"))
 
 
-def parse_ephemeral(text: str) -> PortRange:
-    """The range in ``ip_local_port_range``; the kernel's default if there is none."""
-    words = text.split()
-    if len(words) != 2 or not all(word.isdecimal() for word in words):
-        return USUAL_EPHEMERAL
-    return PortRange(int(words[0]), int(words[1]))
-
-
 def parse_listening(text: str) -> frozenset[int]:
     """The ports of listening sockets in ``/proc/net/tcp`` or ``/proc/net/tcp6``."""
     rows = (line.split()[:4] for line in text.splitlines()[1:])
-    return frozenset(
-        int(row[1].rpartition(":")[2], 16) for row in rows if len(row) == 4 and row[3] == _LISTEN
-    )
-
-
-def has_any(addresses: Iterable[str]) -> bool:
-    """Whether one of these is an address of this machine, as seen in this network namespace."""
-    return any(has(address) for address in addresses if address)
+    return frozenset(int(row[1].rpartition(":")[2], 16) for row in rows if row[3] == _LISTEN)
 
 
 def has(address: str) -> bool:
-    """Whether an IPv4 address is one of this machine's."""
+    """Whether an IPv4 address is one of this machine's, as seen in this network namespace."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address, 0))
-        except OSError as error:
-            return error.errno not in (errno.EADDRNOTAVAIL, errno.EINVAL)
+        except OSError:
+            return False
     return True
 
 

@@ -8,11 +8,10 @@ from collections.abc import Callable, Collection
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.docker.planner.model import Member
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, facts
-from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
 log = logging.getLogger(__name__)
@@ -27,23 +26,18 @@ class ProxyUpdater:
     """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
     The proxy is asked for its nodes after each look, and told what is new (`ProxyNews`).
+    ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
     """
 
     def __init__(
         self, name: str, access: ProxyAccess, proxies: ProxyClient, answered: Callable[[], None]
     ) -> None:
-        self.name, self.access = name, access
+        self.access = access
         self.error: ProxyError | None = None
-        self._proxies, self._answered = proxies, answered
+        self.silent_since: float | None = time.monotonic()
+        self._name, self._proxies, self._answered = name, proxies, answered
         self._news = ProxyNews()
-        self._heard = False
         self._looked = asyncio.Event()
-        self._since = time.monotonic()
-
-    @property
-    def silent_for(self) -> float:
-        """Seconds since it did not answer any more (or was started); 0 while it does."""
-        return 0.0 if self._heard and not self.error else time.monotonic() - self._since
 
     def update(self, known: NetworkFacts) -> None:
         """Take note of what a look has found."""
@@ -54,11 +48,9 @@ class ProxyUpdater:
         """Tell what there is to be told, for good."""
         failures = 0
         while True:
-            pause = (
-                PAUSES[min(failures, len(PAUSES)) - 1]
-                if failures
-                else self._news.next_due(time.monotonic())
-            )
+            pause = self._news.next_due(time.monotonic())
+            if failures:
+                pause = PAUSES[min(failures, len(PAUSES)) - 1]
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._looked.wait()
@@ -67,10 +59,7 @@ class ProxyUpdater:
                 failures = 0
             except ProxyError as error:
                 failures += 1
-                if error.later:
-                    self._well()
-                else:
-                    self._unwell(error)
+                self._heard(None if error.later else error)
 
     async def _tell(self) -> None:
         self._looked.clear()
@@ -80,30 +69,26 @@ class ProxyUpdater:
         address = self._news.facts.master_address
         if address and status.master.address != address:
             await self._proxies.master_address(where, token, address)
-            log.info("%s: its master is now at %s", self.name, address)
+            log.info("%s: its master is now at %s", self._name, address)
         now = time.monotonic()
         body = self._news.body(nodes_by_address(status).keys(), now)
         if body:
-            log.debug("%s is told %s", self.name, body)
-            self._log(await self._proxies.containers(where, token, body))
+            log.debug("%s is told %s", self._name, body)
+            done = await self._proxies.containers(where, token, body)
+            counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}
+            if text := ", ".join(f"{count} {word}" for word, count in counts.items() if count):
+                log.info("%s: nodes %s", self._name, text)
         self._news.told(now)
-        self._well()
+        self._heard(None)
 
-    def _well(self) -> None:
-        if self.error is not None or not self._heard:
-            self.error, self._heard = None, True
-            self._answered()
-
-    def _unwell(self, error: ProxyError) -> None:
-        if self.error is None and self._heard:
-            self._since = time.monotonic()
+    def _heard(self, error: ProxyError | None) -> None:
+        """Take note that the proxy has answered, or why not."""
         self.error = error
-
-    def _log(self, done: Json) -> None:
-        counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}
-        if any(counts.values()):
-            text = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
-            log.info("%s: nodes %s", self.name, text)
+        if error is not None:
+            self.silent_since = self.silent_since or time.monotonic()
+        elif self.silent_since is not None:
+            self.silent_since = None
+            self._answered()
 
 
 class DockerProxySync:
@@ -123,30 +108,27 @@ class DockerProxySync:
                 task.cancel()
                 del self._running[name]
         for proxy in look.state.proxies:
-            access = look.access.get(proxy.container.name)
-            if access is not None:
-                address = look.masters.get(master(proxy.key).host.lower(), "")
-                known = facts(look.state, proxy, members, address)
-                self._updater(proxy.container.name, access).update(known)
+            name = proxy.container.name
+            if name not in look.access:
+                continue
+            if name not in self._running:
+                updater = ProxyUpdater(name, look.access[name], self._proxies, self._answered)
+                self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
+            address = look.master_address(proxy.key)
+            self._running[name][0].update(facts(look.state, proxy, members, address))
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""
-        found = self._running.get(name)
-        return found is not None and found[0].silent_for == 0
+        return name in self._running and self._running[name][0].silent_since is None
 
     def problems(self, look: DockerSnapshot) -> list[Problem]:
         """The proxies that do not answer, and what to do about it."""
+        lately = time.monotonic() - STARTING
         return [
             silence(name, updater.error, look, self._uplink)
             for name, (updater, _) in self._running.items()
-            if updater.error is not None and updater.silent_for > STARTING
+            if updater.error and updater.silent_since and updater.silent_since < lately
         ]
-
-    def _updater(self, name: str, access: ProxyAccess) -> ProxyUpdater:
-        if name not in self._running:
-            updater = ProxyUpdater(name, access, self._proxies, self._answered)
-            self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
-        return self._running[name][0]
 
 
 def silence(name: str, error: ProxyError, look: DockerSnapshot, uplink: str) -> Problem:

@@ -5,7 +5,6 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from rosproxy.net.addresses import HostPort, is_loopback
@@ -17,41 +16,27 @@ DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
-@dataclass(frozen=True, slots=True)
-class DockerSettings:
-    """Everything that ``rosproxy-operator docker`` can be told.
-
-    ``resync`` is in seconds: how long it waits at most between two looks. ``admin`` is where it
-    serves its own health.
-    """
-
-    plan: PlanSettings
-    resync: float = 30.0
-    admin: HostPort = DEFAULT_ADMIN
-
-
-def make_docker_settings(options: Mapping[str, Any]) -> DockerSettings:
+def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
     """Settings from the values of the command line's options, by their names.
 
     Raises SettingError if they don't go together.
     """
-    plan = PlanSettings(
+    settings = PlanSettings(
         master_uri=options["master_uri"] or "",
         advertise_host=options["advertise_host"] or "",
         ports=options["ports"],
         window=options["port_window"],
-        publish=options["publish_address"] or ("0.0.0.0",),
+        publish=options["publish_address"],
         image=options["proxy_image"],
         expose_by_default=options["expose_by_default"],
         grace=options["grace"],
         uplink=options["uplink"],
         data_plane=options["data_plane"],
     )
-    if len(plan.window) < plan.ports:
-        raise SettingError(
-            "--port-window", f"{plan.window} has {len(plan.window)} ports, --ports is {plan.ports}"
-        )
-    return DockerSettings(plan, options["resync"], options["admin_bind"])
+    window, ports = settings.window, settings.ports
+    if len(window) < ports:
+        raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")
+    return settings
 
 
 def read_shared_master_uri(text: str) -> str:

@@ -6,28 +6,41 @@ they say decides which masters' names are resolved.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
-from rosproxy.net.addresses import HostPort, is_address
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.resolver import THIS_HOST, MasterResolver
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.docker import host
+from rosproxy_operator.docker import engine_json, host
 from rosproxy_operator.docker.client import DockerClient, Json
-from rosproxy_operator.docker.engine_json import Details, endpoints, read_container, read_network
-from rosproxy_operator.docker.inspector import PATIENCE, Inspector
+from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
-    Container,
     HostPorts,
     HostState,
+    Key,
     Network,
     PlanSettings,
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.specs import ROLE_SANDBOX, admin_port, read_own
+from rosproxy_operator.docker.planner.specs import (
+    ROLE_SANDBOX,
+    TOKEN_VARIABLE,
+    admin_port,
+    master,
+    read_own,
+)
+
+log = logging.getLogger(__name__)
+
+PATIENCE = 0.1
+"""Seconds that a look waits for inspections; later ones count from the next look on."""
+MOST_INSPECTIONS = 16
+"""Inspections that are under way at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +59,83 @@ class ProxyAccess:
 class DockerSnapshot:
     """A Docker host at one moment.
 
-    ``access`` and ``tokens`` are by the proxy's name; access only to those that run. ``masters``
-    are the addresses of masters' hosts, empty where unknown. ``at_host`` tells whether the operator
-    is in the host's network namespace.
+    ``access`` to those proxies that run is by name. ``masters`` are the addresses of masters'
+    hosts, empty where unknown. ``at_host`` tells whether the operator is in the host's network
+    namespace.
     """
 
     state: HostState
-    labels: LabelReading = field(default_factory=LabelReading)
-    access: Mapping[str, ProxyAccess] = field(default_factory=dict)
-    tokens: Mapping[str, str] = field(default_factory=dict)
-    masters: Mapping[str, str] = field(default_factory=dict)
-    at_host: bool = False
+    labels: LabelReading
+    access: Mapping[str, ProxyAccess]
+    tokens: Mapping[Key, str]
+    masters: Mapping[str, str]
+    at_host: bool
+
+    def master_address(self, key: Key) -> str:
+        """The address of a key's master; empty if it is unknown."""
+        return self.masters.get(master(key).host.lower(), "")
+
+
+class Inspector:
+    """Inspections of containers, by id, each asked for once and kept.
+
+    The engine's list answers in milliseconds whatever happens. An inspection waits until the
+    container's start is over, which takes 26 s with 1000 ports to publish. Nothing that is read
+    from it changes but the aliases, and those only with the endpoints, whose ids are in the list.
+    ``late`` is called when some come after a look.
+    """
+
+    def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
+        self._engine, self._late = engine, late
+        self._known: dict[str, tuple[object, Json]] = {}
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._marks: dict[str, object] = {}
+        self._turns = asyncio.Semaphore(MOST_INSPECTIONS)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether inspections are under way, which are going to be told."""
+        return bool(self._asking)
+
+    def get(self, container: str) -> Json | None:
+        """The last known inspection of a container; None if there is none yet."""
+        return self._known.get(container, (None, None))[1]
+
+    def sure(self, row: Json) -> bool:
+        """Whether the list and the inspection of a container, which is newer, say the same."""
+        mark, inspected = self._known.get(row["Id"], (None, None))
+        fresh = mark == self._marks[row["Id"]]
+        return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
+
+    async def update(self, rows: Iterable[Json], always: Collection[str], patience: float) -> None:
+        """Inspect what is new or has changed in the list; wait for it for so many seconds.
+
+        ``always`` are the ids of those that may have been started anew without a trace in the list.
+        """
+        self._marks = {
+            row["Id"]: object() if row["Id"] in always else engine_json.signature(row)
+            for row in rows
+        }
+        self._known = {key: known for key, known in self._known.items() if key in self._marks}
+        asked = []
+        for key, mark in self._marks.items():
+            if key not in self._asking and self._known.get(key, (None,))[0] != mark:
+                self._asking[key] = asyncio.create_task(self._inspect(key, mark))
+                asked.append(self._asking[key])
+        if asked:
+            _, late = await asyncio.wait(asked, timeout=patience)
+            for task in late:
+                task.add_done_callback(lambda _: self._late())
+
+    async def _inspect(self, container: str, mark: object) -> None:
+        try:
+            async with self._turns:
+                inspected = await in_thread(self._engine.container, container)
+            self._known[container] = mark, inspected
+        except EngineError as error:
+            log.debug("inspecting %s: %s", container[:12], error)
+        finally:
+            del self._asking[container]
 
 
 class DockerObserver:
@@ -84,7 +163,7 @@ class DockerObserver:
         there, unless an older one is known.
         """
         listening = host.listening_ports()  # first: what the engine starts meanwhile is no stranger
-        rows, networks, image = await asyncio.gather(
+        rows, found, image = await asyncio.gather(
             in_thread(self._engine.containers),
             in_thread(self._engine.networks),
             in_thread(self._engine.image_id, self._settings.image),
@@ -93,64 +172,64 @@ class DockerObserver:
         # by which to see that it was started anew, and the list is late to tell that one has ended.
         mine = [row["Id"] for row in rows if read_own(row.get("Labels") or {})]
         await self._inspector.update(rows, mine, patience)
-        state = self._read(rows, tuple(map(read_network, networks)), image)
-        at_host = host.has_any(n.gateway for n in state.networks if n.driver == "bridge")
-        taken = strangers(state, listening) if at_host else frozenset()
-        state = replace(state, host=HostPorts(host.ephemeral_ports(), taken))
+        networks = tuple(map(engine_json.read_network, found))
+        bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
+        at_host = any(map(host.has, bridges))
+        state = self._read(rows, networks, listening if at_host else frozenset())
         labels = read_labels(state, self._settings)
         masters = await self._resolve(state, master_hosts(labels, state))
+        gateways = {network.gateway for network in networks}
+        advertise = {
+            name: own
+            for name, address in masters.items()
+            if at_host and address and (own := host.own_address_towards(address, gateways))
+        }
+        unresolved = frozenset(name for name, address in masters.items() if not address)
         return DockerSnapshot(
-            state=replace(
-                state,
-                unresolved=frozenset(name for name, address in masters.items() if not address),
-                advertise=own_addresses(state, masters) if at_host else {},
-            ),
+            state=replace(state, image_id=image, unresolved=unresolved, advertise=advertise),
             labels=labels,
             access={p.container.name: way for p in state.proxies if (way := self._way(p, state))},
-            tokens={proxy.container.name: self._token(proxy) for proxy in state.proxies},
+            tokens={p.key: token for p in state.proxies if (token := self._token(p))},
             masters=masters,
             at_host=at_host,
         )
 
-    def _read(self, rows: list[Json], networks: tuple[Network, ...], image: str) -> HostState:
+    def _read(
+        self, rows: list[Json], networks: tuple[Network, ...], listening: frozenset[int]
+    ) -> HostState:
         """The containers, the operator's own apart from others."""
         containers, sandboxes, proxies = [], [], []
+        busy: set[str] = set()
         for row in rows:
             own = read_own(row.get("Labels") or {})
-            details = self._inspector.get(row["Id"])
-            if own is None and details is None:
+            inspected = self._inspector.get(row["Id"])
+            if own is None and inspected is None:
                 continue
-            container = read_container(row, details or Details(), networks)
+            container = engine_json.read_container(row, inspected, networks)
             if own is None:
                 containers.append(container)
             elif own.role == ROLE_SANDBOX:
                 sandboxes.append(Sandbox(own.key, container, own.range, own.fingerprint))
             else:
                 proxies.append(Proxy(own.key, container, own.range, own.fingerprint))
-        every = [*(one.container for one in sandboxes), *(one.container for one in proxies)]
+            if own and not self._inspector.sure(row):
+                busy.add(container.name)
         return HostState(
             containers=tuple(containers),
             networks=networks,
             proxies=tuple(proxies),
-            host=HostPorts(host.USUAL_EPHEMERAL),
-            image_id=image,
+            host=HostPorts(host.ephemeral_ports(), strangers(sandboxes, busy, listening)),
             sandboxes=tuple(sandboxes),
-            busy=frozenset(one.name for one in every if not self._sure(one)),
+            busy=frozenset(busy),
             addresses=frozenset(
-                end["IPAddress"] for row in rows for end in endpoints(row).values() if end
+                end.get("IPAddress") or ""
+                for row in rows
+                for end in engine_json.endpoints(row).values()
             ),
         )
 
-    def _sure(self, container: Container) -> bool:
-        """Whether the list and the inspection, which is newer, say the same."""
-        details = self._inspector.get(container.id)
-        if details is None or not self._inspector.fresh(container.id):
-            return False
-        return details.state == container.state
-
-    async def _resolve(self, state: HostState, hosts: Iterable[str]) -> dict[str, str]:
+    async def _resolve(self, state: HostState, names: Collection[str]) -> dict[str, str]:
         """The addresses of masters' hosts, empty where unknown."""
-        names = list(hosts)
         uplink = self._settings.uplink
         known = {name: found for name in names if (found := address_in(state, name, uplink))}
         never = [a.address for box in state.sandboxes for a in box.container.attachments]
@@ -168,45 +247,28 @@ class DockerObserver:
         return ProxyAccess(admin, self._token(proxy), run) if address else None
 
     def _token(self, proxy: Proxy) -> str:
-        details = self._inspector.get(proxy.container.id)
-        return details.token if details else ""
+        variables = engine_json.environment(self._inspector.get(proxy.container.id))
+        return variables.get(TOKEN_VARIABLE, "")
 
 
-def strangers(state: HostState, listening: frozenset[int]) -> frozenset[int]:
+def strangers(
+    sandboxes: Iterable[Sandbox], busy: Collection[str], listening: frozenset[int]
+) -> frozenset[int]:
     """Which of the host's ports on which something listens may be somebody else's.
 
     Not those of a sandbox that is just being started: the engine takes them one by one before it
     says that it runs.
     """
-    starting = (box for box in state.sandboxes if box.container.name in state.busy)
+    starting = (box for box in sandboxes if box.container.name in busy)
     return listening - {port for box in starting for port in box.range.ports()}
-
-
-def own_addresses(state: HostState, masters: Mapping[str, str]) -> dict[str, str]:
-    """This host's address towards each master whose address is known."""
-    gateways = {network.gateway for network in state.networks}
-    towards = {
-        name: host.own_address_towards(address, gateways)
-        for name, address in masters.items()
-        if address
-    }
-    return {name: own for name, own in towards.items() if own}
 
 
 def address_in(state: HostState, name: str, uplink: str) -> str:
     """The address of a host's name that no name server has: this host, or a container."""
-    if is_address(name):
-        return ""
     if name == THIS_HOST:
         return next((n.gateway for n in state.networks if n.name == uplink), "")
-    return next(
-        (
-            attachment.address
-            for container in state.containers
-            for attachment in container.attachments
-            if container.state in STARTED
-            and attachment.address
-            and name in {known.lower() for known in attachment.names}
-        ),
-        "",
-    )
+    for container in state.containers:
+        for place in container.attachments if container.state in STARTED else ():
+            if place.address and name in {known.lower() for known in place.names}:
+                return place.address
+    return ""

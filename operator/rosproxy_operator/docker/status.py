@@ -1,139 +1,162 @@
-"""What there is on a host, for ``status`` and ``plan``: found out without a running operator."""
+"""The commands ``status`` and ``plan``: what there is on a host, without a running operator."""
 
 import asyncio
+import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import TypeVar
 
 from rosproxy import __version__
 from rosproxy.admin.status_document import ProxyStatus
-from rosproxy.net.addresses import HostPort
+from rosproxy.cli.terminal import size, watch, write
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
-from rosproxy_operator.docker.planner.actions import Action
-from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings, Proxy, Sandbox
-from rosproxy_operator.docker.planner.plan import DockerPlan, plan
+from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.model import (
+    Container,
+    HostState,
+    Key,
+    PlanSettings,
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.docker.planner.plan import plan
+from rosproxy_operator.docker.planner.report import plan_text, render
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
+Said = Mapping[str, ProxyStatus]
+"""What the proxies that answer say, by the names of their containers."""
 Own = TypeVar("Own", Proxy, Sandbox)
 PATIENCE = 3.0
 """Seconds that are waited for inspections: nobody looks a second time."""
 
 
-@dataclass(frozen=True, slots=True)
-class Survey:
-    """One look at a host, what would be done there, and what its proxies say, by name."""
-
-    look: DockerSnapshot
-    plan: DockerPlan
-    said: Mapping[str, ProxyStatus | ProxyError]
-    problems: tuple[Problem, ...]
-
-    def answer(self, proxy: str) -> ProxyStatus | None:
-        """What a proxy says of itself, by its container's name; None if it does not answer."""
-        said = self.said.get(proxy)
-        return None if isinstance(said, ProxyError) else said
-
-    @property
-    def actions(self) -> list[Action]:
-        """What would be done, but for what the engine is busy with and tells nothing of."""
-        groups = (*self.plan.groups, *self.plan.deferred)
-        return [action for group in groups for action in group.actions]
+def show_plan(settings: PlanSettings) -> None:
+    """Print what would be done now, and what is wrong. Raises EngineError."""
+    status = asyncio.run(survey(settings))
+    write(plan_text(status["actions"]))
+    for problem in status["problems"]:
+        write(f"{problem['subject']}: {problem['text']}")
 
 
-async def survey(settings: PlanSettings) -> Survey:
-    """Look at the engine and ask all proxies. Raises EngineError."""
-    engine, masters, proxies = DockerClient(), MasterResolver(_nothing), ProxyClient()
-    observer = DockerObserver(engine, settings, masters, _nothing)
+def show_status(settings: PlanSettings, as_json: bool) -> None:
+    """Print what there is on the host. Raises EngineError."""
+    status = asyncio.run(survey(settings))
+    write(json.dumps(status, indent=2) if as_json else render(status, size()[0]))
+
+
+def watch_status(settings: PlanSettings) -> None:
+    """Draw the status again and again until interrupted, also while no engine answers."""
+
+    def draw(columns: int, lines: int | None) -> str:
+        try:
+            return render(asyncio.run(survey(settings)), columns, lines)
+        except EngineError as error:
+            return f"{time.strftime('%H:%M:%S')} {error}"
+
+    watch(draw)
+
+
+async def survey(settings: PlanSettings) -> Json:
+    """What there is, what would be done, and what the proxies say. Raises EngineError.
+
+    Containers are those that have a proxy or whose labels are wrong. Actions are all but those for
+    what the engine is busy with and tells nothing of.
+    """
+
+    def nothing() -> None:
+        """Nobody has to be woken."""
+
+    proxies = ProxyClient()
+    observer = DockerObserver(DockerClient(), settings, MasterResolver(nothing), nothing)
     try:
         look = await observer.look(PATIENCE)
         planned = plan(look.state, look.labels, settings, DockerMemory(), time.monotonic())
-        ways = look.access.values()
-        answers = await asyncio.gather(*(_ask(proxies, access.admin) for access in ways))
+        asked = (_ask(proxies, name, look, settings.uplink) for name in look.access)
+        answers = dict(zip(look.access, await asyncio.gather(*asked), strict=True))
     finally:
         await proxies.close()
-    said = dict(zip(look.access, answers, strict=True))
-    silent = [
-        silence(name, answer, look, settings.uplink)
-        for name, answer in said.items()
-        if isinstance(answer, ProxyError)
-    ]
-    return Survey(look, planned, said, (*planned.problems, *silent))
-
-
-def describe(found: Survey, settings: PlanSettings) -> Json:
-    """A survey as JSON: what `rosproxy_operator.docker.planner.report.render` shows."""
-    observed = found.look.state
-    keys = {member.id: member.key for member in found.plan.members if member.key in observed.keys}
-    listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
+    said = {name: each for name, each in answers.items() if isinstance(each, ProxyStatus)}
+    silent = [each for each in answers.values() if isinstance(each, Problem)]
+    problems = [*planned.problems, *silent]
+    wrong = {problem.subject for problem in problems}
+    keys = {member.id: member.key for member in planned.members if member.key in look.state.keys}
     return {
         "version": __version__,
         "uplink": settings.uplink,
-        "proxies": [_proxy(key, found, settings) for key in sorted(observed.keys)],
-        "containers": [_container(c, _name(keys.get(c.id)), found) for c in listed],
-        "problems": [
-            {"subject": problem.subject, "text": problem.text, "fatal": problem.fatal}
-            for problem in found.problems
+        "proxies": [_proxy(key, look.state, said, settings) for key in sorted(look.state.keys)],
+        "containers": [
+            _container(container, keys.get(container.id), said)
+            for container in look.state.containers
+            if container.id in keys or f"container {container.name}" in wrong
         ],
-        "actions": [str(action) for action in found.actions],
+        "problems": [asdict(problem) for problem in problems],
+        "actions": [
+            str(action)
+            for group in (*planned.groups, *planned.deferred)
+            for action in group.actions
+        ],
     }
 
 
-def _name(key: Key | None) -> str | None:
-    return proxy_name(key) if key else None
+async def _ask(
+    proxies: ProxyClient, name: str, look: DockerSnapshot, uplink: str
+) -> ProxyStatus | Problem:
+    try:
+        return await proxies.status(look.access[name].admin)
+    except ProxyError as error:
+        return silence(name, error, look, uplink)
 
 
-def _proxy(key: Key, found: Survey, settings: PlanSettings) -> Json:
+def _proxy(key: Key, observed: HostState, said: Said, settings: PlanSettings) -> Json:
     """One row per proxy; its sandbox is only told of where it is what is wrong."""
-    observed, name = found.look.state, proxy_name(key)
-    process = _best(observed.proxies_of(key), name)
+    process = _best(observed.proxies_of(key), proxy_name(key))
     box = _best(observed.sandboxes_of(key), sandbox_name(key))
-    said = found.answer(process.container.name) if process else None
     own = box or process
-    networks = box.container.networks if box else frozenset()
+    home = box.container.state if box else "absent"
+    told = said.get(process.container.name) if process else None
+    problems = [f"{one.subject}: {one.text}" for one in (told.problems if told else ())]
+    if home != "running":
+        held = f"the container {sandbox_name(key)}, which holds its ports and networks"
+        problems.insert(0, f"{held}, is {home}")
     return {
-        "name": name,
+        "name": proxy_name(key),
         "master_uri": key.master_uri,
-        "master_address": (said.master.address if said else None) or "",
-        "master_up": said.master.up if said else None,
+        "master_address": (told.master.address if told else None) or "",
+        "master_up": told.master.up if told else None,
         "advertise_host": key.advertise_host,
         "range": str(own.range) if own else "",
         "state": process.container.state if process else "absent",
-        "reachable": said is not None,
-        "networks": sorted(networks - {settings.uplink}),
-        "data_plane": said.data_plane.plane if said and said.data_plane else None,
-        "used": said.ports.used if said else None,
-        "free": said.ports.free if said else None,
-        "problems": [
-            *_amiss(box, sandbox_name(key)),
-            *(f"{one.subject}: {one.text}" for one in (said.problems if said else ())),
-        ],
+        "reachable": told is not None,
+        "networks": sorted(box.container.networks - {settings.uplink}) if box else [],
+        "data_plane": told.data_plane.plane if told and told.data_plane else None,
+        "used": told.ports.used if told else None,
+        "free": told.ports.free if told else None,
+        "problems": problems,
     }
 
 
-def _best(found: Sequence[Own], name: str) -> Own | None:
+def _best(found: Iterable[Own], name: str) -> Own | None:
     """The one that is called so, if it runs; else any that runs; else any."""
-    ranked = sorted(found, key=lambda o: (o.container.state != "running", o.container.name != name))
-    return ranked[0] if ranked else None
+    return min(
+        found,
+        key=lambda one: (one.container.state != "running", one.container.name != name),
+        default=None,
+    )
 
 
-def _amiss(box: Sandbox | None, name: str) -> Iterator[str]:
-    state = box.container.state if box else "absent"
-    if state != "running":
-        yield f"the container {name}, which holds its ports and networks, is {state}"
-
-
-def _container(container: Container, proxy: str | None, found: Survey) -> Json:
+def _container(container: Container, key: Key | None, said: Said) -> Json:
+    proxy = proxy_name(key) if key else None
     addresses = {a.network: a.address for a in container.attachments if a.address}
-    answer = found.answer(proxy or "")
-    nodes = nodes_by_address(answer) if answer else {}
+    told = said.get(proxy or "")
+    nodes = nodes_by_address(told) if told else {}
     return {
         "name": container.name,
         "state": container.state,
@@ -151,19 +174,3 @@ def _container(container: Container, proxy: str | None, found: Survey) -> Json:
             for node in nodes.get(address, ())
         ],
     }
-
-
-def _meant(container: Container, found: Survey) -> bool:
-    """Whether something is wrong with a container's labels."""
-    return any(problem.subject == f"container {container.name}" for problem in found.problems)
-
-
-async def _ask(proxies: ProxyClient, where: HostPort) -> ProxyStatus | ProxyError:
-    try:
-        return await proxies.status(where)
-    except ProxyError as error:
-        return error
-
-
-def _nothing() -> None:
-    """Nobody has to be woken."""

@@ -1,4 +1,4 @@
-"""What the operator can do to a Docker host: data, carried out by `rosproxy_operator.docker.apply`.
+"""What the operator can do to a Docker host: data, carried out by `docker.executor`.
 
 Containers are named, not numbered: a plan may start what it has yet to create. The text of an
 action says what it does, in one plain and harmless line.

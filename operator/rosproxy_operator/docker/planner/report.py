@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from rosproxy.telemetry.text import besides_first, clean, plural, shorten, table, wrap
-from rosproxy_operator.docker.planner.actions import Action
 
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
@@ -34,7 +33,7 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     return "\n".join(short)
 
 
-def plan_text(actions: Iterable[Action]) -> str:
+def plan_text(actions: Iterable[object]) -> str:
     """One line for each action."""
     return "\n".join(map(str, actions)) or "Nothing to do."
 

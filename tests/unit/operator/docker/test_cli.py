@@ -5,7 +5,7 @@ from click.testing import CliRunner, Result
 
 from rosproxy_operator.cli import main
 from rosproxy_operator.docker.planner.model import PlanSettings
-from rosproxy_operator.docker.settings import DEFAULT_ADMIN, DockerSettings, make_docker_settings
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, make_plan_settings
 
 
 def run(*words: str, **variables: str) -> Result:
@@ -13,13 +13,12 @@ def run(*words: str, **variables: str) -> Result:
 
 
 def test_the_defaults() -> None:
-    context = main.commands["docker"].make_context("docker", [])
-    settings = make_docker_settings(context.params)
-    assert settings == DockerSettings(PlanSettings())
-    assert settings.admin == DEFAULT_ADMIN
-    assert settings.resync == 30.0
-    assert settings.plan.publish == ("0.0.0.0",)
-    assert settings.plan.uplink == "0-rosproxy"
+    options = main.commands["docker"].make_context("docker", []).params
+    assert make_plan_settings(options) == PlanSettings()
+    assert options["admin_bind"] == DEFAULT_ADMIN
+    assert options["resync"] == 30.0
+    assert PlanSettings().publish == ("0.0.0.0",)
+    assert PlanSettings().uplink == "0-rosproxy"
 
 
 @pytest.mark.parametrize(

@@ -1,56 +1,26 @@
 """Looks at an engine that is given by the test, and what the controller makes of them."""
 
+from typing import Any
+
 import pytest
 
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.resolver import MasterResolver
-from rosproxy_operator.docker import controller as module
-from rosproxy_operator.docker.client import DockerClient, Json
+from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
-from rosproxy_operator.docker.errors import Gone, Unavailable
 from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
-from rosproxy_operator.docker.settings import DockerSettings
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
 from tests.unit.operator.docker.builders import KEY, RANGE
+from tests.unit.operator.docker.conftest import FakeEngine
 
 SETTINGS = PlanSettings(advertise_host=KEY.advertise_host)
 
 
-class FakeEngine(DockerClient):
-    """Lists ``rows`` and inspects ``inspected``; there is no image."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rows: list[Json] = []
-        self.inspected: dict[str, Json] = {}
-        self.away = False
-
-    def containers(self) -> list[Json]:
-        if self.away:
-            raise Unavailable("no engine")
-        return self.rows
-
-    def container(self, name: str) -> Json:
-        if name not in self.inspected:
-            raise Gone(f"no such container: {name}")
-        return self.inspected[name]
-
-    def networks(self) -> list[Json]:
-        return [captured.network()]
-
-    def image_id(self, image: str) -> str:
-        return ""
-
-    def add(self, row: Json, inspected: Json) -> None:
-        self.rows.append(row)
-        self.inspected[row["Id"]] = inspected
-
-
-def own(spec: SandboxSpec | ProxySpec, number: str, network: str, address: str) -> Json:
+def own(spec: SandboxSpec | ProxySpec, number: str, network: str, address: str) -> dict[str, Any]:
     ends = {network: captured.end("e", address)} if address else {}
     return captured.running() | {
         "Id": number,
@@ -61,10 +31,10 @@ def own(spec: SandboxSpec | ProxySpec, number: str, network: str, address: str) 
     }
 
 
-@pytest.fixture
-def engine() -> FakeEngine:
+@pytest.fixture(autouse=True)
+def containers(engine: FakeEngine) -> None:
     """A labelled container, which is called as its master is, and a proxy in its sandbox."""
-    engine = FakeEngine()
+    engine.knows["/networks"] = [captured.network()]
     details = captured.inspected() | {"State": {"Status": "running", "StartedAt": "1"}}
     details["NetworkSettings"] = {"Networks": {"app": {"Aliases": ["robot"]}}}
     engine.add(captured.running(), details)
@@ -73,15 +43,14 @@ def engine() -> FakeEngine:
     process = ProxySpec(proxy_name(KEY), KEY, RANGE, "f", sandbox_name(KEY))
     token = {"Config": {"Env": ["ROSPROXY_ADMIN_TOKEN=secret"]}, "State": details["State"]}
     engine.add(own(process, "p" * 64, f"container:{'b' * 64}", ""), token)
-    return engine
 
 
-def observer(engine: FakeEngine) -> DockerObserver:
-    return DockerObserver(engine, SETTINGS, MasterResolver(lambda: None), lambda: None)
+def observer() -> DockerObserver:
+    return DockerObserver(DockerClient(), SETTINGS, MasterResolver(lambda: None), lambda: None)
 
 
-async def test_a_look_finds_containers_labels_masters_and_proxies(engine: FakeEngine) -> None:
-    look = await observer(engine).look(5.0)
+async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
+    look = await observer().look(5.0)
     state, name = look.state, proxy_name(KEY)
     assert [container.name for container in state.containers] == ["talker"]
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
@@ -93,32 +62,38 @@ async def test_a_look_finds_containers_labels_masters_and_proxies(engine: FakeEn
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
     access = look.access[name]
     assert (str(access.admin), access.token) == ("172.30.0.2:11312", "secret")
-    assert look.tokens == {name: "secret"}
+    assert look.tokens == {KEY: "secret"}
 
 
 async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine) -> None:
-    engine.inspected.clear()
-    look = await observer(engine).look(5.0)
+    for row in engine.rows:
+        del engine.knows[f"/containers/{row['Id']}/json"]
+    look = await observer().look(5.0)
     assert not look.state.containers
     assert look.state.busy == {proxy_name(KEY), sandbox_name(KEY)}
     assert look.state.unresolved == {"robot"}
 
 
 async def test_a_list_that_is_behind_the_inspection_makes_busy(engine: FakeEngine) -> None:
-    engine.inspected["p" * 64]["State"] = {"Status": "exited"}
-    look = await observer(engine).look(5.0)
+    engine.knows[f"/containers/{'p' * 64}/json"]["State"] = {"Status": "exited"}
+    look = await observer().look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
 
 
-async def test_once_tells_what_is_not_as_wanted(
-    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
+    looking = observer()
+    await looking.look(5.0)
+    del engine.knows[f"/containers/{'p' * 64}/json"]
+    look = await looking.look(5.0)
+    assert look.state.busy == {proxy_name(KEY)}
+    assert look.tokens == {KEY: "secret"}
+
+
+async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
     del engine.rows[1:]
-    monkeypatch.setattr(module, "DockerClient", lambda: engine)
-    monkeypatch.setattr(engine, "events", lambda _: iter(()))
     metrics = DockerMetrics()
-    controller = DockerController(DockerSettings(SETTINGS), metrics)
-    problems = await controller.run_once(0.3)
+    controller = DockerController(SETTINGS, 30.0, metrics)
+    problems = await controller.run_once(0.5)
     assert [problem.subject for problem in problems] == [
         f"proxy image {SETTINGS.image}",
         f"proxy {proxy_name(KEY)}",
@@ -128,10 +103,7 @@ async def test_once_tells_what_is_not_as_wanted(
     assert metrics.registry.get_sample_value("rosproxy_operator_containers") == 1.0
 
 
-async def test_once_without_an_engine(engine: FakeEngine, monkeypatch: pytest.MonkeyPatch) -> None:
-    engine.away = True
-    monkeypatch.setattr(module, "DockerClient", lambda: engine)
-    monkeypatch.setattr(engine, "events", lambda _: iter(()))
-    controller = DockerController(DockerSettings(SETTINGS), DockerMetrics())
-    with pytest.raises(LookFailed, match="no engine"):
-        await controller.run_once(5.0)
+async def test_once_without_an_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DOCKER_HOST", "unix:///nowhere")
+    with pytest.raises(LookFailed, match="there is no Docker engine's socket /nowhere"):
+        await DockerController(SETTINGS, 30.0, DockerMetrics()).run_once(5.0)

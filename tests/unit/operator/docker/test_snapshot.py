@@ -8,10 +8,8 @@ import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.engine_json import (
-    Details,
-    bound_ports,
+    environment,
     read_container,
-    read_details,
     read_network,
     signature,
 )
@@ -30,80 +28,69 @@ from tests.unit.operator.docker import captured
 APP = Network(captured.APP_ID, "app")
 
 
+def container(inspected: dict[str, Any] | None = None, **row: Any) -> Container:
+    return read_container(captured.running() | row, inspected, [APP])
+
+
 def test_a_running_container() -> None:
-    found = read_container(captured.running(), read_details(captured.inspected()), [APP])
+    found = container(captured.inspected())
     assert (found.id, found.name, found.state) == (captured.ID, "talker", "running")
     assert found.labels == {"rosproxy.enable": "true"}
     assert (found.network_mode, found.hostname) == ("app", "bhost")
     assert found.master_uri == "http://robot:11311"
     assert found.host_ports == {18080, 18000, 18001, 18002}
+    assert found.started_at == "2026-11-21T10:27:24.131326951Z"
     (place,) = found.attachments
     assert (place.network, place.address, place.network_id) == ("app", "172.29.0.2", APP.id)
     assert place.names == {"talker", "45afed2aea6c", "web", "bhost"}
 
 
 def test_a_created_container_on_the_default_network() -> None:
-    found = read_container(captured.created(), Details())
+    found = read_container(captured.created(), None)
     assert (found.name, found.state, found.network_mode) == ("listener", "created", "bridge")
     assert found.networks == {"bridge"}
     assert found.attachments[0].address == found.attachments[0].network_id == ""
     assert found.started_at == ""
 
 
-def test_a_network_mode_given_by_id_becomes_the_name() -> None:
-    row = captured.running() | {"HostConfig": {"NetworkMode": captured.APP_ID}}
-    assert read_container(row, Details(), [APP]).network_mode == "app"
+def test_names() -> None:
+    assert container(HostConfig={"NetworkMode": captured.APP_ID}).network_mode == "app"
+    assert container(Names=["/other/talker", "/talker"]).name == "talker"  # the first is a link's
+    assert container(Names=None).name == "45afed2aea6c"
 
 
-def test_a_name_of_a_link_is_not_the_containers_name() -> None:
-    row = captured.running() | {"Names": ["/other/talker", "/talker"]}
-    assert read_container(row, Details()).name == "talker"
-
-
-def test_a_container_without_names_goes_by_its_id() -> None:
-    assert read_container(captured.running() | {"Names": None}, Details()).name == "45afed2aea6c"
-
-
-def test_details() -> None:
-    details = read_details(captured.inspected())
-    assert details.token == "a=b"
-    assert details.aliases == {"app": {"web", "45afed2aea6c", "bhost"}}
-    assert details.started_at == "2026-11-21T10:27:24.131326951Z"
+def test_variables() -> None:
+    assert environment(captured.inspected())["ROSPROXY_ADMIN_TOKEN"] == "a=b"
+    assert environment({"Config": {"Env": None}}) == environment(None) == {}
 
 
 def test_newer_engines_keep_the_containers_own_names_apart() -> None:
-    inspected = captured.inspected()
-    ends = {"app": {"Aliases": ["web"], "DNSNames": ["talker", "web", "45afed2aea6c"]}}
-    inspected["NetworkSettings"]["Networks"] = ends
-    assert read_details(inspected).aliases == {"app": {"talker", "web", "45afed2aea6c"}}
+    ends = {"app": {"Aliases": ["web"], "DNSNames": ["own", "web", "45afed2aea6c"]}}
+    found = container({"NetworkSettings": {"Networks": ends}})
+    assert found.attachments[0].names == {"talker", "own", "web", "45afed2aea6c"}
 
 
 def test_a_container_that_was_never_started() -> None:
-    inspected = captured.inspected() | {"State": {"StartedAt": "0001-01-01T00:00:00Z"}}
-    assert read_details(inspected).started_at == ""
+    assert container({"State": {"StartedAt": "0001-01-01T00:00:00Z"}}).started_at == ""
 
 
 def test_an_inspection_with_nothing_in_it() -> None:
-    assert read_details({}) == Details()
+    assert container({}) == container(None)
 
 
 @pytest.mark.parametrize(
-    ("text", "ports"),
+    ("bindings", "ports"),
     [
-        ("80", {80}),
-        ("8000-8002", {8000, 8001, 8002}),
-        ("", set()),
-        ("0", set()),
-        ("x", set()),
-        ("80-", {80}),
+        ({"1/tcp": [{"HostIp": "", "HostPort": "80"}]}, {80}),
+        ({"1/tcp": [{"HostPort": "8000-8002"}]}, {8000, 8001, 8002}),
+        ({"1/tcp": [{"HostPort": ""}, {"HostPort": "0"}, {"HostPort": "x"}]}, set()),
+        ({"1": [{"HostPort": "80-"}]}, {80}),
+        ({"1/udp": [{"HostPort": "80"}], "2/tcp": [], "3/tcp": None}, set()),
+        (None, set()),
     ],
 )
-def test_host_ports(text: str, ports: set[int]) -> None:
-    assert bound_ports({"1/tcp": [{"HostIp": "", "HostPort": text}]}) == ports
-
-
-def test_no_bindings() -> None:
-    assert bound_ports(None) == bound_ports({"80/tcp": []}) == frozenset()
+def test_host_ports(bindings: object, ports: set[int]) -> None:
+    assert container({"HostConfig": {"PortBindings": bindings}}, Ports=None).host_ports == ports
 
 
 def test_a_network_and_its_subnets() -> None:
@@ -131,10 +118,9 @@ def test_the_signature_changes_with_each_connection() -> None:
 def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
-    state = HostState((), (), (), HostPorts(ports), sandboxes=(box,))
     listening = frozenset({22, 11400, 11401})
-    assert strangers(replace(state, busy=frozenset({"box"})), listening) == {22}
-    assert strangers(state, listening) == listening
+    assert strangers([box], {"box"}, listening) == {22}
+    assert strangers([box], set(), listening) == listening
 
 
 def test_the_engine_knows_names_that_no_name_server_has() -> None:
