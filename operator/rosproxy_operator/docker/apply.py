@@ -20,7 +20,6 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
@@ -72,10 +71,10 @@ class DockerApplier:
             case CreateNetwork(name):
                 with _fine("already exists"):
                     engine.create_network(name, {MANAGED: "true"})
-            case CreateSandbox(spec):
-                self._create(spec.name, sandbox_config(spec, self._settings))
-            case Create(spec):
-                self._create(spec.name, self._config(spec, look))
+            case CreateSandbox(name):
+                self._create(name, sandbox_config(action, self._settings))
+            case Create(name):
+                self._create(name, self._config(action, look))
             case Start(name):
                 with _fine("is not running"):
                     engine.start(name)
@@ -121,10 +120,10 @@ class DockerApplier:
                 with _fine("is not connected"):
                     self._engine.disconnect(name, network)
 
-    def _config(self, spec: ProxySpec, look: DockerSnapshot) -> Json:
-        token = look.tokens.get(self._seen_as(spec.replaces, look)) or secrets.token_hex(16)
-        address = look.masters.get(master(spec.key).host.lower(), "")
-        return container_config(spec, self._settings, token, address)
+    def _config(self, made: Create, look: DockerSnapshot) -> Json:
+        token = look.tokens.get(self._seen_as(made.replaces, look)) or secrets.token_hex(16)
+        address = look.masters.get(master(made.key).host.lower(), "")
+        return container_config(made, self._settings, token, address)
 
     def _create(self, name: str, config: Json) -> None:
         try:

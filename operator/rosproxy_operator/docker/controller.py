@@ -117,7 +117,7 @@ class DockerController:
         problems = self._current(look, planned)
         self._log.update(problems)
         metrics = self._metrics
-        metrics.containers.set(sum(member.alive for member in planned.members))
+        metrics.containers.set(sum(member.container.alive for member in planned.members))
         metrics.problems.set(len(problems))
         metrics.show_proxies(proxy.container.state for proxy in look.state.proxies)
 

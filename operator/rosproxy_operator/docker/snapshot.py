@@ -20,7 +20,6 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading, master
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Container,
-    HostPorts,
     HostState,
     Network,
     PlanSettings,
@@ -96,7 +95,7 @@ class DockerObserver:
         state = self._read(rows, tuple(map(read_network, networks)), image)
         at_host = host.has_any(n.gateway for n in state.networks if n.driver == "bridge")
         taken = strangers(state, listening) if at_host else frozenset()
-        state = replace(state, host=HostPorts(host.ephemeral_ports(), taken))
+        state = replace(state, ephemeral=host.ephemeral_ports(), listening=taken)
         labels = read_labels(state, self._settings)
         masters = await self._resolve(state, master_hosts(labels, state))
         return DockerSnapshot(
@@ -132,7 +131,7 @@ class DockerObserver:
             containers=tuple(containers),
             networks=networks,
             proxies=tuple(proxies),
-            host=HostPorts(host.USUAL_EPHEMERAL),
+            ephemeral=host.USUAL_EPHEMERAL,
             image_id=image,
             sandboxes=tuple(sandboxes),
             busy=frozenset(one.name for one in every if not self._sure(one)),

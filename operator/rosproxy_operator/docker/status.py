@@ -71,7 +71,11 @@ async def survey(settings: PlanSettings) -> Survey:
 def describe(found: Survey, settings: PlanSettings) -> Json:
     """A survey as JSON: what `rosproxy_operator.docker.planner.report.render` shows."""
     observed = found.look.state
-    keys = {member.id: member.key for member in found.plan.members if member.key in observed.keys}
+    keys = {
+        member.container.id: member.key
+        for member in found.plan.members
+        if member.key in observed.keys
+    }
     listed = [c for c in observed.containers if c.id in keys or _meant(c, found)]
     return {
         "version": __version__,

@@ -4,17 +4,17 @@ An engine answers with all containers that have a name, in any order. So no name
 another one holds: nodes would reach now this, now that.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.masters import ALIAS
-from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key, Sandbox
+from rosproxy_operator.docker.planner.model import Container, Desired, HostState, Key
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 
-Aliases = Mapping[tuple[Key, str], tuple[str, ...]]
+Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
 """For a key and a network, the names of the key's proxy there."""
 _GONE = frozenset({"dead", "removing"})
 
@@ -45,21 +45,25 @@ class _Claim:
         return (needed or [one.key for one in self.claimants])[0]
 
 
-def assign(desired: Iterable[Desired], observed: HostState) -> tuple[Aliases, tuple[Problem, ...]]:
-    """The names of the proxies that are wanted, and the containers that won't find theirs."""
-    claims = [*_claims(sorted(desired, key=lambda one: one.key), observed)]
-    given: dict[tuple[Key, str], tuple[str, ...]] = {}
-    for claim in claims:
+def assign(desired: Iterable[Desired], observed: HostState) -> tuple[Aliases, list[Problem]]:
+    """The names of the proxies that are wanted, and the containers that won't find theirs.
+
+    ``desired`` is sorted by key.
+    """
+    given: dict[Key, dict[str, tuple[str, ...]]] = {}
+    problems: list[Problem] = []
+    for claim in _claims(tuple(desired), observed):
         if claim.owner is not None:
-            place = claim.owner, claim.network
-            given[place] = (*given.get(place, ()), claim.alias)
-    return given, tuple(problem for claim in claims for problem in _problems(claim))
+            names = given.setdefault(claim.owner, {})
+            names[claim.network] = (*names.get(claim.network, ()), claim.alias)
+        problems += _problems(claim)
+    return given, problems
 
 
 def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
     """The containers of a proxy on a network that look for it by this name."""
     return tuple(
-        member.container
+        member.container.name
         for member in desired.members
         if network in member.networks and member.needs == alias
     )
@@ -80,9 +84,8 @@ def _names(key: Key) -> tuple[str, ...]:
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
 
 
-def _claims(desired: list[Desired], observed: HostState) -> Iterator[_Claim]:
-    live = [one for one in desired if one.live]
-    for network in sorted({name for one in live for name in one.networks}):
+def _claims(desired: Collection[Desired], observed: HostState) -> Iterator[_Claim]:
+    for network in sorted({name for one in desired if one.live for name in one.networks}):
         there = [one for one in desired if network in one.networks]
         for alias in sorted({name for one in there if one.live for name in _names(one.key)}):
             yield _claim(network, alias, there, observed)
@@ -94,37 +97,33 @@ def _claim(network: str, alias: str, there: list[Desired], observed: HostState) 
         for container in observed.containers
         if container.state not in _GONE and holds(container, network, alias)
     ]
-    having = [s for s in observed.sandboxes if holds(s.container, network, alias)]
-    staying = [one.key for one in there if one.key in {s.key for s in having}]
+    having = [box for box in observed.sandboxes if holds(box.container, network, alias)]
+    staying = [one.key for one in there if one.key in {box.key for box in having}]
+    # One that is restarting can't leave the network: it answers there again in a moment.
+    stuck = sorted(box.key for box in having if box.container.state == "restarting")
     return _Claim(
         network,
         alias,
         claimants=tuple(one for one in there if one.live and alias in _names(one.key)),
         others=tuple(sorted(others)),
-        holders=tuple(dict.fromkeys([*staying, *_stuck(having)])),
+        holders=tuple(dict.fromkeys([*staying, *stuck])),
     )
-
-
-def _stuck(sandboxes: Iterable[Sandbox]) -> list[Key]:
-    """Whose sandboxes can't leave a network: it answers there again as soon as it is restarted."""
-    return sorted(one.key for one in sandboxes if one.container.state == "restarting")
 
 
 def _problems(claim: _Claim) -> Iterator[Problem]:
+    """What containers are told that look for their proxy by a name that others have."""
+    containers = [f"container {name}" for name in claim.others]
     for one in claim.claimants:
-        if one.key != claim.owner or claim.others or len(claim.holders) > 1:
-            for container in needed_by(one, claim.network, claim.alias):
-                yield Problem(f"container {container}", _misled_text(claim, one.key), fatal=False)
-
-
-def _misled_text(claim: _Claim, key: Key) -> str:
-    """What a container is told that looks for its proxy by a name that others have."""
-    proxies = {*claim.holders, claim.owner or key} - {key}
-    others = [f"container {name}" for name in claim.others]
-    others += sorted(f"proxy {proxy_name(other)}" for other in proxies)
-    host = proxy_name(key) if claim.alias == ALIAS else ALIAS
-    return (
-        f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
-        f"{listed(others)} answers to it, so its nodes go around their proxy: "
-        f"set ROS_MASTER_URI=http://{host}:{master(key).port}"
-    )
+        if one.key == claim.owner and not claim.others and len(claim.holders) <= 1:
+            continue
+        proxies = {*claim.holders, claim.owner or one.key} - {one.key}
+        others = [*containers, *sorted(f"proxy {proxy_name(other)}" for other in proxies)]
+        host = proxy_name(one.key) if claim.alias == ALIAS else ALIAS
+        for container in needed_by(one, claim.network, claim.alias):
+            yield Problem(
+                f"container {container}",
+                f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
+                f"{listed(others)} answers to it, so its nodes go around their proxy: "
+                f"set ROS_MASTER_URI=http://{host}:{master(one.key).port}",
+                fatal=False,
+            )

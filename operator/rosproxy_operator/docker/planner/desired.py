@@ -1,20 +1,11 @@
 """From members to the proxies that there ought to be."""
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import replace
 
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.networks import BUILT_IN
-from rosproxy_operator.docker.planner.labels.values import DATA_PLANE
-from rosproxy_operator.docker.planner.model import (
-    Desired,
-    HostState,
-    Key,
-    Member,
-    Network,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.labels.values import BUILT_IN, DATA_PLANE
+from rosproxy_operator.docker.planner.model import Desired, HostState, Member, PlanSettings
 from rosproxy_operator.docker.planner.state import DockerMemory
 
 _PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
@@ -24,7 +15,7 @@ _PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
 def desire(
     observed: HostState,
     settings: PlanSettings,
-    members: Iterable[Member],
+    members: Collection[Member],
     memory: DockerMemory,
     now: float,
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
@@ -34,54 +25,39 @@ def desire(
     keep networks joined that a proxy is on, and its data plane, for the settings' grace, but join
     none.
     """
-    every = tuple(members)
-    bad = _before_uplink(observed.networks, settings.uplink)
+    bad = _before_uplink(observed, settings.uplink)
     usable = {network.name for network in observed.networks} - BUILT_IN - bad
-    keys = {member.key for member in every} | observed.keys
+    alive = [member for member in members if member.container.alive]
     recent = [
         member
-        for member in every
-        if not member.alive and now - memory.exited.get(member.id, now) < settings.grace
+        for member in members
+        if not member.container.alive
+        and now - memory.exited.get(member.container.id, now) < settings.grace
     ]
-    live = [member for member in every if member.alive and member.networks & usable]
-    desired = tuple(
-        replace(
-            _one(key, settings.ports, live, _kept(key, recent, observed), usable),
-            data_plane=_data_plane(key, [*live, *recent], settings),
-        )
-        for key in sorted(keys)
-    )
-    wanted = {name for member in every if member.alive for name in member.networks}
-    bad_networks = (_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
-    return desired, (*bad_networks, *_outvoted(desired))
+    desired: list[Desired] = []
+    for key in sorted({member.key for member in members} | observed.keys):
+        own = tuple(member for member in alive if member.key == key and member.networks & usable)
+        left = [member for member in recent if member.key == key]
+        there = {name for box in observed.sandboxes_of(key) for name in box.container.networks}
+        networks = _networks(own) | (_networks(left) & there)
+        plane = chosen_plane([*own, *left], settings.data_plane)
+        ports = max([settings.ports, *(member.ports for member in own)])
+        desired.append(Desired(key, bool(own), ports, networks & usable, own, plane))
+    told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
+    return tuple(desired), (*told, *_outvoted(desired))
 
 
-def _one(
-    key: Key, ports: int, live: Iterable[Member], kept: frozenset[str], usable: Collection[str]
-) -> Desired:
-    own = tuple(member for member in live if member.key == key)
-    joined = {name for member in own for name in member.networks} | kept
-    return Desired(
-        key=key,
-        live=bool(own),
-        ports=max([ports, *(member.ports for member in own)]),
-        networks=frozenset(joined.intersection(usable)),
-        members=own,
-    )
+def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
+    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
+    asked = {member.data_plane for member in members}
+    return next((plane for plane in _PLANES if plane in asked), default)
 
 
-def _data_plane(key: Key, members: Iterable[Member], settings: PlanSettings) -> DataPlane:
-    return chosen_plane((member for member in members if member.key == key), settings.data_plane)
+def _networks(members: Iterable[Member]) -> frozenset[str]:
+    return frozenset(name for member in members for name in member.networks)
 
 
-def _kept(key: Key, recent: Iterable[Member], observed: HostState) -> frozenset[str]:
-    """The networks that a key's sandboxes are on and that its exited containers are, too."""
-    there = {n for s in observed.sandboxes if s.key == key for n in s.container.networks}
-    left = {name for member in recent if member.key == key for name in member.networks}
-    return frozenset(there & left)
-
-
-def _before_uplink(networks: Iterable[Network], uplink: str) -> set[str]:
+def _before_uplink(observed: HostState, uplink: str) -> set[str]:
     """Networks that would take the published ports and the default route over from the uplink.
 
     The engine gives both to the network whose name sorts first, internal ones aside, and moving
@@ -89,7 +65,7 @@ def _before_uplink(networks: Iterable[Network], uplink: str) -> set[str]:
     """
     return {
         network.name
-        for network in networks
+        for network in observed.networks
         if not network.internal and network.name.encode() < uplink.encode()
     }
 
@@ -103,27 +79,16 @@ def _bad_network(name: str, uplink: str) -> Problem:
     )
 
 
-def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
-    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
-    asked = {member.data_plane for member in members}
-    return next((plane for plane in _PLANES if plane in asked), default)
-
-
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
     """Tell the containers that share a proxy with one that asks for something else."""
     for one in desired:
+        winners = [m.container.name for m in one.members if m.data_plane == one.data_plane]
         for member in one.members:
             if member.data_plane not in (None, one.data_plane):
                 yield Problem(
-                    f"container {member.container}", _outvoted_text(member, one), fatal=False
+                    f"container {member.container.name}",
+                    f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves "
+                    f"{next(iter(winners), 'another one')}, which asks for {one.data_plane}; give "
+                    "both the same",
+                    fatal=False,
                 )
-
-
-def _outvoted_text(member: Member, one: Desired) -> str:
-    other = next(
-        (w.container for w in one.members if w.data_plane == one.data_plane), "another one"
-    )
-    return (
-        f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves {other}, which "
-        f"asks for {one.data_plane}; give both the same"
-    )

@@ -9,7 +9,7 @@ from rosproxy_operator.docker import controller as module
 from rosproxy_operator.docker.client import DockerClient, Json
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.errors import Gone, Unavailable
-from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
 from rosproxy_operator.docker.settings import DockerSettings
@@ -50,7 +50,7 @@ class FakeEngine(DockerClient):
         self.inspected[row["Id"]] = inspected
 
 
-def own(spec: SandboxSpec | ProxySpec, number: str, network: str, address: str) -> Json:
+def own(spec: CreateSandbox | Create, number: str, network: str, address: str) -> Json:
     ends = {network: captured.end("e", address)} if address else {}
     return captured.running() | {
         "Id": number,
@@ -68,9 +68,9 @@ def engine() -> FakeEngine:
     details = captured.inspected() | {"State": {"Status": "running", "StartedAt": "1"}}
     details["NetworkSettings"] = {"Networks": {"app": {"Aliases": ["robot"]}}}
     engine.add(captured.running(), details)
-    box = SandboxSpec(sandbox_name(KEY), KEY, RANGE, "f", SETTINGS.uplink)
+    box = CreateSandbox(sandbox_name(KEY), KEY, RANGE, "f")
     engine.add(own(box, "b" * 64, SETTINGS.uplink, "172.30.0.2"), details)
-    process = ProxySpec(proxy_name(KEY), KEY, RANGE, "f", sandbox_name(KEY))
+    process = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
     token = {"Config": {"Env": ["ROSPROXY_ADMIN_TOKEN=secret"]}, "State": details["State"]}
     engine.add(own(process, "p" * 64, f"container:{'b' * 64}", ""), token)
     return engine
@@ -86,7 +86,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies(engine: FakeEn
     assert [container.name for container in state.containers] == ["talker"]
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
     assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]
-    assert [request.master_uri for request in look.labels.requests] == [KEY.master_uri]
+    assert [request.key.master_uri for request in look.labels.requests] == [KEY.master_uri]
     assert look.masters == {"robot": "172.29.0.2"}  # no name server has it, but a container
     assert not state.unresolved
     assert not state.busy

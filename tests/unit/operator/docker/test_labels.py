@@ -34,7 +34,7 @@ def read(
     """The member of one container, if any, and its problems."""
     members, problems = read_members(observed(one, *others, **more), settings)
     mine = [problem for problem in problems if problem.subject == f"container {one.name}"]
-    return next((member for member in members if member.container == one.name), None), mine
+    return next((member for member in members if member.container == one), None), mine
 
 
 def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
@@ -55,11 +55,11 @@ def warning(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
 
 def test_a_labelled_container_wishes_for_a_proxy() -> None:
     labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
-    member, problems = read(container(labels=labels, networks=("app", "lab")))
+    one = container(labels=labels, networks=("app", "lab"))
+    member, problems = read(one)
     assert problems == []
     assert member == Member(
-        "talker",
-        "id-talker",
+        one,
         Key(ROBOT, "host.lab"),
         40,
         frozenset({"app", "lab"}),
@@ -369,13 +369,13 @@ def test_the_network_of_a_container_that_is_gone() -> None:
 def test_who_lives_counts(state: str) -> None:
     member, _ = read(container(state=state))
     assert member
-    assert member.alive
+    assert member.container.alive
 
 
 def test_who_has_exited_has_no_problems() -> None:
     member, problems = read(container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited"))
     assert member
-    assert (member.alive, problems) == (False, [])
+    assert (member.container.alive, problems) == (False, [])
     assert read(container(labels=ON, state="exited")) == (None, [])
 
 

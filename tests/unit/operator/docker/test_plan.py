@@ -15,11 +15,9 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
-    SandboxSpec,
     Start,
     Unpause,
 )
@@ -59,15 +57,15 @@ NEXT = PortRange(11432, 11463)
 
 
 def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
-    made = sandbox_fingerprint(KEY, ports, SETTINGS)
-    return CreateSandbox(SandboxSpec(name, KEY, ports, made, "0-rosproxy"))
+    made = CreateSandbox(name, KEY, ports)
+    return replace(made, fingerprint=sandbox_fingerprint(made, SETTINGS))
 
 
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
-    made = proxy_fingerprint(KEY, ports, SETTINGS, image)
-    return Create(ProxySpec(NAME, KEY, ports, made, home, replaces))
+    made = Create(NAME, KEY, ports, home, replaces=replaces)
+    return replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image))
 
 
 def look(
@@ -436,7 +434,7 @@ def port_problem(found: DockerPlan) -> str:
 
 
 def created(found: DockerPlan) -> PortRange:
-    return next(a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox))
+    return next(a.range for a in found.actions if isinstance(a, CreateSandbox))
 
 
 @pytest.mark.parametrize(
@@ -463,16 +461,14 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
 
 def test_two_new_proxies_do_not_get_the_same() -> None:
     found = look(observed(container(), container("b", ON_ARM)))
-    ranges = [a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox)]
+    ranges = [a.range for a in found.actions if isinstance(a, CreateSandbox)]
     assert ranges == [RANGE, NEXT]
 
 
 def test_ports_are_kept_while_a_container_is_being_created() -> None:
     memory = look(observed(container())).memory
     found = look(observed(container(), container("a", ON_ARM)), memory=memory)
-    assert [
-        (a.sandbox.key, a.sandbox.range) for a in found.actions if isinstance(a, CreateSandbox)
-    ] == [
+    assert [(a.key, a.range) for a in found.actions if isinstance(a, CreateSandbox)] == [
         (ARM, NEXT),
         (KEY, RANGE),
     ]

@@ -12,11 +12,9 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
-    SandboxSpec,
     Start,
     Unpause,
 )
@@ -67,12 +65,12 @@ STATUS = {
 ACTIONS: list[tuple[Action, str]] = [
     (CreateNetwork("0-rosproxy"), "create network 0-rosproxy, a bridge: the uplink of all proxies"),
     (
-        CreateSandbox(SandboxSpec("p-ports", KEY, RANGE, "f", "0-rosproxy")),
+        CreateSandbox("p-ports", KEY, RANGE),
         "create container p-ports: it holds ports 11400-11431 for the proxy of the master "
         "http://robot:11311",
     ),
     (
-        Create(ProxySpec("p", KEY, RANGE, "f", "p-ports", "p-old")),
+        Create("p", KEY, RANGE, "p-ports", replaces="p-old"),
         "create container p: proxy of the master http://robot:11311 at 192.0.2.10, ports "
         "11400-11431 of p-ports, instead of p-old",
     ),

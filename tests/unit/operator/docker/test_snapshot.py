@@ -18,7 +18,6 @@ from rosproxy_operator.docker.engine_json import (
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    HostPorts,
     HostState,
     Key,
     Network,
@@ -131,7 +130,7 @@ def test_the_signature_changes_with_each_connection() -> None:
 def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
-    state = HostState((), (), (), HostPorts(ports), sandboxes=(box,))
+    state = HostState((), (), (), ports, sandboxes=(box,))
     listening = frozenset({22, 11400, 11401})
     assert strangers(replace(state, busy=frozenset({"box"})), listening) == {22}
     assert strangers(state, listening) == listening
@@ -141,7 +140,7 @@ def test_the_engine_knows_names_that_no_name_server_has() -> None:
     uplink = Network("n0", "0-rosproxy", gateway="172.30.0.1")
     places = (Attachment("app", "172.18.0.5", frozenset({"RosCore"})),)
     core = Container("1", "core", "running", attachments=places)
-    state = HostState((core,), (uplink,), (), HostPorts(PortRange(1, 2)))
+    state = HostState((core,), (uplink,), (), PortRange(1, 2))
     assert address_in(state, "roscore", "0-rosproxy") == "172.18.0.5"
     assert address_in(state, "host.docker.internal", "0-rosproxy") == "172.30.0.1"
     assert address_in(state, "robot", "0-rosproxy") == ""

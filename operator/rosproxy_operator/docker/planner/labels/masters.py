@@ -1,13 +1,12 @@
 """Which master a container means, and whether its nodes will find their proxy."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from urllib.parse import urlsplit
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.values import MASTER_URI, UnusableLabel, quoted
+from rosproxy_operator.docker.planner.labels.values import MASTER_URI, UnusableLabel, named, quoted
 from rosproxy_operator.docker.planner.model import Container, Key, PlanSettings
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 
@@ -16,65 +15,26 @@ ALIAS = "rosproxy"
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 
 
-def names_proxy(host: str, proxies: Collection[str]) -> bool:
-    """Whether a host's name means a proxy and not a master. ``proxies`` are names of containers."""
-    return host == ALIAS or host in proxies or is_proxy_name(host)
-
-
-def master_uri(
-    container: Container, label: str | None, settings: PlanSettings, proxies: Collection[str]
-) -> str:
+def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
     """The URI of the real master: from the label, else the environment, else the settings.
 
-    Raises UnusableLabel if there is none or it can't be one.
+    ``proxies`` are names of the operator's own containers. Raises UnusableLabel if there is none
+    or it can't be one.
     """
-    if label is not None:
-        return parse_master(f"label {MASTER_URI}={quoted(label)}", label, proxies)
+    if MASTER_URI in container.labels:
+        source = named(MASTER_URI, container.labels)
+        return _parse_master(source, container.labels[MASTER_URI], proxies)
     where = parse_slave_uri(container.master_uri)
-    if container.master_uri and not (where and names_proxy(where.host.lower(), proxies)):
+    if container.master_uri and not (where and _names_proxy(where.host.lower(), proxies)):
         source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
-        return parse_master(source, container.master_uri, proxies)
+        return _parse_master(source, container.master_uri, proxies)
     if settings.master_uri:
         source = f"the operator's --master-uri {quoted(settings.master_uri)}"
-        return parse_master(source, settings.master_uri, proxies)
+        return _parse_master(source, settings.master_uri, proxies)
     raise UnusableLabel(
         f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
         "or start the operator with --master-uri"
     )
-
-
-def parse_master(source: str, uri: str, proxies: Collection[str] = ()) -> str:
-    """A master's URI in its one form: host in lower case, no slash at the end.
-
-    Raises UnusableLabel, which names ``source``, for what can't be the URI of a real master.
-    """
-    where = parse_slave_uri(uri.strip())
-    path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
-    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
-        raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
-    host = where.host.lower()
-    if is_loopback(host):
-        raise UnusableLabel(
-            f"{source} is the container itself, where no master runs: give the name of the "
-            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
-            f"{MASTER_URI}"
-        )
-    if names_proxy(host, proxies):
-        raise UnusableLabel(
-            f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
-        )
-    return slave_uri(HostPort(host, where.port), path)
-
-
-def unresolved(hosts: Iterable[str]) -> Iterator[Problem]:
-    """The problems of masters whose hosts have no known address."""
-    for host in sorted(hosts):
-        yield Problem(
-            f"master {host}",
-            f"the name {host} can't be resolved where the operator runs: give the master's "
-            f"address instead, or the operator that name (/etc/hosts; in a container: "
-            f"--add-host {host}:ADDRESS)",
-        )
 
 
 def looks_for(container: Container, key: Key) -> tuple[str, str]:
@@ -95,17 +55,41 @@ def looks_for(container: Container, key: Key) -> tuple[str, str]:
         if where.port == right.port:
             return host, ""
         return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
-    return "", _wrong_master(variable, host, key, fix)
+    return "", f"{variable} {_wrong_master(host, key, fix)}"
 
 
-def _wrong_master(variable: str, host: str, key: Key, fix: str) -> str:
+def _wrong_master(host: str, key: Key, fix: str) -> str:
     if is_proxy_name(host):
-        return f"{variable} names another master's proxy, its own is {proxy_name(key)}: {fix}"
+        return f"names another master's proxy, its own is {proxy_name(key)}: {fix}"
     if is_loopback(host):
-        return f"{variable} is the container itself: {fix}"
+        return f"is the container itself: {fix}"
     if is_address(host):
         return (
-            f"{variable} is an address, so its nodes go around the proxy and can't be reached "
-            f"from outside: {fix}, or use the name of the master's host"
+            "is an address, so its nodes go around the proxy and can't be reached from outside: "
+            f"{fix}, or use the name of the master's host"
         )
-    return f"{variable} is not its master {key.master_uri}, so its nodes go elsewhere: {fix}"
+    return f"is not its master {key.master_uri}, so its nodes go elsewhere: {fix}"
+
+
+def _names_proxy(host: str, proxies: Collection[str]) -> bool:
+    return host == ALIAS or host in proxies or is_proxy_name(host)
+
+
+def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
+    """A master's URI in its one form: host in lower case, no slash at the end."""
+    where = parse_slave_uri(uri.strip())
+    path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
+    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
+        raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
+    host = where.host.lower()
+    if is_loopback(host):
+        raise UnusableLabel(
+            f"{source} is the container itself, where no master runs: give the name of the "
+            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
+            f"{MASTER_URI}"
+        )
+    if _names_proxy(host, proxies):
+        raise UnusableLabel(
+            f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
+        )
+    return slave_uri(HostPort(host, where.port), path)
