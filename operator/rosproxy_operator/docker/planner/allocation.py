@@ -130,11 +130,21 @@ class _Allocation:
             try:
                 self.given[key] = negotiate(count, window, blocked, held)
             except PortsExhausted as error:
-                self.problems.append(_exhausted(key, error))
+                text = (
+                    f"{error}: lower --ports or the label rosproxy.ports ({count}), widen "
+                    f"--port-window ({window}), or stop what holds ports there"
+                )
+                self.problems.append(_problem(key, text, fatal=True))
         elif not frozen:
             self.given[key] = extended(kept, count, window, blocked, held) or kept
             if len(self.given[key]) < count:
-                self.problems.append(_too_few(key, kept, count))
+                more = PortRange(kept.last + 1, kept.first + count - 1)
+                text = (
+                    f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps "
+                    f"its {len(kept)} at {kept}, since {more} are not free or beyond "
+                    "--port-window: stop what holds them"
+                )
+                self.problems.append(_problem(key, text))
 
 
 def allocate(
@@ -161,42 +171,21 @@ def allocate(
     given, served = allocation.given, dict(memory.served)
     left = [key for key in given if key in served and not within(served[key], given[key])]
     moved = {key: Move(served.pop(key), now) for key in left} | dict(memory.moved)
-    told = [
-        _moved(key, moved[key], ports)
-        for key, ports in sorted(given.items(), key=lambda item: item[0])
-        if key in moved and not within(moved[key].ports, ports)
-    ]
+    for key, ports in sorted(given.items(), key=lambda item: item[0]):
+        if key in moved and not within(moved[key].ports, ports):
+            text = (
+                f"HAS LEFT ITS PORTS {moved[key].ports} for {ports}, since something else has "
+                "taken them: nodes that had registered under the old ones can't be reached until "
+                "they register anew"
+            )
+            allocation.problems.append(_problem(key, text))
     memory = replace(memory, served=served, planned=given, moved=moved)
-    return memory, [*allocation.problems, *told]
+    return memory, allocation.problems
 
 
 def _published(containers: Iterable[Container]) -> frozenset[int]:
     return frozenset(port for one in containers for port in one.host_ports)
 
 
-def _exhausted(key: Key, error: PortsExhausted) -> Problem:
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"{error}: lower --ports or the label rosproxy.ports ({error.count}), widen --port-window "
-        f"({error.window}), or stop what holds ports there",
-    )
-
-
-def _too_few(key: Key, kept: PortRange, count: int) -> Problem:
-    more = PortRange(kept.last + 1, kept.first + count - 1)
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps its "
-        f"{len(kept)} at {kept}, since {more} are not free or beyond --port-window: stop what "
-        "holds them",
-        fatal=False,
-    )
-
-
-def _moved(key: Key, move: Move, ports: PortRange) -> Problem:
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"HAS LEFT ITS PORTS {move.ports} for {ports}, since something else has taken them: nodes "
-        "that had registered under the old ones can't be reached until they register anew",
-        fatal=False,
-    )
+def _problem(key: Key, text: str, fatal: bool = False) -> Problem:
+    return Problem(f"proxy {proxy_name(key)}", text, fatal)

@@ -11,17 +11,10 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
 )
-from rosproxy_operator.docker.planner.aliases import assign
 from rosproxy_operator.docker.planner.allocation import allocate, refused
-from rosproxy_operator.docker.planner.desired import desire
+from rosproxy_operator.docker.planner.desired import assign, desire
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
-from rosproxy_operator.docker.planner.model import (
-    Desired,
-    HostState,
-    Key,
-    Member,
-    PlanSettings,
-)
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
 from rosproxy_operator.docker.planner.steps import PlanContext, leave, retired, wanted_steps

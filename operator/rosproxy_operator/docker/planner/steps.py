@@ -24,7 +24,7 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.aliases import holds, needed_by
+from rosproxy_operator.docker.planner.desired import holds, needed_by
 from rosproxy_operator.docker.planner.model import (
     SERVING,
     STARTED,

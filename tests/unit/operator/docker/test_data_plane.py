@@ -26,7 +26,6 @@ from tests.unit.operator.docker.builders import (
     observed,
     planned,
     proxy,
-    read_members,
     sandbox,
 )
 
@@ -83,23 +82,6 @@ def test_a_label_goes_before_the_option(plane: str) -> None:
         found = look(asking("a", plane), settings=replace(SETTINGS, data_plane=option))
         assert given(found) == plane.strip().lower()
         assert found.problems == ()
-
-
-@pytest.mark.parametrize("value", ["", "fast", "kernel,splice", "true"])
-def test_a_label_that_names_no_plane(value: str) -> None:
-    members, problems = read_members(observed(asking("a", value), container("b")), SETTINGS)
-    assert [member.container.name for member in members] == ["b"]
-    assert [problem.text for problem in problems] == [
-        f"label rosproxy.data-plane={value!r} is none of auto, kernel, splice, copy: write "
-        "rosproxy.data-plane=kernel for a proxy that lets the kernel forward, or leave it out"
-    ]
-
-
-def test_a_misspelt_label() -> None:
-    _, problems = read_members(
-        observed(container(labels={**ENABLED, "rosproxy.dataplane": "kernel"})), SETTINGS
-    )
-    assert "did you mean rosproxy.data-plane?" in problems[0].text
 
 
 def test_who_is_outvoted_is_told() -> None:

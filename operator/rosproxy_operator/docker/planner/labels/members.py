@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels import values
-from rosproxy_operator.docker.planner.labels.masters import looks_for, master_uri
 from rosproxy_operator.docker.planner.labels.values import (
     ADVERTISE_HOST,
     ENABLE,
@@ -54,7 +53,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if _counts(container, settings):
+            if _wants_proxy(container, settings):
                 requests.append(_request(container, observed, settings, proxies))
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
@@ -78,7 +77,7 @@ def find_members(
         container, uri = request.container, request.key.master_uri
         key = Key(uri, request.key.advertise_host or _advertised(request, observed))
         if key.advertise_host:
-            needs, text = looks_for(container, key)
+            needs, text = values.looks_for(container, key)
             wrong = [_problem(container, text, False)] if text else []
             members.append(replace(request, key=key, needs=needs))
         else:
@@ -94,7 +93,7 @@ def find_members(
 def _request(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> Member:
-    uri = master_uri(container, settings, proxies)
+    uri = values.master_uri(container, settings, proxies)
     return Member(
         container,
         Key(uri, values.advertise_host(container.labels, settings)),
@@ -113,8 +112,7 @@ def _unusable(container: Container, text: str) -> Problem:
     return _problem(container, text, fatal=bool(_own(container)))
 
 
-def _counts(container: Container, settings: PlanSettings) -> bool:
-    """Whether a container wants a proxy. Raises UnusableLabel if its label says neither."""
+def _wants_proxy(container: Container, settings: PlanSettings) -> bool:
     enabled = values.enabled(container.labels)
     if enabled is None:
         return settings.expose_by_default and bool(_own(container) or container.master_uri)

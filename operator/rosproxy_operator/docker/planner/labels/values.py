@@ -1,21 +1,25 @@
-"""What each of a container's labels says.
+"""What each of a container's labels says, and which master it means.
 
-Each function raises UnusableLabel for a value that can't be.
+Each function that reads a label raises UnusableLabel for a value that can't be.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import get_args
+from urllib.parse import urlsplit
 
-from rosproxy.net.addresses import is_address, is_loopback
+from rosproxy.net.addresses import HostPort, is_address, is_loopback
+from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.model import (
     MOST_PORTS,
     Container,
     HostState,
+    Key,
     PlanSettings,
 )
+from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"
@@ -25,9 +29,12 @@ NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
 LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE)
 
+ALIAS = "rosproxy"
+"""The name under which every proxy is found on the networks of its containers."""
 BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""
 _SHARED = "container:"
+_PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
@@ -165,3 +172,83 @@ def _why_none(owner: Container) -> str:
     if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
         return f"is only on the default bridge network, where no names resolve: {fix}"
     return f"is on no network: {fix}"
+
+
+def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
+    """The URI of the real master: from the label, else the environment, else the settings.
+
+    ``proxies`` are names of the operator's own containers. Raises UnusableLabel if there is none
+    or it can't be one.
+    """
+    if MASTER_URI in container.labels:
+        source = named(MASTER_URI, container.labels)
+        return _parse_master(source, container.labels[MASTER_URI], proxies)
+    where = parse_slave_uri(container.master_uri)
+    if container.master_uri and not (where and _names_proxy(where.host.lower(), proxies)):
+        source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+        return _parse_master(source, container.master_uri, proxies)
+    if settings.master_uri:
+        source = f"the operator's --master-uri {quoted(settings.master_uri)}"
+        return _parse_master(source, settings.master_uri, proxies)
+    raise UnusableLabel(
+        f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
+        "or start the operator with --master-uri"
+    )
+
+
+def looks_for(container: Container, key: Key) -> tuple[str, str]:
+    """The name by which a container's nodes look for their proxy, and what is wrong with it.
+
+    The name is empty if no alias can help. The second text is empty if nothing is wrong.
+    """
+    if not container.master_uri:
+        return ALIAS, ""
+    where = parse_slave_uri(container.master_uri)
+    variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+    right = master(key)
+    fix = f"set ROS_MASTER_URI=http://{ALIAS}:{right.port}"
+    if where is None:
+        return "", f"{variable} is not of the form http://HOST:11311: {fix}"
+    host = where.host.lower()
+    if not is_address(host) and host in (ALIAS, right.host, proxy_name(key)):
+        if where.port == right.port:
+            return host, ""
+        return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
+    return "", f"{variable} {_wrong_master(host, key, fix)}"
+
+
+def _wrong_master(host: str, key: Key, fix: str) -> str:
+    if is_proxy_name(host):
+        return f"names another master's proxy, its own is {proxy_name(key)}: {fix}"
+    if is_loopback(host):
+        return f"is the container itself: {fix}"
+    if is_address(host):
+        return (
+            "is an address, so its nodes go around the proxy and can't be reached from outside: "
+            f"{fix}, or use the name of the master's host"
+        )
+    return f"is not its master {key.master_uri}, so its nodes go elsewhere: {fix}"
+
+
+def _names_proxy(host: str, proxies: Collection[str]) -> bool:
+    return host == ALIAS or host in proxies or is_proxy_name(host)
+
+
+def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
+    """A master's URI in its one form: host in lower case, no slash at the end."""
+    where = parse_slave_uri(uri.strip())
+    path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
+    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
+        raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
+    host = where.host.lower()
+    if is_loopback(host):
+        raise UnusableLabel(
+            f"{source} is the container itself, where no master runs: give the name of the "
+            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
+            f"{MASTER_URI}"
+        )
+    if _names_proxy(host, proxies):
+        raise UnusableLabel(
+            f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
+        )
+    return slave_uri(HostPort(host, where.port), path)
