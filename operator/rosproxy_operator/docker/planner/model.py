@@ -22,11 +22,10 @@ WINDOW = PortRange(11400, 65535)
 class PlanSettings:
     """The operator's options that decide what is planned.
 
-    ``master_uri`` and ``advertise_host`` are for containers without a label of their own and may
-    be empty. ``ports`` is the least number of ports that a proxy gets, ``window`` where they are
-    looked for, ``publish`` the host's addresses on which they are published. ``grace`` is in
-    seconds: how long a proxy outlives its last container. ``data_plane`` is that of proxies whose
-    containers ask for none.
+    ``master_uri``, ``advertise_host`` (both may be empty) and ``data_plane`` are for containers
+    without a label of their own. ``ports`` is the least number that a proxy gets, ``window`` where
+    they are looked for, ``publish`` the host's addresses on which they are published. ``grace`` is
+    in seconds: how long a proxy outlives its last container.
     """
 
     master_uri: str = ""
@@ -62,10 +61,10 @@ class Attachment:
 class Container:
     """A container, in the engine's words.
 
-    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name.
-    ``master_uri`` is ROS_MASTER_URI of its environment, empty if unset. ``host_ports`` are the TCP
-    ports that it publishes on the host, or will once it is started. ``started_at`` is when it was
-    started last, in the engine's words; empty if never, or if nobody asked.
+    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name,
+    ``master_uri`` ROS_MASTER_URI of its environment or empty. ``host_ports`` are the TCP ports that
+    it publishes on the host, or will once it is started. ``started_at`` is empty if it never was,
+    or if nobody asked.
     """
 
     id: str

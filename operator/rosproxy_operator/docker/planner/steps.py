@@ -50,10 +50,9 @@ _CHANGEABLE = frozenset({"created", "running", "paused", "exited"})
 
 @dataclass(frozen=True, slots=True)
 class PlanContext:
-    """One key that is wanted, what there is for it, and what it gets.
+    """One key that is wanted, what there is for it, and what it gets: ports, and names by network.
 
-    ``aliases`` are the proxy's names by network. ``creatable``: the image and the uplink are there
-    or can be made.
+    ``creatable``: the image and the uplink are there or can be made.
     """
 
     observed: HostState
@@ -154,7 +153,7 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     kept = found.kept
     if found.stuck:
         return None, None
-    actions: list[Action] = _left_over(found)
+    actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
     if kept is None and not found.waiting:
         made = replace(made, name=free_name(made.name, taken), fingerprint=expected)
         former = _former_name(found.old, made.name, taken)
@@ -264,7 +263,7 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         return []
     if found.stuck or misplaced:
         return None
-    actions: list[Action] = _left_over(found)
+    actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
     if kept:
         actions += _tended(found, kept, home)
         if wanted not in (kept.name, *taken) and not found.waiting:
@@ -303,10 +302,6 @@ def _instant(text: str) -> tuple[str, str]:
     """A time in the engine's words, so that it can be compared: their fractions vary in length."""
     seconds, _, fraction = text.removesuffix("Z").partition(".")
     return seconds, fraction.ljust(9, "0")
-
-
-def _left_over(found: Selection) -> list[Action]:
-    return [Remove(one.name, "left over") for one in found.others]
 
 
 def _former_name(old: Container | None, name: str, taken: frozenset[str]) -> str:

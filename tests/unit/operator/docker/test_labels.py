@@ -358,7 +358,7 @@ def test_who_is_dead_wants_nothing(state: str) -> None:
 
 def test_everybody_with_a_master_is_exposed() -> None:
     assert good(container(labels={}, env=ROBOT), EXPOSING).key == KEY
-    assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING)
+    assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING).key == KEY
     assert read(container(labels={}), EXPOSING) == (None, [])
 
 
@@ -408,7 +408,9 @@ def test_a_proxy_of_whatever_name_is_no_master() -> None:
     odd = {"sandboxes": [sandbox(name="odd")], "proxies": [proxy(name="strange")]}
     for host in ("odd", "strange"):
         one = container(labels=ON, env=f"http://{host}:11311")
-        assert read(one, replace(SETTINGS, master_uri=ROBOT), **odd)[0]
+        member, _ = read(one, replace(SETTINGS, master_uri=ROBOT), **odd)
+        assert member is not None
+        assert member.key == KEY
 
 
 TEXT = st.text(max_size=30) | st.sampled_from(["true", ROBOT, "app", "8", HERE])

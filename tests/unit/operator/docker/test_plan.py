@@ -538,7 +538,9 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
         Remove(f"{PORTS}-old", "made anew"),
         Start(PORTS),
     )
-    assert look(seen, memory=found.memory, now=299.0).actions == found.actions
+    forgets = replace(found.memory, planned={})
+    assert look(seen, memory=forgets, now=299.0).actions == found.actions
+    assert look(seen, memory=forgets, now=300.0).actions != found.actions
 
 
 @pytest.mark.parametrize("ports", [[11410], None])
