@@ -223,7 +223,7 @@ def test_a_move_is_told_until_the_proxy_knows() -> None:
     news = ProxyNews()
     news.look(HERE, 0.0)
     news.body({OLD}, 0.0)
-    news.look(replace(THERE, taken=THERE.taken | {NEW}), 1.0)
+    news.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
     assert news.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
     news.told(1.0)
     assert news.next_due(1.0) == 1.0
