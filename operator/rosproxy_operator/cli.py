@@ -332,9 +332,10 @@ def _one_line(*more: type[Exception]) -> Iterator[None]:
     from rosproxy_operator.common.control_loop import LookFailed
     from rosproxy_operator.docker.errors import EngineError
 
+    errors: tuple[type[Exception], ...] = (EngineError, LookFailed, *more)
     try:
         yield
-    except (EngineError, LookFailed, *more) as error:
+    except errors as error:
         _fail(error)
 
 

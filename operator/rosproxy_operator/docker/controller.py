@@ -143,7 +143,7 @@ class DockerController:
         self._log.update(problems)
         metrics = self._metrics
         metrics.look_time.observe(took)
-        metrics.containers.set(sum(member.alive for member in planned.members))
+        metrics.containers.set(sum(member.container.alive for member in planned.members))
         metrics.problems.set(len(problems))
         metrics.show_proxies(proxy.container.state for proxy in look.state.proxies)
         times = (planned.again_in, self._executor.again_in)

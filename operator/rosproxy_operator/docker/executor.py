@@ -244,12 +244,12 @@ class DockerApplier:
             case CreateNetwork(name):
                 labels = {MANAGED: "true"}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
-            case CreateSandbox(spec):
-                self._create(spec.name, sandbox_config(spec, self._settings))
-            case Create(spec):
-                token = look.tokens.get(spec.key) or secrets.token_hex(16)
-                address = look.master_address(spec.key)
-                self._create(spec.name, container_config(spec, self._settings, token, address))
+            case CreateSandbox(name):
+                self._create(name, sandbox_config(action, self._settings))
+            case Create(name, key):
+                token = look.tokens.get(key) or secrets.token_hex(16)
+                address = look.master_address(key)
+                self._create(name, container_config(action, self._settings, token, address))
             case Start(name):
                 do("start", name)
             case Restart(name):

@@ -19,7 +19,6 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
-    HostPorts,
     HostState,
     Key,
     Network,
@@ -218,7 +217,8 @@ class DockerObserver:
             containers=tuple(containers),
             networks=networks,
             proxies=tuple(proxies),
-            host=HostPorts(host.ephemeral_ports(), strangers(sandboxes, busy, listening)),
+            ephemeral=host.ephemeral_ports(),
+            listening=strangers(sandboxes, busy, listening),
             sandboxes=tuple(sandboxes),
             busy=frozenset(busy),
             addresses=frozenset(

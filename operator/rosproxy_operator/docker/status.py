@@ -87,7 +87,11 @@ async def survey(settings: PlanSettings) -> Json:
     silent = [each for each in answers.values() if isinstance(each, Problem)]
     problems = [*planned.problems, *silent]
     wrong = {problem.subject for problem in problems}
-    keys = {member.id: member.key for member in planned.members if member.key in look.state.keys}
+    keys = {
+        member.container.id: member.key
+        for member in planned.members
+        if member.key in look.state.keys
+    }
     return {
         "version": __version__,
         "uplink": settings.uplink,

@@ -13,37 +13,6 @@ from rosproxy_operator.docker.planner.model import Key
 
 
 @dataclass(frozen=True, slots=True)
-class SandboxSpec:
-    """A sandbox to create: the container with a proxy's network namespace and published ports.
-
-    With ``forwards`` the kernel may forward packets in that namespace.
-    """
-
-    name: str
-    key: Key
-    range: PortRange
-    fingerprint: str
-    uplink: str
-    forwards: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class ProxySpec:
-    """A proxy's container to create, in the namespace of the container named ``sandbox``.
-
-    ``replaces`` names the one whose token it takes over, if any.
-    """
-
-    name: str
-    key: Key
-    range: PortRange
-    fingerprint: str
-    sandbox: str
-    replaces: str = ""
-    data_plane: DataPlane = "auto"
-
-
-@dataclass(frozen=True, slots=True)
 class CreateNetwork:
     """Create the uplink network, an ordinary bridge."""
 
@@ -55,31 +24,45 @@ class CreateNetwork:
 
 @dataclass(frozen=True, slots=True)
 class CreateSandbox:
-    """Create a sandbox on the uplink network, without starting it."""
+    """Create a sandbox on the uplink network, without starting it.
 
-    sandbox: SandboxSpec
+    With ``forwards`` the kernel may forward packets in its network namespace.
+    """
+
+    name: str
+    key: Key
+    range: PortRange
+    fingerprint: str = ""
+    forwards: bool = False
 
     def __str__(self) -> str:
-        box = self.sandbox
         return clean(
-            f"create container {box.name}: it holds ports {box.range} for the proxy of the master "
-            f"{box.key.master_uri}"
+            f"create container {self.name}: it holds ports {self.range} for the proxy of the "
+            f"master {self.key.master_uri}"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Create:
-    """Create a proxy's container, without starting it."""
+    """Create a proxy's container in the namespace of the one named ``sandbox``; don't start it.
 
-    proxy: ProxySpec
+    ``replaces`` names the one whose token it takes over, if any.
+    """
+
+    name: str
+    key: Key
+    range: PortRange
+    sandbox: str
+    data_plane: DataPlane = "auto"
+    fingerprint: str = ""
+    replaces: str = ""
 
     def __str__(self) -> str:
-        proxy = self.proxy
-        instead = f", instead of {proxy.replaces}" if proxy.replaces else ""
-        rights = ", with NET_ADMIN" if proxy.data_plane == "kernel" else ""
+        instead = f", instead of {self.replaces}" if self.replaces else ""
+        rights = ", with NET_ADMIN" if self.data_plane == "kernel" else ""
         return clean(
-            f"create container {proxy.name}: proxy of the master {proxy.key.master_uri} at "
-            f"{proxy.key.advertise_host}, ports {proxy.range} of {proxy.sandbox}{rights}{instead}"
+            f"create container {self.name}: proxy of the master {self.key.master_uri} at "
+            f"{self.key.advertise_host}, ports {self.range} of {self.sandbox}{rights}{instead}"
         )
 
 

@@ -1,7 +1,7 @@
 """Which range of ports each proxy of a Docker host gets, and when it must leave it."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable
+from dataclasses import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
@@ -15,7 +15,9 @@ from rosproxy_operator.common.allocation import (
 )
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import (
+    SERVING,
     STARTED,
+    Container,
     Desired,
     HostState,
     Key,
@@ -23,21 +25,20 @@ from rosproxy_operator.docker.planner.model import (
     Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import proxy_name, reserved_ports
-from rosproxy_operator.docker.planner.state import SERVING, DockerMemory, PortRefusal
+from rosproxy_operator.docker.planner.state import DockerMemory, PortRefusal
 
 
 def refused(
-    observed: HostState, live: Iterable[Key], memory: DockerMemory, now: float
+    observed: HostState, live: Collection[Key], memory: DockerMemory, now: float
 ) -> DockerMemory:
     """Draw the conclusions from the engine's refusals to start sandboxes.
 
     A range that has never served is given up at once: its refused ports become ``taken``. One that
     has served is given up after `RETRY_FOR` seconds, since its ports may only be slow to be let go.
     """
-    wanted = set(live)
     for sandbox in observed.sandboxes:
         refusal = memory.refusals.get(sandbox.container.name)
-        if refusal is not None and sandbox.key in wanted:
+        if refusal is not None and sandbox.key in live:
             memory = _concluded(memory, sandbox, refusal, now)
     return memory
 
@@ -45,39 +46,25 @@ def refused(
 def _concluded(
     memory: DockerMemory, sandbox: Sandbox, refusal: PortRefusal, now: float
 ) -> DockerMemory:
-    name, served = sandbox.container.name, memory.served.get(sandbox.key)
-    hit = _hit(sandbox.range, refusal)
+    served, moved = memory.served.get(sandbox.key), dict(memory.moved)
+    named = {port for port in refusal.ports or () if port in sandbox.range}
+    hit = named or set(sandbox.range.ports())
     fresh = {port for port in hit if served is None or port not in served}
-    if fresh:
-        return _settled(memory, name, fresh, now)
-    if served is None or now - refusal.since < RETRY_FOR:
-        return memory
-    moved = {**memory.moved, sandbox.key: Move(served, now)}
-    return replace(_settled(memory, name, hit, now), moved=moved)
-
-
-def _hit(ports: PortRange, refusal: PortRefusal) -> set[int]:
-    """The ports that a refusal is about: those that the engine named, else all of the range."""
-    named = {port for port in refusal.ports or () if port in ports}
-    return named or set(ports.ports())
-
-
-def _settled(memory: DockerMemory, name: str, taken: Iterable[int], now: float) -> DockerMemory:
-    refusals = {other: said for other, said in memory.refusals.items() if other != name}
-    return replace(memory, refusals=refusals, taken={**memory.taken, **dict.fromkeys(taken, now)})
-
-
-@dataclass(frozen=True, slots=True)
-class GivenRanges:
-    """The range of each live proxy that can have one, and what is to be told and remembered."""
-
-    given: Mapping[Key, PortRange]
-    memory: DockerMemory
-    problems: tuple[Problem, ...]
+    if served is not None and not fresh:
+        if now - refusal.since < RETRY_FOR:
+            return memory
+        moved[sandbox.key] = Move(served, now)
+    name = sandbox.container.name
+    return replace(
+        memory,
+        refusals={other: said for other, said in memory.refusals.items() if other != name},
+        taken={**memory.taken, **dict.fromkeys(fresh or hit, now)},
+        moved=moved,
+    )
 
 
 class _Allocation:
-    """GivenRanges being given out, one key after the other."""
+    """Ranges being given out, one key after the other."""
 
     def __init__(
         self, observed: HostState, settings: PlanSettings, memory: DockerMemory, live: set[Key]
@@ -88,23 +75,20 @@ class _Allocation:
         self.live = live
         self.given: dict[Key, PortRange] = {}
         self.problems: list[Problem] = []
-        published = frozenset(port for one in observed.containers for port in one.host_ports)
-        self.claimed = published | memory.taken.keys()
-        self.blocked = self.claimed | observed.host.listening
+        self.serving = {s.key for s in observed.sandboxes if s.container.state in SERVING}
+        """The keys that have ports on which a proxy serves."""
+        self.claimed = _published(observed.containers) | memory.taken.keys()
+        self.blocked = self.claimed | observed.listening
 
     def order(self, key: Key) -> tuple[int, Key]:
         """Who has ports comes before who had some, and that one before who wants some."""
-        ranks = (self.serving(key), key in self.memory.served, key in self.memory.planned)
-        return ranks.index(True) if True in ranks else len(ranks), key
-
-    def serving(self, key: Key) -> bool:
-        """Whether a key has ports on which a proxy serves."""
-        return any(s.key == key and s.container.state in SERVING for s in self.observed.sandboxes)
+        ranks = [key in found for found in (self.serving, self.memory.served, self.memory.planned)]
+        return [*ranks, True].index(True), key
 
     def held(self, key: Key) -> list[PortRange]:
         """The ranges that a key can't have: other proxies', and the kernel's."""
         others = [sandbox.range for sandbox in self.observed.sandboxes if sandbox.key != key]
-        return [self.observed.host.ephemeral, *others, *self.given_to_others(key)]
+        return [self.observed.ephemeral, *others, *self.given_to_others(key)]
 
     def given_to_others(self, key: Key) -> list[PortRange]:
         """What other keys have got already."""
@@ -118,20 +102,19 @@ class _Allocation:
         others = [
             one.range
             for one in self.observed.sandboxes
-            if one.key != key and (one.key not in self.live or self.serving(one.key))
+            if one.key != key and (one.key not in self.live or one.key in self.serving)
         ]
         started = [one for one in self.observed.containers if one.state in STARTED]
-        published = {port for one in started for port in one.host_ports}
-        taken = published | self.memory.taken.keys()
+        taken = _published(started) | self.memory.taken.keys()
         return is_free(ports, taken, [*others, *self.given_to_others(key)])
 
     def keep(self, key: Key) -> None:
         """Give a key the range where its proxy serves, has served, or is being made."""
         ports = self.memory.served.get(key)
-        if ports is not None and (self.serving(key) or self.may_stay(key, ports)):
+        if ports is not None and (key in self.serving or self.may_stay(key, ports)):
             self.given[key] = ports
             return
-        created = [one.range for one in self.observed.sandboxes if one.key == key]
+        created = [one.range for one in self.observed.sandboxes_of(key)]
         ports = self.memory.planned.get(key) or (created[0] if created else None)
         # What listens on ports of a sandbox that is there may be the engine, which is starting it.
         blocked = self.claimed if ports in created else self.blocked
@@ -147,11 +130,21 @@ class _Allocation:
             try:
                 self.given[key] = negotiate(count, window, blocked, held)
             except PortsExhausted as error:
-                self.problems.append(_exhausted(key, error))
+                text = (
+                    f"{error}: lower --ports or the label rosproxy.ports ({count}), widen "
+                    f"--port-window ({window}), or stop what holds ports there"
+                )
+                self.problems.append(_problem(key, text, fatal=True))
         elif not frozen:
             self.given[key] = extended(kept, count, window, blocked, held) or kept
             if len(self.given[key]) < count:
-                self.problems.append(_too_few(key, kept, count))
+                more = PortRange(kept.last + 1, kept.first + count - 1)
+                text = (
+                    f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps "
+                    f"its {len(kept)} at {kept}, since {more} are not free or beyond "
+                    "--port-window: stop what holds them"
+                )
+                self.problems.append(_problem(key, text))
 
 
 def allocate(
@@ -161,11 +154,12 @@ def allocate(
     memory: DockerMemory,
     now: float,
     frozen: bool = False,
-) -> GivenRanges:
-    """A range for each live proxy: the one that it has or had, else the first that is free.
+) -> tuple[DockerMemory, list[Problem]]:
+    """Plan a range for each live proxy: the one that it has or had, else the first that is free.
 
-    A proxy that serves is never moved. One that has served and does not is only moved if
-    others are seen on its ports. With ``frozen`` no range gets longer: nothing can be created.
+    The memory's ``planned`` has those of all that can have one. A proxy that serves is never moved.
+    One that has served and does not is only moved if others are seen on its ports. With ``frozen``
+    no range gets longer: nothing can be created.
     """
     live = {one.key: one for one in desired if one.live}
     allocation = _Allocation(observed, settings, memory, set(live))
@@ -174,43 +168,24 @@ def allocate(
         allocation.keep(key)
     for key in order:
         allocation.fill(live[key], frozen)
-    given = allocation.given
-    served = memory.served
-    left = {key for key in given if key in served and not within(served[key], given[key])}
-    moved = {key: Move(served[key], now) for key in left} | dict(memory.moved)
-    told = [
-        _moved(key, moved[key], ports)
-        for key, ports in sorted(given.items(), key=lambda item: item[0])
-        if key in moved and not within(moved[key].ports, ports)
-    ]
-    served = {key: ports for key, ports in served.items() if key not in left}
+    given, served = allocation.given, dict(memory.served)
+    left = [key for key in given if key in served and not within(served[key], given[key])]
+    moved = {key: Move(served.pop(key), now) for key in left} | dict(memory.moved)
+    for key, ports in sorted(given.items(), key=lambda item: item[0]):
+        if key in moved and not within(moved[key].ports, ports):
+            text = (
+                f"HAS LEFT ITS PORTS {moved[key].ports} for {ports}, since something else has "
+                "taken them: nodes that had registered under the old ones can't be reached until "
+                "they register anew"
+            )
+            allocation.problems.append(_problem(key, text))
     memory = replace(memory, served=served, planned=given, moved=moved)
-    return GivenRanges(given, memory, (*allocation.problems, *told))
+    return memory, allocation.problems
 
 
-def _exhausted(key: Key, error: PortsExhausted) -> Problem:
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"{error}: lower --ports or the label rosproxy.ports ({error.count}), widen --port-window "
-        f"({error.window}), or stop what holds ports there",
-    )
+def _published(containers: Iterable[Container]) -> frozenset[int]:
+    return frozenset(port for one in containers for port in one.host_ports)
 
 
-def _too_few(key: Key, kept: PortRange, count: int) -> Problem:
-    more = PortRange(kept.last + 1, kept.first + count - 1)
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"{count} ports are wanted (--ports or the label rosproxy.ports), but it keeps its "
-        f"{len(kept)} at {kept}, since {more} are not free or beyond --port-window: stop what "
-        "holds them",
-        fatal=False,
-    )
-
-
-def _moved(key: Key, move: Move, ports: PortRange) -> Problem:
-    return Problem(
-        f"proxy {proxy_name(key)}",
-        f"HAS LEFT ITS PORTS {move.ports} for {ports}, since something else has taken them: nodes "
-        "that had registered under the old ones can't be reached until they register anew",
-        fatal=False,
-    )
+def _problem(key: Key, text: str, fatal: bool = False) -> Problem:
+    return Problem(f"proxy {proxy_name(key)}", text, fatal)

@@ -1,30 +1,39 @@
-"""From members to the proxies that there ought to be."""
+"""From members to the proxies that there ought to be, and the names under which nodes find them.
 
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import replace
+An engine answers with all containers that have a name, in any order. So no name is taken that
+another one holds: nodes would reach now this, now that.
+"""
 
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from rosproxy.net.addresses import is_address
 from rosproxy.settings import DataPlane
+from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.networks import BUILT_IN
-from rosproxy_operator.docker.planner.labels.values import DATA_PLANE
+from rosproxy_operator.docker.planner.labels.values import ALIAS, BUILT_IN, DATA_PLANE
 from rosproxy_operator.docker.planner.model import (
+    Container,
     Desired,
     HostState,
     Key,
     Member,
-    Network,
     PlanSettings,
 )
+from rosproxy_operator.docker.planner.specs import master, proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 
 _PLANES: tuple[DataPlane, ...] = ("kernel", "splice", "copy", "auto")
 """Who asks for what the proxy can't do by itself goes first."""
+Aliases = Mapping[Key, Mapping[str, tuple[str, ...]]]
+"""For a key and a network, the names of the key's proxy there."""
+_GONE = frozenset({"dead", "removing"})
 
 
 def desire(
     observed: HostState,
     settings: PlanSettings,
-    members: Iterable[Member],
+    members: Collection[Member],
     memory: DockerMemory,
     now: float,
 ) -> tuple[tuple[Desired, ...], tuple[Problem, ...]]:
@@ -34,54 +43,39 @@ def desire(
     keep networks joined that a proxy is on, and its data plane, for the settings' grace, but join
     none.
     """
-    every = tuple(members)
-    bad = _before_uplink(observed.networks, settings.uplink)
+    bad = _before_uplink(observed, settings.uplink)
     usable = {network.name for network in observed.networks} - BUILT_IN - bad
-    keys = {member.key for member in every} | observed.keys
+    alive = [member for member in members if member.container.alive]
     recent = [
         member
-        for member in every
-        if not member.alive and now - memory.exited.get(member.id, now) < settings.grace
+        for member in members
+        if not member.container.alive
+        and now - memory.exited.get(member.container.id, now) < settings.grace
     ]
-    live = [member for member in every if member.alive and member.networks & usable]
-    desired = tuple(
-        replace(
-            _one(key, settings.ports, live, _kept(key, recent, observed), usable),
-            data_plane=_data_plane(key, [*live, *recent], settings),
-        )
-        for key in sorted(keys)
-    )
-    wanted = {name for member in every if member.alive for name in member.networks}
-    bad_networks = (_bad_network(name, settings.uplink) for name in sorted(bad & wanted))
-    return desired, (*bad_networks, *_outvoted(desired))
+    desired: list[Desired] = []
+    for key in sorted({member.key for member in members} | observed.keys):
+        own = tuple(member for member in alive if member.key == key and member.networks & usable)
+        left = [member for member in recent if member.key == key]
+        there = {name for box in observed.sandboxes_of(key) for name in box.container.networks}
+        networks = _networks(own) | (_networks(left) & there)
+        plane = chosen_plane([*own, *left], settings.data_plane)
+        ports = max([settings.ports, *(member.ports for member in own)])
+        desired.append(Desired(key, bool(own), ports, networks & usable, own, plane))
+    told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
+    return tuple(desired), (*told, *_outvoted(desired))
 
 
-def _one(
-    key: Key, ports: int, live: Iterable[Member], kept: frozenset[str], usable: Collection[str]
-) -> Desired:
-    own = tuple(member for member in live if member.key == key)
-    joined = {name for member in own for name in member.networks} | kept
-    return Desired(
-        key=key,
-        live=bool(own),
-        ports=max([ports, *(member.ports for member in own)]),
-        networks=frozenset(joined.intersection(usable)),
-        members=own,
-    )
+def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
+    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
+    asked = {member.data_plane for member in members}
+    return next((plane for plane in _PLANES if plane in asked), default)
 
 
-def _data_plane(key: Key, members: Iterable[Member], settings: PlanSettings) -> DataPlane:
-    return chosen_plane((member for member in members if member.key == key), settings.data_plane)
+def _networks(members: Iterable[Member]) -> frozenset[str]:
+    return frozenset(name for member in members for name in member.networks)
 
 
-def _kept(key: Key, recent: Iterable[Member], observed: HostState) -> frozenset[str]:
-    """The networks that a key's sandboxes are on and that its exited containers are, too."""
-    there = {n for s in observed.sandboxes if s.key == key for n in s.container.networks}
-    left = {name for member in recent if member.key == key for name in member.networks}
-    return frozenset(there & left)
-
-
-def _before_uplink(networks: Iterable[Network], uplink: str) -> set[str]:
+def _before_uplink(observed: HostState, uplink: str) -> set[str]:
     """Networks that would take the published ports and the default route over from the uplink.
 
     The engine gives both to the network whose name sorts first, internal ones aside, and moving
@@ -89,7 +83,7 @@ def _before_uplink(networks: Iterable[Network], uplink: str) -> set[str]:
     """
     return {
         network.name
-        for network in networks
+        for network in observed.networks
         if not network.internal and network.name.encode() < uplink.encode()
     }
 
@@ -103,27 +97,122 @@ def _bad_network(name: str, uplink: str) -> Problem:
     )
 
 
-def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
-    """The data plane of a proxy with these containers; ``default`` if none asks for one."""
-    asked = {member.data_plane for member in members}
-    return next((plane for plane in _PLANES if plane in asked), default)
-
-
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
     """Tell the containers that share a proxy with one that asks for something else."""
     for one in desired:
+        winners = [m.container.name for m in one.members if m.data_plane == one.data_plane]
         for member in one.members:
             if member.data_plane not in (None, one.data_plane):
                 yield Problem(
-                    f"container {member.container}", _outvoted_text(member, one), fatal=False
+                    f"container {member.container.name}",
+                    f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves "
+                    f"{next(iter(winners), 'another one')}, which asks for {one.data_plane}; give "
+                    "both the same",
+                    fatal=False,
                 )
 
 
-def _outvoted_text(member: Member, one: Desired) -> str:
-    other = next(
-        (w.container for w in one.members if w.data_plane == one.data_plane), "another one"
+@dataclass(frozen=True, slots=True)
+class _Claim:
+    """A name on a network, who wants it, and who has it already."""
+
+    network: str
+    alias: str
+    claimants: tuple[Desired, ...]
+    others: tuple[str, ...]
+    holders: tuple[Key, ...]
+
+    @property
+    def owner(self) -> Key | None:
+        """The proxy that gets the name; None if another container on the network has it.
+
+        A proxy that already has the name keeps it, so that no connection is cut. Otherwise it goes
+        to the first one whose containers look for it, else to the first that would have it. One
+        that shares its name with another container loses it when it joins the network anew.
+        """
+        if self.others:
+            return None
+        if self.holders:
+            return self.holders[0]
+        needed = [one.key for one in self.claimants if needed_by(one, self.network, self.alias)]
+        return (needed or [one.key for one in self.claimants])[0]
+
+
+def assign(desired: Collection[Desired], observed: HostState) -> tuple[Aliases, list[Problem]]:
+    """The names of the proxies that are wanted, and the containers that won't find theirs.
+
+    ``desired`` is sorted by key.
+    """
+    given: dict[Key, dict[str, tuple[str, ...]]] = {}
+    problems: list[Problem] = []
+    for network in sorted({name for one in desired if one.live for name in one.networks}):
+        there = [one for one in desired if network in one.networks]
+        for alias in sorted({name for one in there if one.live for name in _names(one.key)}):
+            claim = _claim(network, alias, there, observed)
+            if claim.owner is not None:
+                names = given.setdefault(claim.owner, {})
+                names[network] = (*names.get(network, ()), alias)
+            problems += _problems(claim)
+    return given, problems
+
+
+def needed_by(desired: Desired, network: str, alias: str) -> tuple[str, ...]:
+    """The containers of a proxy on a network that look for it by this name."""
+    return tuple(
+        member.container.name
+        for member in desired.members
+        if network in member.networks and member.needs == alias
     )
-    return (
-        f"label {DATA_PLANE}={member.data_plane} is ignored: its proxy also serves {other}, which "
-        f"asks for {one.data_plane}; give both the same"
+
+
+def holds(container: Container, network: str, alias: str) -> bool:
+    """Whether a container answers to a name on a network; case does not matter to engines."""
+    return any(
+        alias.lower() in map(str.lower, place.names)
+        for place in container.attachments
+        if place.network == network
     )
+
+
+def _names(key: Key) -> tuple[str, ...]:
+    """The names that a proxy is to have: its container's own, too, which has no endpoint itself."""
+    host = master(key).host
+    return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
+
+
+def _claim(network: str, alias: str, there: list[Desired], observed: HostState) -> _Claim:
+    others = [
+        container.name
+        for container in observed.containers
+        if container.state not in _GONE and holds(container, network, alias)
+    ]
+    having = [box for box in observed.sandboxes if holds(box.container, network, alias)]
+    staying = [one.key for one in there if one.key in {box.key for box in having}]
+    # One that is restarting can't leave the network: it answers there again in a moment.
+    stuck = sorted(box.key for box in having if box.container.state == "restarting")
+    return _Claim(
+        network,
+        alias,
+        claimants=tuple(one for one in there if one.live and alias in _names(one.key)),
+        others=tuple(sorted(others)),
+        holders=tuple(dict.fromkeys([*staying, *stuck])),
+    )
+
+
+def _problems(claim: _Claim) -> Iterator[Problem]:
+    """What containers are told that look for their proxy by a name that others have."""
+    containers = [f"container {name}" for name in claim.others]
+    for one in claim.claimants:
+        if one.key == claim.owner and not claim.others and len(claim.holders) <= 1:
+            continue
+        proxies = {*claim.holders, claim.owner or one.key} - {one.key}
+        others = [*containers, *sorted(f"proxy {proxy_name(other)}" for other in proxies)]
+        host = proxy_name(one.key) if claim.alias == ALIAS else ALIAS
+        for container in needed_by(one, claim.network, claim.alias):
+            yield Problem(
+                f"container {container}",
+                f"looks for its proxy by the name {claim.alias}, but on network {claim.network} "
+                f"{listed(others)} answers to it, so its nodes go around their proxy: "
+                f"set ROS_MASTER_URI=http://{host}:{master(one.key).port}",
+                fatal=False,
+            )

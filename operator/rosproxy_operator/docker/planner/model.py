@@ -10,6 +10,8 @@ from rosproxy.settings import DataPlane
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which it is or may soon be somebody's node."""
 STARTED = frozenset({"running", "paused"})
+SERVING = STARTED | {"restarting"}
+"""States of a container that runs, or does again in a moment."""
 MOST_PORTS = 1000
 """Ports that one proxy may ask for: each costs rules and, by default, a process of the engine."""
 WINDOW = PortRange(11400, 65535)
@@ -20,11 +22,10 @@ WINDOW = PortRange(11400, 65535)
 class PlanSettings:
     """The operator's options that decide what is planned.
 
-    ``master_uri`` and ``advertise_host`` are for containers without a label of their own and may
-    be empty. ``ports`` is the least number of ports that a proxy gets, ``window`` where they are
-    looked for, ``publish`` the host's addresses on which they are published. ``grace`` is in
-    seconds: how long a proxy outlives its last container. ``data_plane`` is that of proxies whose
-    containers ask for none.
+    ``master_uri``, ``advertise_host`` (both may be empty) and ``data_plane`` are for containers
+    without a label of their own. ``ports`` is the least number that a proxy gets, ``window`` where
+    they are looked for, ``publish`` the host's addresses on which they are published. ``grace`` is
+    in seconds: how long a proxy outlives its last container.
     """
 
     master_uri: str = ""
@@ -60,10 +61,10 @@ class Attachment:
 class Container:
     """A container, in the engine's words.
 
-    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name.
-    ``master_uri`` is ROS_MASTER_URI of its environment, empty if unset. ``host_ports`` are the TCP
-    ports that it publishes on the host, or will once it is started. ``started_at`` is when it was
-    started last, in the engine's words; empty if never, or if nobody asked.
+    ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name,
+    ``master_uri`` ROS_MASTER_URI of its environment or empty. ``host_ports`` are the TCP ports that
+    it publishes on the host, or will once it is started. ``started_at`` is empty if it never was,
+    or if nobody asked.
     """
 
     id: str
@@ -109,13 +110,10 @@ class Key:
 
 
 @dataclass(frozen=True, slots=True)
-class Sandbox:
-    """A container of this operator that holds a proxy's network namespace, as found on the host.
+class OwnContainer:
+    """A container of this operator, as found on the host, and what its labels say.
 
-    The published ports, the networks and the names on them are its own; the proxy itself runs in
-    another container in the same namespace. So a proxy can be replaced in no time, while taking
-    published ports down and up again costs an engine seconds. ``fingerprint`` is that of the
-    settings that it was created with.
+    ``range`` are the proxy's ports, ``fingerprint`` is that of the settings it was created with.
     """
 
     key: Key
@@ -124,48 +122,37 @@ class Sandbox:
     fingerprint: str
 
 
-@dataclass(frozen=True, slots=True)
-class Proxy:
-    """A container of this operator in which a proxy runs, as found on the host.
+class Sandbox(OwnContainer):
+    """It holds a proxy's network namespace: published ports, networks and the names on them.
 
-    It listens on ``range``, in the namespace of the container that its ``network_mode`` names by
-    its id.
+    The proxy itself runs in another container in the same namespace. So it can be replaced in no
+    time, while taking published ports down and up again costs an engine seconds.
     """
 
-    key: Key
-    container: Container
-    range: PortRange
-    fingerprint: str
 
-
-@dataclass(frozen=True, slots=True)
-class HostPorts:
-    """What the operator knows of the host's ports.
-
-    ``listening`` are TCP ports on which something listens, in the operator's own network
-    namespace; ``ephemeral`` is the range from which the kernel takes ports for connections.
-    """
-
-    ephemeral: PortRange
-    listening: frozenset[int] = frozenset()
+class Proxy(OwnContainer):
+    """A proxy runs in it, in the namespace of the sandbox that its ``network_mode`` names by id."""
 
 
 @dataclass(frozen=True, slots=True)
 class HostState:
     """A Docker host at one moment.
 
-    ``containers`` are all but the operator's own: the proxies and their sandboxes.
-    ``image_id`` is the id of the proxy's image, empty if the host does not have it. ``advertise``
-    gives, for a master's host name, this host's address towards it; without an entry it is not
-    known. ``unresolved`` are the masters' hosts without a known address, ``busy`` the names of own
-    containers of which not everything is known yet, so that nothing can be done to them, and
-    ``addresses`` those of all containers.
+    ``containers`` are all but the operator's own: the proxies and their sandboxes. ``ephemeral``
+    is the range from which the kernel takes ports for connections, ``listening`` are TCP ports on
+    which something listens in the operator's own network namespace. ``image_id`` is the id of the
+    proxy's image, empty if the host does not have it. ``advertise`` gives, for a master's host
+    name, this host's address towards it; without an entry it is not known. ``unresolved`` are the
+    masters' hosts without a known address, ``busy`` the names of own containers of which not
+    everything is known yet, so that nothing can be done to them, and ``addresses`` those of all
+    containers.
     """
 
     containers: tuple[Container, ...]
     networks: tuple[Network, ...]
     proxies: tuple[Proxy, ...]
-    host: HostPorts
+    ephemeral: PortRange
+    listening: frozenset[int] = frozenset()
     image_id: str = ""
     advertise: Mapping[str, str] = field(default_factory=dict)
     sandboxes: tuple[Sandbox, ...] = ()
@@ -174,7 +161,7 @@ class HostState:
     addresses: frozenset[str] = frozenset()
 
     @property
-    def own(self) -> tuple[Sandbox | Proxy, ...]:
+    def own(self) -> tuple[OwnContainer, ...]:
         """All that is the operator's own."""
         return (*self.sandboxes, *self.proxies)
 
@@ -191,11 +178,6 @@ class HostState:
         """The proxies of a key."""
         return tuple(one for one in self.proxies if one.key == key)
 
-    @property
-    def busy_keys(self) -> frozenset[Key]:
-        """The keys of those to which nothing can be done now."""
-        return frozenset(one.key for one in self.own if one.container.name in self.busy)
-
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""
         home = proxy.container.network_mode.removeprefix("container:")
@@ -209,16 +191,14 @@ class Member:
     ``ports`` is 0 and ``data_plane`` None without a label. ``networks`` are the names of those on
     which it wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which
     it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
-    it. A container that is not ``alive`` only keeps networks joined and the data plane for a while.
+    it. A container that is not alive only keeps networks joined and the data plane for a while.
     """
 
-    container: str
-    id: str
+    container: Container
     key: Key
     ports: int = 0
     networks: frozenset[str] = frozenset()
     needs: str = ""
-    alive: bool = True
     data_plane: DataPlane | None = None
 
 

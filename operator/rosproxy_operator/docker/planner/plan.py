@@ -1,6 +1,6 @@
 """From what is seen on a Docker host to what is to be done there."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from rosproxy_operator.common.problem import Problem
@@ -10,27 +10,14 @@ from rosproxy_operator.docker.planner.actions import (
     Create,
     CreateNetwork,
     CreateSandbox,
-    Remove,
 )
-from rosproxy_operator.docker.planner.aliases import Aliases, assign
-from rosproxy_operator.docker.planner.allocation import GivenRanges, allocate, refused
-from rosproxy_operator.docker.planner.context import PlanContext
-from rosproxy_operator.docker.planner.desired import desire
-from rosproxy_operator.docker.planner.labels.masters import unresolved
+from rosproxy_operator.docker.planner.allocation import allocate, refused
+from rosproxy_operator.docker.planner.desired import assign, desire
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
-from rosproxy_operator.docker.planner.model import (
-    Desired,
-    HostState,
-    Key,
-    Member,
-    PlanSettings,
-    Proxy,
-    Sandbox,
-)
-from rosproxy_operator.docker.planner.process import process_steps, retired
-from rosproxy_operator.docker.planner.sandbox import leave, sandbox_steps
+from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.specs import master
 from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
+from rosproxy_operator.docker.planner.steps import PlanContext, leave, retired, wanted_steps
 
 SOON = 1.0
 """Seconds until a look at something that is about to end: a removal, a port that is let go."""
@@ -89,62 +76,35 @@ def plan(
     desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = looked(memory, observed, desired, settings.grace, now)
     aliases, missed = assign(desired, observed)
-    live = [one.key for one in desired if one.live]
+    live = {one.key for one in desired if one.live}
     memory = refused(observed, live, memory, now)
     obstacle = _obstacle(observed, settings) if live else None
-    ranges = allocate(observed, settings, desired, memory, now, frozen=obstacle is not None)
-    view = _View(observed, settings, aliases, ranges, obstacle is None, now)
-    planned = {one.key: _main(view, one) for one in desired}
-    problems = [*labels.problems, *unplaced, *bad_networks, *missed, *ranges.problems]
-    problems += [*_restarting(view, live), *unresolved(observed.unresolved)]
+    creatable = obstacle is None
+    memory, tight = allocate(observed, settings, desired, memory, now, frozen=not creatable)
+    over = {key for key, since in memory.absent.items() if now - since >= settings.grace}
+    planned: dict[Key, list[Action] | None] = {key: [*retired(observed, key)] for key in over}
+    for one in desired:
+        if ports := memory.planned.get(one.key):  # else its problem is told already
+            names = aliases.get(one.key, {})
+            context = PlanContext(observed, settings, one, ports, names, creatable)
+            planned[one.key] = wanted_steps(context)
+    problems = [*labels.problems, *unplaced, *bad_networks, *missed, *tight]
+    problems += _unwell(observed, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    groups = [g for g in _groups(view, desired, planned) if g.key not in observed.busy_keys]
-    return DockerPlan(
-        groups=tuple(group for group in groups if not _waits(group, observed)),
-        deferred=tuple(group for group in groups if _waits(group, observed)),
-        memory=ranges.memory,
+    busy = {one.key for one in observed.own if one.container.name in observed.busy}
+    groups = [g for g in _groups(observed, settings.uplink, desired, planned) if g.key not in busy]
+    deferred = tuple(group for group in groups if _waits(group, observed))
+    found = DockerPlan(
+        groups=tuple(group for group in groups if group not in deferred),
+        deferred=deferred,
+        memory=memory,
         problems=tuple(dict.fromkeys(problems)),
         members=members,
         desired=desired,
-        again_in=min(_ends(view, desired, members), default=None),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _View:
-    """What the plans of all keys are made from."""
-
-    observed: HostState
-    settings: PlanSettings
-    aliases: Aliases
-    ranges: GivenRanges
-    creatable: bool
-    now: float
-
-    @property
-    def memory(self) -> DockerMemory:
-        """What is going to be remembered."""
-        return self.ranges.memory
-
-    def sandboxes(self, key: Key) -> tuple[Sandbox, ...]:
-        """The sandboxes of a key but those that are being removed."""
-        own = self.observed.sandboxes_of(key)
-        return tuple(one for one in own if one.container.state != "removing")
-
-    def proxies(self, key: Key) -> tuple[Proxy, ...]:
-        """The proxies of a key but those that are being removed."""
-        own = self.observed.proxies_of(key)
-        return tuple(one for one in own if one.container.state != "removing")
-
-    def waiting(self, key: Key) -> bool:
-        """Whether a container of the key is being removed."""
-        own = self.observed.own
-        return any(one.key == key and one.container.state == "removing" for one in own)
-
-    def left(self, since: float) -> float:
-        """The seconds until the grace ends of what began then."""
-        return self.settings.grace - (self.now - since)
+    ends = [end for end in _ends(observed, settings, found, now) if end > 0]
+    return replace(found, again_in=min(ends, default=None))
 
 
 def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
@@ -165,87 +125,62 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     return None
 
 
-def _main(view: _View, desired: Desired) -> tuple[Action, ...] | None:
-    """What is to be done for a key besides leaving networks; None if it can't be done."""
-    key = desired.key
-    if not desired.live:
-        ended = view.left(view.memory.absent.get(key, view.now)) <= 0
-        return tuple(retired(view.sandboxes(key), view.proxies(key))) if ended else ()
-    ports = view.ranges.given.get(key)
-    if ports is None:
-        return ()  # its problem is told already
-    context = PlanContext(
-        view.observed, view.settings, desired, ports, view.aliases, view.creatable
-    )
-    first = sandbox_steps(context)
-    if first.stuck or first.home is None:
-        return None if first.stuck else first.actions
-    gone = {action.name for action in first.actions if isinstance(action, Remove)}
-    then = process_steps(context, first.home, gone)
-    return None if then is None else first.actions + then
-
-
 def _groups(
-    view: _View,
-    desired: Iterable[Desired],
-    planned: Mapping[Key, tuple[Action, ...] | None],
+    observed: HostState,
+    uplink: str,
+    desired: Collection[Desired],
+    planned: Mapping[Key, list[Action] | None],
 ) -> Iterator[Group]:
     """First what makes names free, then the uplink, then one key after the other."""
-    uplink = view.settings.uplink
     for one in desired:
-        main = planned[one.key] or ()
-        removed = {action.name for action in main if isinstance(action, Remove)}
-        staying = tuple(
-            sandbox.container
-            for sandbox in view.sandboxes(one.key)
-            if sandbox.container.name not in removed
-        )
-        for action in leave(view.observed, one, staying, uplink):
-            if action not in main:
-                yield Group(one.key, (action,))
-    if uplink not in {network.name for network in view.observed.networks} and any(
-        _needs(action, uplink) for actions in planned.values() for action in actions or ()
-    ):
+        for action in leave(observed, one, planned.get(one.key) or [], uplink):
+            yield Group(one.key, (action,))
+    every = [action for actions in planned.values() for action in actions or ()]
+    joins = (isinstance(a, Connect) and a.network == uplink for a in every)
+    needed = any(joins) or any(isinstance(action, CreateSandbox) for action in every)
+    if needed and uplink not in {network.name for network in observed.networks}:
         yield Group(None, (CreateNetwork(uplink),))
-    for key, actions in planned.items():
-        if actions:
-            yield Group(key, actions)
+    for one in desired:
+        if actions := planned.get(one.key):
+            yield Group(one.key, tuple(actions))
 
 
 def _waits(group: Group, observed: HostState) -> bool:
     """Whether a group makes a proxy whose master has no known address."""
     return any(
-        isinstance(action, Create) and master(action.proxy.key).host in observed.unresolved
+        isinstance(action, Create) and master(action.key).host in observed.unresolved
         for action in group.actions
     )
 
 
-def _needs(action: Action, uplink: str) -> bool:
-    return isinstance(action, CreateSandbox) or (
-        isinstance(action, Connect) and action.network == uplink
-    )
-
-
-def _restarting(view: _View, live: Collection[Key]) -> Iterator[Problem]:
-    for one in view.observed.own:
+def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
+    """Proxies that end again and again, and masters that are not found."""
+    for one in observed.own:
         name = one.container.name
         if one.key in live and one.container.state == "restarting":
             yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
+    for host in sorted(observed.unresolved):
+        yield Problem(
+            f"master {host}",
+            f"the name {host} can't be resolved where the operator runs: give the master's "
+            f"address instead, or the operator that name (/etc/hosts; in a container: "
+            f"--add-host {host}:ADDRESS)",
+        )
 
 
-def _ends(view: _View, desired: Iterable[Desired], members: Iterable[Member]) -> Iterator[float]:
+def _ends(
+    observed: HostState, settings: PlanSettings, found: DockerPlan, now: float
+) -> Iterator[float]:
     """In how many seconds something comes to its end that no event tells."""
-    memory = view.memory
-    for one in desired:
-        sandboxes = view.sandboxes(one.key)
-        tried = any(sandbox.container.name in memory.refusals for sandbox in sandboxes)
-        if one.live and (view.waiting(one.key) or tried):
+    memory = found.memory
+    for one in found.desired:
+        own = [each.container for each in observed.own if each.key == one.key]
+        if not one.live and any(each.state != "removing" for each in own):
+            yield settings.grace - (now - memory.absent[one.key])
+        if one.live and any(e.state == "removing" or e.name in memory.refusals for e in own):
             yield SOON
-        there = sandboxes or view.proxies(one.key)
-        if not one.live and there and view.left(memory.absent[one.key]) > 0:
-            yield view.left(memory.absent[one.key])
-    for member in members:
-        left = 0.0 if member.alive else view.left(memory.exited[member.id])
-        joined = any(s.container.networks & member.networks for s in view.sandboxes(member.key))
-        if left > 0 and (joined or member.data_plane):
-            yield left
+    for member in found.members:
+        boxes = [one.container for one in observed.sandboxes_of(member.key)]
+        joined = any(b.networks & member.networks for b in boxes if b.state != "removing")
+        if not member.container.alive and (joined or member.data_plane):
+            yield settings.grace - (now - memory.exited[member.container.id])

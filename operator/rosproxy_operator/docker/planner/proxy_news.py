@@ -8,11 +8,18 @@ is forgotten until the proxy has heard it. Times are seconds of a monotonic cloc
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from ipaddress import IPv4Network, ip_address
+from ipaddress import IPv4Network
 from typing import Any
 
-from rosproxy.net.addresses import is_address
-from rosproxy_operator.docker.planner.model import STARTED, Container, HostState, Member, Proxy
+from rosproxy.net.addresses import is_address, is_inside
+from rosproxy_operator.docker.planner.model import (
+    STARTED,
+    Attachment,
+    Container,
+    HostState,
+    Member,
+    Proxy,
+)
 from rosproxy_operator.docker.planner.specs import master
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
@@ -25,7 +32,6 @@ MOVING = 5.0
 """Seconds for which a proxy is told of a move, until it has found the nodes at the new address."""
 Place = tuple[str, str]
 """A container's id and a network."""
-_SHARED = "container:"
 _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
 """What a node can call its host in a URI; aliases may be anything."""
 
@@ -63,7 +69,7 @@ class Places:
     """Where containers are, as far as their proxy knows, and where they were just now.
 
     A container that is disconnected and connected again under another address has moved, and its
-    nodes live on. Times are monotonic.
+    nodes live on.
     """
 
     def __init__(self) -> None:
@@ -78,7 +84,6 @@ class Places:
         for place, since in list(self._absent.items()):
             if place[0] not in known.running or now >= since + AWAY:
                 del self._at[place], self._absent[place]
-        taken = set(known.addresses.values())
         for place, address in known.addresses.items():
             before = self._at.get(place, address)
             if before != address:
@@ -88,7 +93,7 @@ class Places:
         self._moves = {
             old: (new, since)
             for old, (new, since) in self._moves.items()
-            if now < since + MOVING and old not in taken
+            if now < since + MOVING and old not in known.addresses.values()
         }
 
     def _follow(self, known: NetworkFacts, now: float) -> None:
@@ -147,7 +152,7 @@ class ProxyNews:
         """
         self._places.look(self.facts, now)
         body = {
-            "gone": gone(nodes, self.facts.taken | self._places.held, self._subnets),
+            "gone": sorted(node for node in nodes if self._gone(node)),
             "moved": self._places.moved(nodes),
             "arrived": [
                 {"address": arrival.address, "names": sorted(arrival.names)}
@@ -157,6 +162,14 @@ class ProxyNews:
         }
         self._moving = bool(body["moved"])
         return {key: value for key, value in body.items() if value}
+
+    def _gone(self, node: str) -> bool:
+        """Whether no container has a node's address any more.
+
+        Only the engine can tell, so it must be in a network that the proxy is on or was on.
+        """
+        known = node in self.facts.taken or node in self._places.held
+        return not known and is_inside(node, tuple(self._subnets))
 
     def told(self, now: float) -> None:
         """Take note that the proxy has heard what was due until then."""
@@ -179,15 +192,13 @@ def facts(
     box = observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
     by_id = {container.id: container for container in observed.containers}
-    mine = [by_id[m.id] for m in members if m.key == proxy.key and m.id in by_id]
     running = [container for container in observed.containers if container.state in STARTED]
     return NetworkFacts(
         master_address="" if is_address(master(proxy.key).host) else master_address,
         addresses={
-            (container.id, a.network): a.address
+            (container.id, place.network): place.address
             for container in running
-            for a in container.attachments
-            if a.network in joined and a.address
+            for place in _places(container, joined)
         },
         taken=observed.addresses | {network.gateway for network in observed.networks},
         subnets=tuple(
@@ -197,47 +208,34 @@ def facts(
             for subnet in network.subnets
         ),
         arrivals=frozenset(
-            arrival for container in mine for arrival in _arrivals(container, by_id, joined)
+            arrival
+            for member in members
+            if member.key == proxy.key
+            for arrival in _arrivals(member.container, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
     )
 
 
-def gone(
-    nodes: Collection[str], taken: Collection[str], subnets: Collection[IPv4Network]
-) -> list[str]:
-    """The addresses of a proxy's nodes that no container has any more.
-
-    ``taken`` are those of all containers and gateways, ``subnets`` those of the networks that the
-    proxy is on or was on: other addresses are none of the engine's.
-    """
-    return sorted(address for address in set(nodes) - set(taken) if _inside(address, subnets))
+def _places(container: Container, networks: Collection[str]) -> list[Attachment]:
+    return [each for each in container.attachments if each.network in networks and each.address]
 
 
 def _arrivals(
     container: Container, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
-    host = by_id.get(container.network_mode.removeprefix(_SHARED), container)
+    host = by_id.get(container.network_mode.removeprefix("container:"), container)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
     return [
         ContainerArrival(
             container.id,
-            a.network,
-            a.address,
-            a.endpoint,
-            frozenset(name for name in a.names | own if _HOST_NAME.fullmatch(name)),
+            place.network,
+            place.address,
+            place.endpoint,
+            frozenset(name for name in place.names | own if _HOST_NAME.fullmatch(name)),
         )
-        for a in host.attachments
-        if a.network in joined and a.address
+        for place in _places(host, joined)
     ]
-
-
-def _inside(host: str, subnets: Iterable[IPv4Network]) -> bool:
-    try:
-        address = ip_address(host)
-    except ValueError:
-        return False
-    return any(address in subnet for subnet in subnets)

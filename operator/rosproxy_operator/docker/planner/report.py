@@ -3,7 +3,7 @@
 Names of containers, networks and nodes are whatever their users say, so all are made harmless.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rosproxy.telemetry.text import besides_first, clean, plural, shorten, table, wrap
@@ -21,8 +21,23 @@ INDENT = "    "
 
 def render(status: Status, columns: int, lines: int | None = None) -> str:
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
-    head = wrap(_head(status), columns, "")
-    ending = [*_problems(status, columns), *_actions(status, columns)]
+    proxies, containers = len(status["proxies"]), len(status["containers"])
+    head = wrap(
+        f"rosproxy-operator {clean(status['version'])}: {plural(containers, 'container')}, "
+        f"{proxies} {'proxy' if proxies == 1 else 'proxies'}, uplink network "
+        f"{clean(status['uplink'])}",
+        columns,
+        "",
+    )
+    told = {f"container {container['name']}" for container in status["containers"]}
+    rest = [
+        f"{clean(problem['subject'])}: {clean(problem['text'])}"
+        for problem in status["problems"]
+        if problem["subject"] not in told
+    ]
+    steps = [clean(action) for action in status["actions"]]
+    ending = _listing("problems:", rest, columns)
+    ending += _listing(f"yet to be done: {plural(len(steps), 'step')}", steps, columns)
     full = [*head, "", *_proxies(status, columns), "", *_containers(status, columns, True), *ending]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
@@ -38,15 +53,6 @@ def plan_text(actions: Iterable[object]) -> str:
     return "\n".join(map(str, actions)) or "Nothing to do."
 
 
-def _head(status: Status) -> str:
-    proxies, containers = len(status["proxies"]), len(status["containers"])
-    word = "proxy" if proxies == 1 else "proxies"
-    return (
-        f"rosproxy-operator {clean(status['version'])}: {plural(containers, 'container')}, "
-        f"{proxies} {word}, uplink network {clean(status['uplink'])}"
-    )
-
-
 def _proxies(status: Status, columns: int) -> Iterator[str]:
     proxies = status["proxies"]
     if not proxies:
@@ -60,20 +66,14 @@ def _proxies(status: Status, columns: int) -> Iterator[str]:
 
 
 def _proxy_row(proxy: Status) -> tuple[str, ...]:
-    used = proxy["used"]
-    free = f" {used} used" if used is not None else ""
+    lost = proxy["state"] == "running" and not proxy["reachable"]
     return (
         clean(proxy["name"]),
-        _proxy_state(proxy),
+        clean(proxy["state"]) + (", no answer" if lost else ""),
         clean(proxy["master_uri"]) + (" DOWN" if proxy["master_up"] is False else ""),
         clean(proxy["advertise_host"]),
-        clean(proxy["range"]) + free,
+        clean(proxy["range"]) + (f" {proxy['used']} used" if proxy["used"] is not None else ""),
     )
-
-
-def _proxy_state(proxy: Status) -> str:
-    lost = proxy["state"] == "running" and not proxy["reachable"]
-    return clean(proxy["state"]) + (", no answer" if lost else "")
 
 
 def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
@@ -91,23 +91,16 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         if details:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
             yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
-        yield from _wrong(_of_container(status, container["name"]), columns)
+        subject = f"container {container['name']}"
+        yield from _wrong(
+            (each["text"] for each in status["problems"] if each["subject"] == subject), columns
+        )
 
 
 def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:
-    proxy = container["proxy"]
-    return (
-        clean(container["name"]),
-        clean(container["state"]),
-        clean(proxy or "-"),
-        clean(ranges.get(proxy, "-")),
-        str(len(container["nodes"])),
-    )
-
-
-def _of_container(status: Status, name: str) -> list[str]:
-    subject = f"container {name}"
-    return [each["text"] for each in status["problems"] if each["subject"] == subject]
+    name, state, proxy = container["name"], container["state"], container["proxy"]
+    cells = map(clean, (name, state, proxy or "-", ranges.get(proxy, "-")))
+    return (*cells, str(len(container["nodes"])))
 
 
 def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:
@@ -115,22 +108,9 @@ def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:
         yield from wrap(clean(text), columns, INDENT + "  ", f"{INDENT}! ")
 
 
-def _problems(status: Status, columns: int) -> Iterator[str]:
-    """The problems that have not been told beside a container."""
-    told = {f"container {container['name']}" for container in status["containers"]}
-    rest = [problem for problem in status["problems"] if problem["subject"] not in told]
-    if rest:
-        yield from ("", "problems:")
-    for problem in rest:
-        text = f"{clean(problem['subject'])}: {clean(problem['text'])}"
-        yield from wrap(text, columns, INDENT, "  ")
-
-
-def _actions(status: Status, columns: int) -> Iterator[str]:
-    if status["actions"]:
-        yield from ("", f"yet to be done: {plural(len(status['actions']), 'step')}")
-    for text in map(clean, status["actions"]):
-        yield from wrap(text, columns, INDENT, "  ")
+def _listing(title: str, texts: Sequence[str], columns: int) -> list[str]:
+    lines = [line for text in texts for line in wrap(text, columns, INDENT, "  ")]
+    return ["", title, *lines] if texts else []
 
 
 def _table(rows: list[tuple[str, ...]], columns: int) -> list[str]:

@@ -1,14 +1,13 @@
 """Which of several containers for one thing stays, and which goes.
 
-There are several when settings have changed and one is to take over from another, when a
-operator was killed in between, or when somebody has meddled.
+There are several when settings have changed and one is to take over from another, when the operator
+was killed in between, or when somebody has meddled.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from rosproxy_operator.docker.planner.model import Container
-from rosproxy_operator.docker.planner.state import SERVING
+from rosproxy_operator.docker.planner.model import SERVING, Container, OwnContainer
 
 IDLE = frozenset({"created", "exited"})
 """States of a container that can be started; a dead one can't."""
@@ -32,36 +31,32 @@ class Selection:
 
 
 def select(
-    containers: Iterable[Container],
-    name: str,
-    right: Callable[[Container], bool],
-    usable: Callable[[Container], bool],
-    creatable: bool,
+    own: Iterable[OwnContainer], name: str, right: Collection[str], creatable: bool
 ) -> Selection:
-    """Decide who stays.
+    """Decide which of several containers for one thing stays, and which goes.
 
     Args:
-        containers: All that there are for one thing.
+        own: All that there are for one thing.
         name: What the one that stays is to be called.
-        right: Whether one is as it would be created now.
-        usable: Whether one that has stopped can be started.
+        right: The ids of those that are as they ought to be, and run or can be started.
         creatable: Whether one can be created. If not, one that runs stays as it is.
     """
-    every = sorted(containers, key=lambda one: (one.name != name, one.name))
+    every = sorted((one.container for one in own), key=lambda one: (one.name != name, one.name))
     there = [one for one in every if one.state != "removing"]
-    serving = sorted((one for one in there if one.state in SERVING), key=lambda one: not right(one))
-    idle = [one for one in there if one.state in IDLE]
-    ready = [one for one in idle if right(one) and usable(one)]
-    best = serving[0] if serving else None
+    serving = [one for one in there if one.state in SERVING]
+    best = min(serving, key=lambda one: one.id not in right, default=None)
     if len(there) < len(every):
         return Selection(kept=best, waiting=True)
-    if best and (right(best) or not creatable):
-        return _with(there, best, None)
-    if ready:
-        return _with(there, ready[0], best)
-    if creatable:
-        return _with(there, None, best or (idle[0] if idle else None))
-    return Selection(stuck=True)
+    idle = [one for one in there if one.state in IDLE]
+    ready = next((one for one in idle if one.id in right), None)
+    kept, old = None, best or next(iter(idle), None)
+    if best and (best.id in right or not creatable):
+        kept, old = best, None
+    elif ready:
+        kept, old = ready, best
+    elif not creatable:
+        return Selection(stuck=True)
+    return Selection(kept, old, tuple(one for one in there if one not in (kept, old)))
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
@@ -70,7 +65,3 @@ def free_name(name: str, taken: Collection[str]) -> str:
     while (found := name if number == 1 else f"{name}-{number}") in taken:
         number += 1
     return found
-
-
-def _with(there: Iterable[Container], kept: Container | None, old: Container | None) -> Selection:
-    return Selection(kept, old, tuple(one for one in there if one not in (kept, old)))

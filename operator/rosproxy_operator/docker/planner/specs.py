@@ -4,14 +4,14 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import DataPlane, SettingError, parse_range
-from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy.settings import SettingError, parse_range
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
 MANAGED = "io.rosproxy.managed"
@@ -24,19 +24,20 @@ RANGE = "io.rosproxy.range"
 FINGERPRINT = "io.rosproxy.fingerprint"
 
 TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
-ADDRESS_VARIABLE = "ROSPROXY_MASTER_ADDRESS"
-USER = "10001:10001"
-LOCAL_PORTS = "1024 11000"
-"""Where a proxy's outgoing connections start: never on a port that it is to listen on."""
 ADMIN_PORT = 11312
-WAIT = ("sleep", "infinity")
-"""What a sandbox does: nothing, as long as it is let."""
+_COMMON: Mapping[str, Any] = {
+    "ReadonlyRootfs": True,
+    "CapDrop": ["ALL"],
+    "SecurityOpt": ["no-new-privileges:true"],
+    "RestartPolicy": {"Name": "unless-stopped"},
+}
+"""The ``HostConfig`` of both containers of a proxy."""
 _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 """What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
 
 Said in so many words, as an engine may have no-new-privileges for its default.
 """
-_SLUG = 30
+_USER = "10001:10001"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class OwnLabels:
 def proxy_name(key: Key) -> str:
     """The name of a key's proxy container: its master's host and six digits of the key's hash."""
     digest = hashlib.sha256(f"{key.master_uri} {key.advertise_host}".encode()).hexdigest()
-    slug = re.sub(r"[^a-z0-9]+", "-", master(key).host.lower())[:_SLUG].strip("-")
+    slug = re.sub(r"[^a-z0-9]+", "-", master(key).host.lower())[:30].strip("-")
     return f"rosproxy-{slug or 'master'}-{digest[:6]}"
 
 
@@ -102,115 +103,93 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
     return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
 
 
-def own_labels(spec: SandboxSpec | ProxySpec) -> dict[str, str]:
+def own_labels(made: CreateSandbox | Create) -> dict[str, str]:
     """The labels of a container, from which `read_own` reads it back."""
     return {
         MANAGED: "true",
-        ROLE: ROLE_SANDBOX if isinstance(spec, SandboxSpec) else ROLE_PROXY,
-        MASTER_URI: spec.key.master_uri,
-        ADVERTISE_HOST: spec.key.advertise_host,
-        RANGE: str(spec.range),
-        FINGERPRINT: spec.fingerprint,
+        ROLE: ROLE_SANDBOX if isinstance(made, CreateSandbox) else ROLE_PROXY,
+        MASTER_URI: made.key.master_uri,
+        ADVERTISE_HOST: made.key.advertise_host,
+        RANGE: str(made.range),
+        FINGERPRINT: made.fingerprint,
     }
 
 
-def sandbox_fingerprint(
-    key: Key, ports: PortRange, settings: PlanSettings, forwards: bool = False
-) -> str:
-    """What a sandbox is made of, in 16 hex digits. The image is not in it: any will do."""
-    body = sandbox_config(SandboxSpec("", key, ports, "", settings.uplink, forwards), settings)
+def sandbox_fingerprint(made: CreateSandbox, settings: PlanSettings) -> str:
+    """What a sandbox is made of, in 16 hex digits. Its name and the image are not in it."""
+    body = sandbox_config(replace(made, fingerprint=""), settings)
     return _digest({**body, "Image": ""})
 
 
-def proxy_fingerprint(
-    key: Key,
-    ports: PortRange,
-    settings: PlanSettings,
-    image_id: str,
-    data_plane: DataPlane = "auto",
-) -> str:
+def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str) -> str:
     """What a proxy's own container is made of, in 16 hex digits.
 
     Neither its name, its token, its sandbox nor the master's address are in it.
     """
-    spec = ProxySpec("", key, ports, "", "", data_plane=data_plane)
-    body = container_config(spec, settings, "", "")
+    body = container_config(replace(made, sandbox="", fingerprint=""), settings, "", "")
     return _digest({**body, "Image": image_id})
 
 
-def sandbox_config(spec: SandboxSpec, settings: PlanSettings) -> dict[str, Any]:
-    """The body of the engine's ``POST /containers/create`` for a sandbox."""
+def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for a sandbox.
+
+    It does nothing, as long as it is let. Outgoing connections, which are the proxy's, start
+    below the ports that a proxy is to listen on.
+    """
+    sysctls = {"net.ipv4.ip_local_port_range": "1024 11000"}
+    if made.forwards:
+        sysctls["net.ipv4.ip_forward"] = "1"
+    bindings = {
+        f"{port}/tcp": [{"HostIp": address, "HostPort": str(port)} for address in settings.publish]
+        for port in made.range.ports()
+    }
     return {
         "Image": settings.image,
-        "User": USER,
-        "Entrypoint": list(WAIT[:1]),
-        "Cmd": list(WAIT[1:]),
+        "User": _USER,
+        "Entrypoint": ["sleep"],
+        "Cmd": ["infinity"],
         "Healthcheck": {"Test": ["NONE"]},
-        "Labels": own_labels(spec),
-        "ExposedPorts": {f"{port}/tcp": {} for port in spec.range.ports()},
+        "Labels": own_labels(made),
+        "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
-            **_hardened(),
+            **_COMMON,
             "Init": True,
-            "NetworkMode": spec.uplink,
-            "PortBindings": _bindings(spec.range, settings),
-            "Sysctls": _sysctls(spec),
+            "NetworkMode": settings.uplink,
+            "PortBindings": bindings,
+            "Sysctls": sysctls,
         },
-        "NetworkingConfig": {"EndpointsConfig": {spec.uplink: {}}},
+        "NetworkingConfig": {"EndpointsConfig": {settings.uplink: {}}},
     }
 
 
 def container_config(
-    spec: ProxySpec, settings: PlanSettings, token: str, master_address: str
+    made: Create, settings: PlanSettings, token: str, master_address: str
 ) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a proxy.
 
     ``master_address`` may be empty: then the proxy resolves its master's host itself.
     """
-    variables = _environment(spec) | {TOKEN_VARIABLE: token, ADDRESS_VARIABLE: master_address}
+    variables = {
+        "ROS_MASTER_URI": made.key.master_uri,
+        "ROSPROXY_ADVERTISE_HOST": made.key.advertise_host,
+        "ROSPROXY_PORT_RANGE": str(made.range),
+        "ROSPROXY_MASTER_PORT": str(master(made.key).port),
+        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(made.key)}",
+        "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
+        TOKEN_VARIABLE: token,
+        "ROSPROXY_MASTER_ADDRESS": master_address,
+    }
     return {
         "Image": settings.image,
-        "User": USER,
+        "User": _USER,
         "Env": [f"{name}={value}" for name, value in variables.items() if value],
-        "Labels": own_labels(spec),
+        "Labels": own_labels(made),
         "HostConfig": {
-            **_hardened(),
-            **(_KERNEL if spec.data_plane == "kernel" else {}),
+            **_COMMON,
+            **(_KERNEL if made.data_plane == "kernel" else {}),
             "Init": False,
-            "NetworkMode": f"container:{spec.sandbox}",
+            "NetworkMode": f"container:{made.sandbox}",
         },
-    }
-
-
-def _sysctls(spec: SandboxSpec) -> dict[str, str]:
-    sysctls = {"net.ipv4.ip_local_port_range": LOCAL_PORTS}
-    return sysctls | {"net.ipv4.ip_forward": "1"} if spec.forwards else sysctls
-
-
-def _environment(spec: ProxySpec) -> dict[str, str]:
-    plane = "" if spec.data_plane == "auto" else spec.data_plane
-    return {
-        "ROS_MASTER_URI": spec.key.master_uri,
-        "ROSPROXY_ADVERTISE_HOST": spec.key.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(spec.range),
-        "ROSPROXY_MASTER_PORT": str(master(spec.key).port),
-        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(spec.key)}",
-        "ROSPROXY_DATA_PLANE": plane,
-    }
-
-
-def _bindings(ports: PortRange, settings: PlanSettings) -> dict[str, Any]:
-    return {
-        f"{port}/tcp": [{"HostIp": address, "HostPort": str(port)} for address in settings.publish]
-        for port in ports.ports()
-    }
-
-
-def _hardened() -> dict[str, Any]:
-    return {
-        "ReadonlyRootfs": True,
-        "CapDrop": ["ALL"],
-        "SecurityOpt": ["no-new-privileges:true"],
-        "RestartPolicy": {"Name": "unless-stopped"},
     }
 
 

@@ -5,7 +5,9 @@ from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import MOVED_FOR, TAKEN_FOR, Move, within
-from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member
+from rosproxy_operator.docker.planner.model import SERVING, Desired, HostState, Key, Member
+
+_HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +49,9 @@ class DockerMemory:
         return replace(self, refusals={**self.refusals, name: refusal})
 
 
-SERVING = frozenset({"running", "paused", "restarting"})
-"""States of a container that runs, or does again in a moment."""
-_HAS_SERVED = SERVING | {"exited", "dead", "removing"}
-
-
 def noticed(memory: DockerMemory, members: Iterable[Member], now: float) -> DockerMemory:
     """The memory with who has exited, and since when."""
-    gone = (member.id for member in members if not member.alive)
+    gone = (member.container.id for member in members if not member.container.alive)
     return replace(memory, exited={each: memory.exited.get(each, now) for each in gone})
 
 

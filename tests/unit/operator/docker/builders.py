@@ -6,12 +6,11 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.labels.members import find_members, read_labels
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    HostPorts,
     HostState,
     Key,
     Member,
@@ -82,12 +81,13 @@ def sandbox(
 ) -> Sandbox:
     """A sandbox as the operator makes it, by default one that runs on its uplink and ``app``."""
     name = name or sandbox_name(key)
-    made = made or sandbox_fingerprint(key, ports, settings)
+    create = CreateSandbox(name, key, ports)
+    made = made or sandbox_fingerprint(create, settings)
     aliases = ("rosproxy", master(key).host, proxy_name(key), name)
     places = [place(n, *aliases) if isinstance(n, str) else n for n in networks]
     own = container(
         name,
-        own_labels(SandboxSpec(name, key, ports, made, settings.uplink)),
+        own_labels(replace(create, fingerprint=made)),
         [place(settings.uplink, name), *places],
         state,
         ports=ports.ports(),
@@ -108,9 +108,10 @@ def proxy(
 ) -> Proxy:
     """A proxy as the operator makes it, by default one that runs in the `sandbox` of its key."""
     name = name or proxy_name(key)
-    made = made or proxy_fingerprint(key, ports, settings, image)
+    create = Create(name, key, ports, sandbox_name(key))
+    made = made or proxy_fingerprint(create, settings, image)
     mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
-    labels = own_labels(ProxySpec(name, key, ports, made, sandbox_name(key)))
+    labels = own_labels(replace(create, fingerprint=made))
     own = container(name, labels, [], state, mode=mode)
     return Proxy(key, replace(own, started_at=started_at), ports, made)
 
@@ -136,7 +137,8 @@ def observed(
         containers=containers,
         networks=tuple(networks),
         proxies=tuple(proxies),
-        host=HostPorts(ephemeral, frozenset(listening)),
+        ephemeral=ephemeral,
+        listening=frozenset(listening),
         image_id=image,
         advertise=advertise or {},
         sandboxes=tuple(sandboxes),

@@ -10,7 +10,7 @@ from typing import TypeVar
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
+from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox, Start
 from rosproxy_operator.docker.planner.desired import chosen_plane
 from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan
@@ -299,11 +299,11 @@ class Hosts:
         for action in found.actions:
             if not isinstance(action, CreateSandbox):
                 continue
-            key, ports = action.sandbox.key, action.sandbox.range
+            key, ports = action.key, action.range
             had = [own.range for _, own in self.own() if own.key == key]
             had += [self.served[key]] if key in self.served else []
             new = {port for port in ports.ports() if not any(port in one for one in had)}
-            assert not new & (strangers | seen.host.listening)
+            assert not new & (strangers | seen.listening)
             assert not any(port in EPHEMERAL or port in reserved_ports(key) for port in new)
             for one in seen.sandboxes:
                 assert one.key == key or not overlap(one.range, ports)
@@ -315,7 +315,7 @@ class Hosts:
             for name, network in self.engine.networks.items()
             if network.internal or name >= SETTINGS.uplink
         )
-        live = [member for member in members if member.alive and member.networks & fine]
+        live = [member for member in members if member.container.alive and member.networks & fine]
         assert {own.key for _, own in self.own()} <= {member.key for member in live}
         fatal = {problem.subject for problem in found.problems if problem.fatal}
         told = {problem.subject for problem in found.problems}
@@ -325,7 +325,7 @@ class Hosts:
                 plane = chosen_plane(mine, SETTINGS.data_plane)
                 self.check_key(key, {n for member in mine for n in member.networks & fine}, plane)
                 for member in mine:
-                    if f"container {member.container}" not in told:
+                    if f"container {member.container.name}" not in told:
                         self.check_names(member, member.networks & fine)
 
     def check_key(self, key: Key, wanted: set[str], plane: DataPlane) -> None:
@@ -346,10 +346,10 @@ class Hosts:
             self.check_made_of(key, is_, runs, plane)
 
     def check_made_of(self, key: Key, is_: OwnLabels, runs: OwnLabels, plane: DataPlane) -> None:
-        forwards = plane == "kernel"
-        assert is_.fingerprint == sandbox_fingerprint(key, is_.range, SETTINGS, forwards)
-        image = self.engine.image
-        assert runs.fingerprint == proxy_fingerprint(key, is_.range, SETTINGS, image, plane)
+        box = CreateSandbox("", key, is_.range, forwards=plane == "kernel")
+        assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
+        proxy = Create("", key, is_.range, "", plane)
+        assert runs.fingerprint == proxy_fingerprint(proxy, SETTINGS, self.engine.image)
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

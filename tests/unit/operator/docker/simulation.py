@@ -22,7 +22,6 @@ from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
     Container,
-    HostPorts,
     HostState,
     Network,
     PlanSettings,
@@ -145,7 +144,8 @@ class Engine:
                 for box, is_ in own
                 if is_ and is_.role == ROLE_PROXY
             ),
-            host=HostPorts(self.ephemeral, frozenset(self.open | held)),
+            ephemeral=self.ephemeral,
+            listening=frozenset(self.open | held),
             image_id=self.image,
             sandboxes=tuple(
                 Sandbox(is_.key, self._container(box), is_.range, is_.fingerprint)
@@ -222,18 +222,17 @@ class Engine:
         return [box for box in self.boxes if box.name == name]
 
     def _create(self, action: CreateSandbox | Create) -> None:
-        spec = action.sandbox if isinstance(action, CreateSandbox) else action.proxy
-        if self.named(spec.name) or not self.image:
-            raise Failed(f"can't create {spec.name}")
+        name, labels, uplink = action.name, own_labels(action), self.settings.uplink
+        if self.named(name) or not self.image:
+            raise Failed(f"can't create {name}")
         if isinstance(action, CreateSandbox):
-            if action.sandbox.uplink not in self.networks:
+            if uplink not in self.networks:
                 raise Failed("no uplink")
-            box = self.add(spec.name, labels=own_labels(spec), ports=frozenset(spec.range.ports()))
-            self.join(box, action.sandbox.uplink)
+            self.join(self.add(name, labels=labels, ports=frozenset(action.range.ports())), uplink)
         else:
-            home = self.own(action.proxy.sandbox)
+            home = self.own(action.sandbox)
             assert home.role == ROLE_SANDBOX
-            self.add(spec.name, labels=own_labels(spec), mode=f"container:{home.id}")
+            self.add(name, labels=labels, mode=f"container:{home.id}")
 
     def start(self, box: Box) -> None:
         if box.state not in {"created", "exited"}:

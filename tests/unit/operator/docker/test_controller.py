@@ -9,7 +9,7 @@ from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
-from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
 from rosproxy_operator.docker.snapshot import DockerObserver
@@ -20,7 +20,7 @@ from tests.unit.operator.docker.conftest import FakeEngine
 SETTINGS = PlanSettings(advertise_host=KEY.advertise_host)
 
 
-def own(spec: SandboxSpec | ProxySpec, number: str, network: str, address: str) -> dict[str, Any]:
+def own(spec: CreateSandbox | Create, number: str, network: str, address: str) -> dict[str, Any]:
     ends = {network: captured.end("e", address)} if address else {}
     return captured.running() | {
         "Id": number,
@@ -38,9 +38,9 @@ def containers(engine: FakeEngine) -> None:
     details = captured.inspected() | {"State": {"Status": "running", "StartedAt": "1"}}
     details["NetworkSettings"] = {"Networks": {"app": {"Aliases": ["robot"]}}}
     engine.add(captured.running(), details)
-    box = SandboxSpec(sandbox_name(KEY), KEY, RANGE, "f", SETTINGS.uplink)
+    box = CreateSandbox(sandbox_name(KEY), KEY, RANGE, "f")
     engine.add(own(box, "b" * 64, SETTINGS.uplink, "172.30.0.2"), details)
-    process = ProxySpec(proxy_name(KEY), KEY, RANGE, "f", sandbox_name(KEY))
+    process = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
     token = {"Config": {"Env": ["ROSPROXY_ADMIN_TOKEN=secret"]}, "State": details["State"]}
     engine.add(own(process, "p" * 64, f"container:{'b' * 64}", ""), token)
 
@@ -55,7 +55,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     assert [container.name for container in state.containers] == ["talker"]
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
     assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]
-    assert [request.master_uri for request in look.labels.requests] == [KEY.master_uri]
+    assert [request.key.master_uri for request in look.labels.requests] == [KEY.master_uri]
     assert look.masters == {"robot": "172.29.0.2"}  # no name server has it, but a container
     assert not state.unresolved
     assert not state.busy

@@ -5,13 +5,7 @@ from dataclasses import replace
 import pytest
 
 from rosproxy.settings import DataPlane
-from rosproxy_operator.docker.planner.actions import (
-    Action,
-    Create,
-    CreateSandbox,
-    ProxySpec,
-    SandboxSpec,
-)
+from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Container, PlanSettings, Proxy, Sandbox
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
@@ -32,14 +26,13 @@ from tests.unit.operator.docker.builders import (
     observed,
     planned,
     proxy,
-    read_members,
     sandbox,
 )
 
 LABEL = "rosproxy.data-plane"
 NAME = proxy_name(KEY)
-SANDBOX = SandboxSpec("s", KEY, RANGE, "f1", "0-rosproxy")
-PROXY = ProxySpec("p", KEY, RANGE, "f2", "s")
+SANDBOX = CreateSandbox("s", KEY, RANGE, "f1")
+PROXY = Create("p", KEY, RANGE, "s")
 
 
 def asking(name: str, plane: str, state: str = "running") -> Container:
@@ -64,14 +57,15 @@ def given(found: DockerPlan) -> DataPlane:
 
 def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
     """What sandboxes are created with, and what proxies."""
-    boxes = [action.sandbox.forwards for action in actions if isinstance(action, CreateSandbox)]
-    return boxes, [action.proxy.data_plane for action in actions if isinstance(action, Create)]
+    boxes = [action.forwards for action in actions if isinstance(action, CreateSandbox)]
+    return boxes, [action.data_plane for action in actions if isinstance(action, Create)]
 
 
 def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
-    box = sandbox(made=sandbox_fingerprint(KEY, RANGE, SETTINGS, forwards))
-    return box, proxy(made=proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE, plane))
+    box = sandbox_fingerprint(replace(SANDBOX, forwards=forwards), SETTINGS)
+    process = proxy_fingerprint(replace(PROXY, data_plane=plane), SETTINGS, IMAGE)
+    return sandbox(made=box), proxy(made=process)
 
 
 # what is asked for
@@ -88,23 +82,6 @@ def test_a_label_goes_before_the_option(plane: str) -> None:
         found = look(asking("a", plane), settings=replace(SETTINGS, data_plane=option))
         assert given(found) == plane.strip().lower()
         assert found.problems == ()
-
-
-@pytest.mark.parametrize("value", ["", "fast", "kernel,splice", "true"])
-def test_a_label_that_names_no_plane(value: str) -> None:
-    members, problems = read_members(observed(asking("a", value), container("b")), SETTINGS)
-    assert [member.container for member in members] == ["b"]
-    assert [problem.text for problem in problems] == [
-        f"label rosproxy.data-plane={value!r} is none of auto, kernel, splice, copy: write "
-        "rosproxy.data-plane=kernel for a proxy that lets the kernel forward, or leave it out"
-    ]
-
-
-def test_a_misspelt_label() -> None:
-    _, problems = read_members(
-        observed(container(labels={**ENABLED, "rosproxy.dataplane": "kernel"})), SETTINGS
-    )
-    assert "did you mean rosproxy.data-plane?" in problems[0].text
 
 
 def test_who_is_outvoted_is_told() -> None:
@@ -162,7 +139,7 @@ def test_the_sandbox_forwards_and_gets_no_capability() -> None:
 
 
 def test_the_plan_names_the_capability() -> None:
-    texts = [str(Create(replace(PROXY, data_plane=plane))) for plane in ("kernel", "splice")]
+    texts = [str(replace(PROXY, data_plane=plane)) for plane in ("kernel", "splice")]
     assert ["NET_ADMIN" in text for text in texts] == [True, False]
 
 

@@ -17,11 +17,9 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
-    SandboxSpec,
     Start,
     Unpause,
 )
@@ -32,12 +30,12 @@ from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, observed
 from tests.unit.operator.docker.conftest import FakeEngine
 
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
-BOX = SandboxSpec("box", KEY, RANGE, "", SETTINGS.uplink)
+BOX = CreateSandbox("box", KEY, RANGE)
 LOOK = DockerSnapshot(observed(), LabelReading(), {}, {KEY: "secret"}, {"robot": "192.0.2.7"}, True)
 ACTIONS: list[Action] = [
     CreateNetwork("0-rosproxy"),
-    CreateSandbox(BOX),
-    Create(ProxySpec("p", KEY, RANGE, "", "box")),
+    BOX,
+    Create("p", KEY, RANGE, "box"),
     Start("p"),
     Restart("p"),
     Unpause("p"),

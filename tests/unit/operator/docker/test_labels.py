@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.members import master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.specs import proxy_name
 from tests.unit.operator.docker.builders import (
     ENABLED,
     HERE,
@@ -34,7 +35,7 @@ def read(
     """The member of one container, if any, and its problems."""
     members, problems = read_members(observed(one, *others, **more), settings)
     mine = [problem for problem in problems if problem.subject == f"container {one.name}"]
-    return next((member for member in members if member.container == one.name), None), mine
+    return next((member for member in members if member.container == one), None), mine
 
 
 def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
@@ -45,46 +46,67 @@ def refusal(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
     return problems[-1].text
 
 
-def warning(one: Container, settings: PlanSettings = SETTINGS, **more) -> str:
+def warning(one: Container) -> str:
     """What a container is told that has its member nevertheless."""
-    member, problems = read(one, settings, **more)
+    member, problems = read(one)
     assert member is not None
     assert [problem.fatal for problem in problems] == [False]
     return problems[0].text
 
 
+def good(one: Container, settings: PlanSettings = SETTINGS, *others: Container, **more) -> Member:
+    """The member of a container with which nothing is wrong."""
+    member, problems = read(one, settings, *others, **more)
+    assert member is not None
+    assert problems == []
+    return member
+
+
 def test_a_labelled_container_wishes_for_a_proxy() -> None:
     labels = {**ENABLED, "rosproxy.ports": "40", "rosproxy.advertise-host": "Host.lab"}
-    member, problems = read(container(labels=labels, networks=("app", "lab")))
-    assert problems == []
-    assert member == Member(
-        "talker",
-        "id-talker",
-        Key(ROBOT, "host.lab"),
-        40,
-        frozenset({"app", "lab"}),
-        "rosproxy",
+    one = container(labels=labels, networks=("app", "lab"))
+    assert good(one) == Member(
+        one, Key(ROBOT, "host.lab"), 40, frozenset({"app", "lab"}), "rosproxy"
     )
-
-
-def test_the_label_alone_is_enough() -> None:
-    member, problems = read(container(labels=ON, env=ROBOT))
-    assert problems == []
-    assert member
-    assert (member.key, member.ports, member.needs) == (KEY, 0, "robot")
 
 
 @pytest.mark.parametrize("value", ["true", "True", " TRUE "])
-def test_true_is_true(value: str) -> None:
-    assert read(container(labels={"rosproxy.enable": value}, env=ROBOT))[0]
+def test_the_label_alone_is_enough(value: str) -> None:
+    member = good(container(labels={"rosproxy.enable": value}, env=ROBOT))
+    assert (member.key, member.ports, member.needs) == (KEY, 0, "robot")
 
 
-@pytest.mark.parametrize("value", ["yes", "1", "", "ture"])
-def test_neither_true_nor_false(value: str) -> None:
-    text = refusal(container(labels={**ENABLED, "rosproxy.enable": value}))
-    assert text == (
-        f"label rosproxy.enable={value!r} is neither true nor false: write rosproxy.enable=true"
-    )
+URI = "is not of the form http://HOST:11311"
+HOST = "is neither a host name nor an address: give the one under which others reach this host"
+BAD = {
+    "rosproxy.enable": ("is neither true nor false: write rosproxy.enable=true", [
+        "yes", "1", "", "ture",
+    ]),
+    "rosproxy.ports": (
+        "is not a number from 1 to 1000: give how many ports the whole proxy is to have, one for "
+        "each node, e.g. rosproxy.ports=32", [
+        "0", "1001", "-1", "many", "", "1.5", "٣", "9" * 5000,
+    ]),
+    "rosproxy.master-uri": (URI, [
+        "robot", "robot:11311", "https://robot:11311", "http://robot", "http://robot:0",
+        "http://:1", "http://robot:11311/a b", "http://rö:11311", "", "http://u@robot:11311",
+    ]),
+    "rosproxy.advertise-host": (HOST, ["", "a b", "http://host", "host:1", "-x", "x" * 300]),
+    "rosproxy.data-plane": (
+        "is none of auto, kernel, splice, copy: write rosproxy.data-plane=kernel for a proxy that "
+        "lets the kernel forward, or leave it out", ["", "fast", "kernel,splice", "true"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "told"),
+    [(label, value, told) for label, (told, values) in BAD.items() for value in values],
+)
+def test_a_value_that_can_not_be(label: str, value: str, told: str) -> None:
+    text = refusal(container(labels={**ENABLED, label: value}))
+    shown = repr(value) if len(value) <= 80 else repr(f"{value[:79]}…")
+    assert text == f"label {label}={shown} {told}"
 
 
 def test_nobody_else_is_asked() -> None:
@@ -115,6 +137,7 @@ def test_a_label_without_enable_is_ignored_and_told() -> None:
         ("rosproxy.networks", "rosproxy.network"),
         ("Rosproxy.Ports", "rosproxy.ports"),
         ("rosproxy_ports", "rosproxy.ports"),
+        ("rosproxy.dataplane", "rosproxy.data-plane"),
     ],
 )
 def test_an_unknown_label_and_the_nearest_right_one(name: str, near: str) -> None:
@@ -133,20 +156,9 @@ def test_other_peoples_labels_are_not_ours(name: str) -> None:
     assert read(container(labels={name: "1"})) == (None, [])
 
 
-@pytest.mark.parametrize("value", ["0", "1001", "-1", "many", "", "1.5", "٣", "9" * 5000])
-def test_bad_numbers_of_ports(value: str) -> None:
-    text = refusal(container(labels={**ENABLED, "rosproxy.ports": value}))
-    assert text.startswith("label rosproxy.ports=")
-    assert "not a number from 1 to 1000" in text
-    assert "e.g. rosproxy.ports=32" in text
-    assert len(text) < 300
-
-
 @pytest.mark.parametrize("value", ["1", "1000", " 32 "])
 def test_good_numbers_of_ports(value: str) -> None:
-    member, problems = read(container(labels={**ENABLED, "rosproxy.ports": value}))
-    assert member
-    assert (member.ports, problems) == (int(value), [])
+    assert good(container(labels={**ENABLED, "rosproxy.ports": value})).ports == int(value)
 
 
 # masters
@@ -165,19 +177,7 @@ def test_good_numbers_of_ports(value: str) -> None:
     ],
 )
 def test_a_master_has_one_uri(uri: str, same: str) -> None:
-    member, _ = read(container(labels={**ON, "rosproxy.master-uri": uri}))
-    assert member
-    assert member.key.master_uri == same
-
-
-@pytest.mark.parametrize(
-    "uri",
-    ["robot", "robot:11311", "https://robot:11311", "http://robot", "http://robot:0", "http://:1",
-     "http://robot:11311/a b", "http://rö:11311", "", "http://u@robot:11311"],
-)  # fmt: skip
-def test_what_is_no_uri(uri: str) -> None:
-    text = refusal(container(labels={**ON, "rosproxy.master-uri": uri}))
-    assert text == f"label rosproxy.master-uri={uri!r} is not of the form http://HOST:11311"
+    assert good(container(labels={**ON, "rosproxy.master-uri": uri})).key.master_uri == same
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "[::1]", "0.0.0.0", "a.localhost"])
@@ -201,60 +201,47 @@ def test_a_proxy_is_no_master(host: str) -> None:
 
 def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
     settings = replace(SETTINGS, master_uri="http://arm:11311")
-    for env in ("", "http://rosproxy:11311", "http://rosproxy-arm-0a1b2c:11311"):
-        member, _ = read(container(labels=ON, env=env), settings)
-        assert member
-        assert member.key.master_uri == "http://arm:11311"
-    member, _ = read(container(labels=ON, env=ROBOT), settings)
-    assert member
-    assert member.key == KEY
+    arm = Key("http://arm:11311", HERE)
+    for env in ("", "http://rosproxy:11311", f"http://{proxy_name(arm)}:11311"):
+        assert good(container(labels=ON, env=env), settings).key == arm
+    member, _ = read(container(labels=ON, env="http://rosproxy-zoo-0a1b2c:11311"), settings)
+    assert member is not None
+    assert good(container(labels=ON, env=ROBOT), settings).key == KEY
 
 
 def test_no_master() -> None:
     text = refusal(container(labels=ON))
-    assert text.startswith(
-        "no master is known: add the label rosproxy.master-uri=http://HOST:11311"
-    )
+    assert text.startswith("no master is known: add the label rosproxy.master-uri=http://HOST:")
     text = refusal(container(labels=ON), replace(SETTINGS, master_uri="robot"))
-    assert text.startswith("the operator's --master-uri 'robot' is not of the form")
+    assert text == f"the operator's --master-uri 'robot' {URI}"
 
 
 # by which name the proxy is found
 
 
-def test_an_address_goes_around_the_proxy() -> None:
-    text = warning(container(labels=ON, env="http://192.0.2.7:11311"))
-    assert text.startswith("its variable ROS_MASTER_URI='http://192.0.2.7:11311' is an address")
-    assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
+ASTRAY = {
+    "http://rosproxy:11312": "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
+    "http://robot:11312": "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
+    "http://other:11311": "is not its master http://robot:11311, so its nodes go elsewhere: set ",
+    "http://localhost:11311": "is the container itself: set ROS_MASTER_URI=",
+    "http://rosproxy-arm-0a1b2c:11311": "names another master's proxy, its own is rosproxy-robot-",
+    "robot:11311": f"{URI}: set ROS_MASTER_URI=",
+    "http://192.0.2.7:11311": "is an address, so its nodes go around the proxy and can't be",
+}
 
 
-@pytest.mark.parametrize(
-    ("env", "told"),
-    [
-        (
-            "http://rosproxy:11312",
-            "the proxy stands at its master's port 11311: set ROS_MASTER_URI=",
-        ),
-        ("http://robot:11312", "the proxy stands at its master's port 11311"),
-        ("http://other:11311", "is not its master http://robot:11311, so its nodes go elsewhere"),
-        ("http://localhost:11311", "is the container itself: set ROS_MASTER_URI="),
-        (
-            "http://rosproxy-arm-0a1b2c:11311",
-            "names another master's proxy, its own is rosproxy-robot-",
-        ),
-        ("robot:11311", "is not of the form http://HOST:11311"),
-    ],
-)
+@pytest.mark.parametrize(("env", "told"), ASTRAY.items())
 def test_a_variable_that_leads_astray(env: str, told: str) -> None:
-    assert told in warning(container(env=env))
+    text = warning(container(env=env))
+    assert text.startswith(f"its variable ROS_MASTER_URI={env!r}")
+    assert told in text
+    assert "set ROS_MASTER_URI=http://rosproxy:11311" in text
 
 
 @pytest.mark.parametrize("env", ["", "http://rosproxy:11311", "http://ROBOT:11311/", ROBOT])
 def test_a_variable_that_leads_to_the_proxy(env: str) -> None:
-    member, problems = read(container(env=env))
-    assert member
-    assert problems == []
-    assert member.needs == ("rosproxy" if "rosproxy" in env or not env else "robot")
+    needs = "rosproxy" if "rosproxy" in env or not env else "robot"
+    assert good(container(env=env)).needs == needs
 
 
 # this host's address
@@ -268,15 +255,7 @@ def test_who_says_what_this_host_is_called() -> None:
         (container(), SETTINGS, HERE),
         (container(), PlanSettings(), "192.0.2.99"),
     ):
-        member, problems = read(one, settings, advertise=found)
-        assert member
-        assert (member.key.advertise_host, problems) == (host, [])
-
-
-@pytest.mark.parametrize("value", ["", "a b", "http://host", "host:1", "-x", "x" * 300])
-def test_what_is_no_host(value: str) -> None:
-    text = refusal(container(labels={**ENABLED, "rosproxy.advertise-host": value}))
-    assert "is neither a host name nor an address" in text
+        assert good(one, settings, advertise=found).key.advertise_host == host
 
 
 def test_loopback_is_no_address_for_others() -> None:
@@ -294,32 +273,28 @@ def test_an_address_that_is_not_known_for_a_moment() -> None:
     """The proxy that is there stays: of several, the one on the container's network."""
     other = Key(ROBOT, "192.0.2.1")
     seen = [sandbox(other, networks=()), sandbox(KEY)]
-    member, problems = read(container(), PlanSettings(), sandboxes=seen)
-    assert member
-    assert (member.key, problems) == (KEY, [])
+    assert good(container(), PlanSettings(), sandboxes=seen).key == KEY
 
 
 # networks
 
 
-def test_only_user_defined_networks_but_the_uplink() -> None:
-    member, _ = read(container(networks=("bridge", "app", "0-rosproxy")))
-    assert member
-    assert member.networks == {"app"}
-
-
-def test_one_network_of_several() -> None:
-    labels = {**ENABLED, "rosproxy.network": "lab"}
-    member, _ = read(container(labels=labels, networks=("app", "lab")))
-    assert member
-    assert member.networks == {"lab"}
-
-
-def test_a_network_as_compose_files_call_it() -> None:
-    labels = {**ENABLED, "rosproxy.network": "lab", "com.docker.compose.project": "demo"}
-    member, _ = read(container(labels=labels, networks=("demo_lab", "demo_default")))
-    assert member
-    assert member.networks == {"demo_lab"}
+@pytest.mark.parametrize(
+    ("networks", "labels", "joined"),
+    [
+        (("bridge", "app", "0-rosproxy"), {}, "app"),
+        (("app", "lab"), {"rosproxy.network": "lab"}, "lab"),
+        (
+            ("demo_lab", "demo_default"),
+            {"rosproxy.network": "lab", "com.docker.compose.project": "demo"},
+            "demo_lab",
+        ),
+    ],
+)
+def test_one_network_of_several(
+    networks: tuple[str, ...], labels: dict[str, str], joined: str
+) -> None:
+    assert good(container(labels={**ENABLED, **labels}, networks=networks)).networks == {joined}
 
 
 def test_a_network_that_it_is_not_on() -> None:
@@ -350,10 +325,7 @@ def test_the_network_of_another_container() -> None:
     one = container("talker", networks=(), mode="container:id-pod")
     two = container("two", networks=(), mode="container:id-talker")
     for each, other in ((one, two), (two, one)):
-        member, problems = read(each, SETTINGS, pod, other)
-        assert member
-        assert problems == []
-        assert member.networks == {"app", "lab"}
+        assert good(each, SETTINGS, pod, other).networks == {"app", "lab"}
 
 
 def test_the_network_of_a_container_that_is_gone() -> None:
@@ -367,15 +339,12 @@ def test_the_network_of_a_container_that_is_gone() -> None:
 
 @pytest.mark.parametrize("state", ["created", "running", "paused", "restarting"])
 def test_who_lives_counts(state: str) -> None:
-    member, _ = read(container(state=state))
-    assert member
-    assert member.alive
+    assert good(container(state=state)).container.alive
 
 
 def test_who_has_exited_has_no_problems() -> None:
-    member, problems = read(container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited"))
-    assert member
-    assert (member.alive, problems) == (False, [])
+    gone = container(labels={**ENABLED, "rosproxy.what": "1"}, state="exited")
+    assert not good(gone).container.alive
     assert read(container(labels=ON, state="exited")) == (None, [])
 
 
@@ -388,11 +357,8 @@ def test_who_is_dead_wants_nothing(state: str) -> None:
 
 
 def test_everybody_with_a_master_is_exposed() -> None:
-    member, problems = read(container(labels={}, env=ROBOT), EXPOSING)
-    assert member
-    assert (member.key, problems) == (KEY, [])
-    member, _ = read(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING)
-    assert member
+    assert good(container(labels={}, env=ROBOT), EXPOSING).key == KEY
+    assert good(container(labels={"rosproxy.master-uri": ROBOT}), EXPOSING).key == KEY
     assert read(container(labels={}), EXPOSING) == (None, [])
 
 
@@ -416,11 +382,8 @@ def test_one_bad_container_does_not_touch_the_others() -> None:
     members, _ = read_members(observed(*good), SETTINGS)
     with_bad, problems = read_members(observed(*bad, *good), SETTINGS)
     assert with_bad == members
-    assert {problem.subject for problem in problems if problem.fatal} == {
-        "container bad1",
-        "container bad2",
-        "container bad3",
-    }
+    fatal = {problem.subject for problem in problems if problem.fatal}
+    assert fatal == {"container bad1", "container bad2", "container bad3"}
 
 
 def test_a_container_with_the_operators_own_label() -> None:
@@ -445,7 +408,9 @@ def test_a_proxy_of_whatever_name_is_no_master() -> None:
     odd = {"sandboxes": [sandbox(name="odd")], "proxies": [proxy(name="strange")]}
     for host in ("odd", "strange"):
         one = container(labels=ON, env=f"http://{host}:11311")
-        assert read(one, replace(SETTINGS, master_uri=ROBOT), **odd)[0]
+        member, _ = read(one, replace(SETTINGS, master_uri=ROBOT), **odd)
+        assert member is not None
+        assert member.key == KEY
 
 
 TEXT = st.text(max_size=30) | st.sampled_from(["true", ROBOT, "app", "8", HERE])

@@ -15,15 +15,13 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
-    SandboxSpec,
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.model import HostState, Key, Network, PlanSettings
+from rosproxy_operator.docker.planner.model import HostState, Key, Network, PlanSettings, Proxy
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     proxy_fingerprint,
@@ -56,18 +54,21 @@ ARM = Key("http://arm:11311", HERE)
 ON_ARM = {**ENABLED, "rosproxy.master-uri": ARM.master_uri}
 LAB = Network("n2", "lab")
 NEXT = PortRange(11432, 11463)
+ELSEWHERE = PortRange(11500, 11531)
+LONGER = PortRange(11400, 11439)
+ASKS_FOR_40 = {**ENABLED, "rosproxy.ports": "40"}
 
 
 def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
-    made = sandbox_fingerprint(KEY, ports, SETTINGS)
-    return CreateSandbox(SandboxSpec(name, KEY, ports, made, "0-rosproxy"))
+    made = CreateSandbox(name, KEY, ports)
+    return replace(made, fingerprint=sandbox_fingerprint(made, SETTINGS))
 
 
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
-    made = proxy_fingerprint(KEY, ports, SETTINGS, image)
-    return Create(ProxySpec(NAME, KEY, ports, made, home, replaces))
+    made = Create(NAME, KEY, ports, home, replaces=replaces)
+    return replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image))
 
 
 def look(
@@ -88,12 +89,17 @@ def texts(found: DockerPlan) -> list[str]:
 
 
 FIRST = [
-    new_sandbox(),
+    new_sandbox(), Start(PORTS), Connect(PORTS, "app", ALIASES), new_proxy(), Start(NAME),
+]  # fmt: skip
+ANEW = [
+    Remove(NAME, "its sandbox is made anew", stop=True),
+    Remove(f"{PORTS}-old", "made anew"),
     Start(PORTS),
     Connect(PORTS, "app", ALIASES),
-    new_proxy(),
+    new_proxy(LONGER, replaces=NAME),
     Start(NAME),
 ]
+"""The end of the steps that give a proxy more ports."""
 
 
 def test_the_first_container_on_a_host() -> None:
@@ -103,13 +109,13 @@ def test_the_first_container_on_a_host() -> None:
     assert (found.problems, found.again_in) == ((), None)
 
 
-def test_all_is_as_it_ought_to_be() -> None:
-    found = look(observed(container(), **both()))
-    assert (found.actions, found.problems, found.again_in) == ((), (), None)
-
-
-def test_nobody_wants_anything() -> None:
-    found = look(observed(container(labels={}), networks=[APP]))
+@pytest.mark.parametrize(
+    "seen",
+    [observed(container(), **both()), observed(container(labels={}), networks=[APP])],
+    ids=["all is as it ought to be", "nobody wants anything"],
+)
+def test_nothing_is_to_be_done(seen: HostState) -> None:
+    found = look(seen)
     assert (found.actions, found.problems, found.again_in) == ((), (), None)
 
 
@@ -194,25 +200,26 @@ def test_a_sandbox_on_a_network_that_was_made_anew_is_made_anew(network_id: str)
     assert actions(seen) == (usual if network_id == "n1" else anew)
 
 
-def test_a_sandbox_that_is_paused() -> None:
-    seen = observed(container(), sandboxes=[sandbox(state="paused")], proxies=[proxy()])
-    assert actions(seen) == [Unpause(PORTS)]
-
-
-def test_a_sandbox_that_the_engine_restarts_is_left_alone() -> None:
-    found = look(observed(container(), sandboxes=[sandbox(state="restarting", networks=())]))
-    assert found.actions == ()
-    assert texts(found) == [f"ends and is restarted: see docker logs {PORTS}"]
-
-
-def test_a_sandbox_that_is_dead() -> None:
-    seen = observed(container(), sandboxes=[sandbox(state="dead")])
-    assert actions(seen) == [Remove(PORTS, "left over"), *FIRST]
-
-
-def test_a_sandbox_that_is_being_removed_is_waited_for() -> None:
-    found = look(observed(container(), sandboxes=[sandbox(state="removing")], proxies=[proxy()]))
-    assert (found.actions, found.again_in) == ((), 1.0)
+@pytest.mark.parametrize(
+    ("there", "done", "again_in", "told"),
+    [
+        ([sandbox(state="paused"), proxy()], [Unpause(PORTS)], None, []),
+        (
+            [sandbox(state="restarting", networks=())],
+            [],
+            None,
+            [f"ends and is restarted: see docker logs {PORTS}"],
+        ),
+        ([sandbox(state="removing"), proxy()], [], 1.0, []),
+        ([sandbox(state="dead")], [Remove(PORTS, "left over"), *FIRST], None, []),
+    ],
+    ids=["paused", "restarting", "removing", "dead"],
+)
+def test_a_sandbox_that_does_not_run(
+    there: list, done: list[Action], again_in: float | None, told: list[str]
+) -> None:
+    found = look(observed(container(), sandboxes=there[:1], proxies=there[1:]))
+    assert (list(found.actions), found.again_in, texts(found)) == (done, again_in, told)
 
 
 # proxies that do not run
@@ -257,11 +264,6 @@ def test_a_proxy_in_a_namespace_that_is_gone(proxys: str, sandboxs: str, lost: b
     assert actions(seen) == ([Restart(NAME)] if lost else [])
 
 
-def test_a_proxy_in_another_sandbox_is_replaced() -> None:
-    seen = observed(container(), sandboxes=[sandbox()], proxies=[proxy(sandbox_id="gone")])
-    assert actions(seen) == replacement()
-
-
 # replacement
 
 
@@ -275,8 +277,11 @@ def replacement(image: str = IMAGE) -> list[Action]:
     ]
 
 
-def test_a_new_image_replaces_the_proxy_and_not_the_sandbox() -> None:
+def test_what_replaces_the_proxy_and_not_the_sandbox() -> None:
     assert actions(observed(container(), image="new", **both())) == replacement("new")
+    in_another = proxy(sandbox_id="gone")
+    seen = observed(container(), sandboxes=[sandbox()], proxies=[in_another])
+    assert actions(seen) == replacement()
 
 
 def test_a_controller_killed_while_replacing_goes_on() -> None:
@@ -291,49 +296,31 @@ def test_a_controller_killed_while_replacing_goes_on() -> None:
         assert actions(seen) == left
 
 
-def test_an_old_one_that_is_right_after_all_gets_its_name_back() -> None:
-    old = proxy(name=f"{NAME}-old")
-    seen = observed(container(), sandboxes=[sandbox()], proxies=[old])
-    assert actions(seen) == [Rename(f"{NAME}-old", NAME)]
-
-
-def test_two_that_run() -> None:
-    other = proxy(name="other")
-    seen = observed(container(), sandboxes=[sandbox()], proxies=[other, proxy()])
-    assert actions(seen) == [Remove("other", "left over")]
+@pytest.mark.parametrize(
+    ("proxies", "done"),
+    [
+        ([proxy(name=f"{NAME}-old")], Rename(f"{NAME}-old", NAME)),
+        ([proxy(name="other"), proxy()], Remove("other", "left over")),
+    ],
+    ids=["an old one that is right after all gets its name back", "of two that run one goes"],
+)
+def test_what_a_controller_that_was_killed_leaves(proxies: list[Proxy], done: Action) -> None:
+    assert actions(observed(container(), sandboxes=[sandbox()], proxies=proxies)) == [done]
 
 
 def test_other_ports_replace_both() -> None:
-    labels = {**ENABLED, "rosproxy.ports": "40"}
-    longer = PortRange(11400, 11439)
-    assert actions(observed(container(labels=labels), **both())) == [
-        Rename(PORTS, f"{PORTS}-old"),
-        new_sandbox(longer),
-        Remove(NAME, "its sandbox is made anew", stop=True),
-        Remove(f"{PORTS}-old", "made anew"),
-        Start(PORTS),
-        Connect(PORTS, "app", ALIASES),
-        new_proxy(longer, replaces=NAME),
-        Start(NAME),
-    ]
+    found = actions(observed(container(labels=ASKS_FOR_40), **both()))
+    assert found == [Rename(PORTS, f"{PORTS}-old"), new_sandbox(LONGER), *ANEW]
 
 
 def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
     """The proxy goes first: without its network it could not close its connections."""
-    labels = {**ENABLED, "rosproxy.ports": "40"}
-    longer = PortRange(11400, 11439)
     old = sandbox(name=f"{PORTS}-old")
-    new = sandbox(ports=longer, state="created", networks=())
+    new = sandbox(ports=LONGER, state="created", networks=())
     lives = proxy(sandbox_id=old.container.id)
-    seen = observed(container(labels=labels), sandboxes=[old, new], proxies=[lives])
-    assert actions(seen) == [
-        Remove(NAME, "its sandbox is made anew", stop=True),
-        Remove(f"{PORTS}-old", "another one takes over"),
-        Start(PORTS),
-        Connect(PORTS, "app", ALIASES),
-        new_proxy(longer, replaces=NAME),
-        Start(NAME),
-    ]
+    seen = observed(container(labels=ASKS_FOR_40), sandboxes=[old, new], proxies=[lives])
+    gone = Remove(f"{PORTS}-old", "another one takes over")
+    assert actions(seen) == [ANEW[0], gone, *ANEW[2:]]
 
 
 def test_another_publish_address_replaces_both() -> None:
@@ -390,24 +377,25 @@ def test_an_uplink_that_is_none(uplink: Network) -> None:
 # the end
 
 
+UNWANTED = "no running container wants it any more"
+ALONE: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
+
+
 def test_the_grace() -> None:
-    alone: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
-    first = look(observed(**alone))
+    first = look(observed(**ALONE))
     assert (first.actions, first.again_in) == ((), 60.0)
-    second = look(observed(**alone), memory=first.memory, now=59.5)
+    second = look(observed(**ALONE), memory=first.memory, now=59.5)
     assert (second.actions, second.again_in) == ((), 0.5)
-    third = look(observed(**alone), memory=second.memory, now=60.0)
-    why = "no running container wants it any more"
-    assert list(third.actions) == [Remove(NAME, why, retire=True), Remove(PORTS, why)]
+    third = look(observed(**ALONE), memory=second.memory, now=60.0)
+    assert list(third.actions) == [Remove(NAME, UNWANTED, retire=True), Remove(PORTS, UNWANTED)]
     assert third.again_in is None
     assert look(observed(), memory=third.memory, now=61.0).memory == DockerMemory()
 
 
 def test_the_grace_begins_anew_with_each_container() -> None:
-    alone: Any = {"sandboxes": [sandbox(networks=())], "proxies": [proxy()]}
-    memory = look(observed(**alone)).memory
+    memory = look(observed(**ALONE)).memory
     memory = look(observed(container(), **both()), memory=memory, now=50.0).memory
-    assert look(observed(**alone), memory=memory, now=70.0).again_in == 60.0
+    assert look(observed(**ALONE), memory=memory, now=70.0).again_in == 60.0
 
 
 @pytest.mark.parametrize("state", ["exited", "paused", "created", "restarting"])
@@ -415,8 +403,7 @@ def test_what_does_not_run_goes_too(state: str) -> None:
     settings = replace(SETTINGS, grace=0.0)
     seen = observed(sandboxes=[sandbox(networks=(), state=state)], proxies=[proxy(state=state)])
     found = actions(seen, settings=settings)
-    why = "no running container wants it any more"
-    removals = [Remove(NAME, why, retire=state == "paused"), Remove(PORTS, why)]
+    removals = [Remove(NAME, UNWANTED, retire=state == "paused"), Remove(PORTS, UNWANTED)]
     assert found == ([Unpause(NAME), *removals] if state == "paused" else removals)
 
 
@@ -436,7 +423,11 @@ def port_problem(found: DockerPlan) -> str:
 
 
 def created(found: DockerPlan) -> PortRange:
-    return next(a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox))
+    return next(iter(ranges(found).values()))
+
+
+def ranges(found: DockerPlan) -> dict[Key, PortRange]:
+    return {a.key: a.range for a in found.actions if isinstance(a, CreateSandbox)}
 
 
 @pytest.mark.parametrize(
@@ -462,20 +453,12 @@ def test_ports_on_which_the_proxy_itself_listens_are_not_in_its_range() -> None:
 
 
 def test_two_new_proxies_do_not_get_the_same() -> None:
+    """Who has been promised some keeps them: its container is being created."""
     found = look(observed(container(), container("b", ON_ARM)))
-    ranges = [a.sandbox.range for a in found.actions if isinstance(a, CreateSandbox)]
-    assert ranges == [RANGE, NEXT]
-
-
-def test_ports_are_kept_while_a_container_is_being_created() -> None:
+    assert ranges(found) == {ARM: RANGE, KEY: NEXT}
     memory = look(observed(container())).memory
     found = look(observed(container(), container("a", ON_ARM)), memory=memory)
-    assert [
-        (a.sandbox.key, a.sandbox.range) for a in found.actions if isinstance(a, CreateSandbox)
-    ] == [
-        (ARM, NEXT),
-        (KEY, RANGE),
-    ]
+    assert ranges(found) == {ARM: NEXT, KEY: RANGE}
 
 
 def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
@@ -491,22 +474,16 @@ def test_a_sandbox_that_the_engine_is_just_starting_keeps_its_ports() -> None:
 
 def test_ports_are_kept_when_everything_was_removed_by_hand() -> None:
     """What listens there may be what is left of it."""
-    there = PortRange(11500, 11531)
-    memory = look(observed(container(), **both(ports=there))).memory
-    found = look(observed(container(), listening=there.ports()), memory=memory)
-    assert created(found) == there
+    memory = look(observed(container(), **both(ports=ELSEWHERE))).memory
+    found = look(observed(container(), listening=ELSEWHERE.ports()), memory=memory)
+    assert created(found) == ELSEWHERE
 
 
-def test_ports_are_kept_when_the_proxy_was_removed_and_nothing_is_remembered() -> None:
-    there = PortRange(11500, 11531)
-    seen = observed(container(), sandboxes=[sandbox(ports=there)])
-    assert actions(seen) == [new_proxy(there), Start(NAME)]
-
-
-def test_ports_are_kept_when_the_sandbox_was_removed_and_nothing_is_remembered() -> None:
-    """The proxy, which is of no use without it, says where it was."""
-    there = PortRange(11500, 11531)
-    assert created(look(observed(container(), proxies=[proxy(ports=there)]))) == there
+def test_ports_are_kept_when_one_was_removed_and_nothing_is_remembered() -> None:
+    seen = observed(container(), sandboxes=[sandbox(ports=ELSEWHERE)])
+    assert actions(seen) == [new_proxy(ELSEWHERE), Start(NAME)]
+    # The proxy, which is of no use without its sandbox, says where it was.
+    assert created(look(observed(container(), proxies=[proxy(ports=ELSEWHERE)]))) == ELSEWHERE
 
 
 def test_a_stopped_sandbox_tells_more_than_memory_only_if_it_has_more_ports() -> None:
@@ -524,8 +501,7 @@ def test_never_fewer_ports() -> None:
 
 
 def test_more_ports_that_can_not_be_had() -> None:
-    labels = {**ENABLED, "rosproxy.ports": "40"}
-    found = look(observed(container(labels=labels), listening=[11435], **both()))
+    found = look(observed(container(labels=ASKS_FOR_40), listening=[11435], **both()))
     assert found.actions == ()
     assert "40 ports are wanted" in port_problem(found)
     assert "it keeps its 32 at 11400-11431, since 11432-11439 are not free" in port_problem(found)
@@ -562,7 +538,9 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
         Remove(f"{PORTS}-old", "made anew"),
         Start(PORTS),
     )
-    assert look(seen, memory=found.memory, now=299.0).actions == found.actions
+    forgets = replace(found.memory, planned={})
+    assert look(seen, memory=forgets, now=299.0).actions == found.actions
+    assert look(seen, memory=forgets, now=300.0).actions != found.actions
 
 
 @pytest.mark.parametrize("ports", [[11410], None])
@@ -583,11 +561,11 @@ def test_ports_that_have_served_are_tried_for_a_while(ports: list[int] | None) -
 
 
 def test_added_ports_that_are_refused_are_given_up() -> None:
-    labels = {**ENABLED, "rosproxy.ports": "40"}
-    memory = look(observed(container(labels=labels), **both())).memory
-    longer = sandbox(ports=PortRange(11400, 11439), state="created", networks=())
+    memory = look(observed(container(labels=ASKS_FOR_40), **both())).memory
+    longer = sandbox(ports=LONGER, state="created", networks=())
+    seen = observed(container(labels=ASKS_FOR_40), sandboxes=[longer])
     for ports in ([11435], None):
-        found = refused(observed(container(labels=labels), sandboxes=[longer]), ports, memory, 1.0)
+        found = refused(seen, ports, memory, 1.0)
         assert created(found) == RANGE
         assert "it keeps its 32" in port_problem(found)
 

@@ -7,7 +7,6 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    HostPorts,
     HostState,
     Key,
     Member,
@@ -15,7 +14,7 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
-from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, Places, ProxyNews, facts, gone
+from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, Places, ProxyNews, facts
 
 KEY = Key("http://robot:11311", "192.0.2.10")
 PORTS = PortRange(11400, 11431)
@@ -44,7 +43,7 @@ def look(*containers: Container) -> HostState:
         containers,
         networks,
         (Proxy(KEY, process, PORTS, ""),),
-        HostPorts(PORTS),
+        PORTS,
         sandboxes=(Sandbox(KEY, home, PORTS, ""),),
         addresses=frozenset({"172.18.0.5", "172.18.0.2", "172.30.0.2"}),
     )
@@ -55,20 +54,21 @@ def told(seen: HostState, *members: Member, master: str = "198.51.100.7") -> Net
 
 
 def member(container: Container) -> Member:
-    return Member(container.name, container.id, KEY)
+    return Member(container, KEY)
 
 
 def test_a_running_container_has_arrived_under_all_its_names() -> None:
-    seen = look(replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),)))
-    (arrival,) = told(seen, member(talker())).arrivals
+    one = replace(talker(), attachments=(at("172.18.0.5", "app", "web", "bad name"),))
+    (arrival,) = told(look(one), member(one)).arrivals
     assert (arrival.address, arrival.network, arrival.endpoint) == ("172.18.0.5", "app", "e1")
     assert arrival.names == {"talker", "t" * 12, "web", "bhost"}
 
 
 def test_only_those_that_run_and_want_this_proxy_arrive() -> None:
-    other = Member("talker", "t" * 20, Key("http://other:11311", "192.0.2.10"))
+    other = Member(talker(), Key("http://other:11311", "192.0.2.10"))
+    exited = talker(state="exited")
     assert not told(look(talker()), other).arrivals
-    assert not told(look(talker(state="exited")), member(talker())).arrivals
+    assert not told(look(exited), member(exited)).arrivals
     assert not told(look(talker())).arrivals
 
 
@@ -96,10 +96,14 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
 
 
 def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
-    known = told(look(talker()))
     nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
-    assert gone(nodes, known.taken, known.subnets) == ["172.18.0.6"]
-    assert gone(nodes, known.taken, ()) == []
+    for known, addresses in (
+        (told(look(talker())), {"gone": ["172.18.0.6"]}),
+        (replace(told(look(talker())), subnets=()), {}),
+    ):
+        news = ProxyNews()
+        news.look(known, 0.0)
+        assert news.body(nodes, 0.0) == addresses
 
 
 OLD, NEW = "172.18.0.5", "172.18.0.9"
@@ -219,7 +223,7 @@ def test_a_move_is_told_until_the_proxy_knows() -> None:
     news = ProxyNews()
     news.look(HERE, 0.0)
     news.body({OLD}, 0.0)
-    news.look(replace(THERE, taken=THERE.taken | {NEW}), 1.0)
+    news.look(replace(THERE, taken=frozenset({NEW})), 1.0)  # nobody has the old one: not gone
     assert news.body({OLD}, 1.0) == {"moved": {OLD: NEW}}
     news.told(1.0)
     assert news.next_due(1.0) == 1.0

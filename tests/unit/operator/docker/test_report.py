@@ -12,11 +12,9 @@ from rosproxy_operator.docker.planner.actions import (
     CreateNetwork,
     CreateSandbox,
     Disconnect,
-    ProxySpec,
     Remove,
     Rename,
     Restart,
-    SandboxSpec,
     Start,
     Unpause,
 )
@@ -67,12 +65,12 @@ STATUS = {
 ACTIONS: list[tuple[Action, str]] = [
     (CreateNetwork("0-rosproxy"), "create network 0-rosproxy, a bridge: the uplink of all proxies"),
     (
-        CreateSandbox(SandboxSpec("p-ports", KEY, RANGE, "f", "0-rosproxy")),
+        CreateSandbox("p-ports", KEY, RANGE),
         "create container p-ports: it holds ports 11400-11431 for the proxy of the master "
         "http://robot:11311",
     ),
     (
-        Create(ProxySpec("p", KEY, RANGE, "f", "p-ports", "p-old")),
+        Create("p", KEY, RANGE, "p-ports", replaces="p-old"),
         "create container p: proxy of the master http://robot:11311 at 192.0.2.10, ports "
         "11400-11431 of p-ports, instead of p-old",
     ),
@@ -129,14 +127,10 @@ def test_what_is_wrong_stands_where_it_belongs() -> None:
     text = render(status, 120)
     assert "running, no answer  http://robot:11311 DOWN" in text
     assert "\n    ! ill\n" in text
-    assert (
-        text.endswith(
-            "listener   running             -                      -            0\n"
-            "    ! no master is known\n"
-            "\nproblems:\n  network 0-a: can't be joined\n"
-            "\nyet to be done: 1 step\n  start container x"
-        )
-        or "    ! no master is known\n\nproblems:\n  network 0-a: can't be joined\n" in text
+    assert text.endswith(
+        "\n    ! no master is known\n"
+        "\nproblems:\n  network 0-a: can't be joined\n"
+        "\nyet to be done: 1 step\n  start container x"
     )
 
 

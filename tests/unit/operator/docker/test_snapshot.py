@@ -16,7 +16,6 @@ from rosproxy_operator.docker.engine_json import (
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
-    HostPorts,
     HostState,
     Key,
     Network,
@@ -127,7 +126,7 @@ def test_the_engine_knows_names_that_no_name_server_has() -> None:
     uplink = Network("n0", "0-rosproxy", gateway="172.30.0.1")
     places = (Attachment("app", "172.18.0.5", frozenset({"RosCore"})),)
     core = Container("1", "core", "running", attachments=places)
-    state = HostState((core,), (uplink,), (), HostPorts(PortRange(1, 2)))
+    state = HostState((core,), (uplink,), (), PortRange(1, 2))
     assert address_in(state, "roscore", "0-rosproxy") == "172.18.0.5"
     assert address_in(state, "host.docker.internal", "0-rosproxy") == "172.30.0.1"
     assert address_in(state, "robot", "0-rosproxy") == ""

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.docker.planner.actions import ProxySpec, SandboxSpec
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
     OwnLabels,
@@ -26,8 +26,8 @@ from rosproxy_operator.docker.planner.specs import (
 from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
 
-SANDBOX = SandboxSpec("s", KEY, PortRange(11400, 11401), "f1", "0-rosproxy")
-PROXY = ProxySpec("p", KEY, PortRange(11400, 11401), "f2", "s")
+SANDBOX = CreateSandbox("s", KEY, PortRange(11400, 11401), "f1")
+PROXY = Create("p", KEY, PortRange(11400, 11401), "s", fingerprint="f2")
 
 
 def test_a_sandbox_holds_ports_and_network_and_does_nothing() -> None:
@@ -102,21 +102,30 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
 
 
 def test_what_makes_a_sandbox_anew() -> None:
-    now = sandbox_fingerprint(KEY, RANGE, SETTINGS)
-    assert now == sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, image="other", grace=1.0))
-    assert now != sandbox_fingerprint(KEY, PortRange(11400, 11430), SETTINGS)
-    assert now != sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, publish=("::",)))
-    assert now != sandbox_fingerprint(KEY, RANGE, replace(SETTINGS, uplink="0-other"))
+    now = sandbox_fingerprint(SANDBOX, SETTINGS)
+    renamed = replace(SANDBOX, name="other", fingerprint="")
+    assert now == sandbox_fingerprint(renamed, replace(SETTINGS, image="other", grace=1.0))
+    assert now != sandbox_fingerprint(replace(SANDBOX, range=RANGE), SETTINGS)
+    assert now != sandbox_fingerprint(replace(SANDBOX, forwards=True), SETTINGS)
+    assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, publish=("::",)))
+    assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, uplink="0-other"))
 
 
 def test_what_makes_a_proxy_anew() -> None:
-    now = proxy_fingerprint(KEY, RANGE, SETTINGS, IMAGE)
-    assert now == proxy_fingerprint(
-        KEY, RANGE, replace(SETTINGS, image="other", publish=("::",)), IMAGE
-    )
-    assert now != proxy_fingerprint(KEY, RANGE, SETTINGS, "sha256:2")
-    assert now != proxy_fingerprint(KEY, PortRange(11400, 11430), SETTINGS, IMAGE)
-    assert now != proxy_fingerprint(Key(KEY.master_uri, "192.0.2.11"), RANGE, SETTINGS, IMAGE)
+    now = proxy_fingerprint(PROXY, SETTINGS, IMAGE)
+    renamed = replace(PROXY, name="other", sandbox="another", fingerprint="", replaces="old")
+    other = replace(SETTINGS, image="other", publish=("::",))
+    assert now == proxy_fingerprint(renamed, other, IMAGE)
+    assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2")
+    assert now != proxy_fingerprint(replace(PROXY, range=RANGE), SETTINGS, IMAGE)
+    elsewhere = Key(KEY.master_uri, "192.0.2.11")
+    assert now != proxy_fingerprint(replace(PROXY, key=elsewhere), SETTINGS, IMAGE)
+
+
+def test_fingerprints_stay_as_they_were() -> None:
+    """Else an update of the operator makes all proxies anew."""
+    assert sandbox_fingerprint(SANDBOX, SETTINGS) == "fc38dd94f5f167fd"
+    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE) == "bd5b2f988ae81386"
 
 
 def test_labels_are_read_back() -> None:

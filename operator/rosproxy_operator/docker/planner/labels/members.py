@@ -1,20 +1,16 @@
 """From the labels of containers to what they want of a proxy."""
 
 import difflib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 
-from rosproxy.settings import DataPlane
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels import values
-from rosproxy_operator.docker.planner.labels.masters import looks_for, master_uri
-from rosproxy_operator.docker.planner.labels.networks import networks
 from rosproxy_operator.docker.planner.labels.values import (
     ADVERTISE_HOST,
     ENABLE,
     LABELS,
-    PORTS,
     UnusableLabel,
 )
 from rosproxy_operator.docker.planner.model import (
@@ -32,26 +28,14 @@ _COUNTED = ALIVE | {"exited"}
 
 
 @dataclass(frozen=True, slots=True)
-class ProxyRequest:
-    """What one container's labels ask for, before it is known where its master is.
+class LabelReading:
+    """What all labels ask for, in order of the containers' names, and what is wrong with them.
 
-    ``advertise_host`` is empty if neither a label nor an option names it, ``ports`` 0 and
-    ``data_plane`` None without a label.
+    It is not known yet where the masters are: the keys of ``requests`` have an empty
+    ``advertise_host`` where neither a label nor an option names it, and what they need is open.
     """
 
-    container: Container
-    master_uri: str
-    advertise_host: str
-    ports: int
-    networks: frozenset[str]
-    data_plane: DataPlane | None
-
-
-@dataclass(frozen=True, slots=True)
-class LabelReading:
-    """What all labels ask for, in order of the containers' names, and what is wrong with them."""
-
-    requests: tuple[ProxyRequest, ...] = ()
+    requests: tuple[Member, ...] = ()
     problems: tuple[Problem, ...] = ()
 
 
@@ -62,14 +46,14 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
     touched by it. Containers that do not run have no problems.
     """
     proxies = frozenset(one.container.name for one in observed.own)
-    requests: list[ProxyRequest] = []
+    requests: list[Member] = []
     problems: list[Problem] = []
     for container in sorted(observed.containers, key=lambda one: (one.name, one.id)):
         if container.state not in _COUNTED:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if _counts(container, settings):
+            if _wants_proxy(container, settings):
                 requests.append(_request(container, observed, settings, proxies))
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
@@ -79,9 +63,8 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
     """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
-    found = {key.master_uri for key in observed.keys}
-    found |= {each.master_uri for each in reading.requests if each.container.alive}
-    return tuple(sorted({master(Key(uri, "")).host.lower() for uri in found}))
+    wanted = {each.key for each in reading.requests if each.container.alive}
+    return tuple(sorted({master(key).host.lower() for key in observed.keys | wanted}))
 
 
 def find_members(
@@ -91,44 +74,32 @@ def find_members(
     members: list[Member] = []
     problems: list[Problem] = []
     for request in reading.requests:
-        container, uri = request.container, request.master_uri
-        host = request.advertise_host or _advertised(container, uri, observed)
-        if not host:
+        container, uri = request.container, request.key.master_uri
+        key = Key(uri, request.key.advertise_host or _advertised(request, observed))
+        if key.advertise_host:
+            needs, text = values.looks_for(container, key)
+            wrong = [_problem(container, text, False)] if text else []
+            members.append(replace(request, key=key, needs=needs))
+        else:
             text = (
                 f"this host's address towards the master {uri} is not known: add the label "
                 f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host"
             )
-            problems += [_unusable(container, text)] if container.alive else []
-            continue
-        key = Key(uri, host)
-        needs, text = looks_for(container, key)
-        problems += [_problem(container, text, False)] if text and container.alive else []
-        members.append(
-            Member(
-                container=container.name,
-                id=container.id,
-                key=key,
-                ports=request.ports,
-                networks=request.networks,
-                needs=needs,
-                alive=container.alive,
-                data_plane=request.data_plane,
-            )
-        )
+            wrong = [_unusable(container, text)]
+        problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
 
 
 def _request(
-    container: Container, observed: HostState, settings: PlanSettings, proxies: frozenset[str]
-) -> ProxyRequest:
-    labels = container.labels
-    return ProxyRequest(
-        container=container,
-        master_uri=master_uri(container, labels.get(values.MASTER_URI), settings, proxies),
-        advertise_host=_advertise_host(container, settings),
-        ports=values.count(PORTS, labels[PORTS]) if PORTS in labels else 0,
-        networks=networks(container, observed, settings.uplink, labels.get(values.NETWORK)),
-        data_plane=_data_plane(container),
+    container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
+) -> Member:
+    uri = values.master_uri(container, settings, proxies)
+    return Member(
+        container,
+        Key(uri, values.advertise_host(container.labels, settings)),
+        ports=values.ports(container.labels),
+        networks=values.networks(container, observed, settings.uplink),
+        data_plane=values.data_plane(container.labels),
     )
 
 
@@ -141,16 +112,11 @@ def _unusable(container: Container, text: str) -> Problem:
     return _problem(container, text, fatal=bool(_own(container)))
 
 
-def _data_plane(container: Container) -> DataPlane | None:
-    label = container.labels.get(values.DATA_PLANE)
-    return None if label is None else values.data_plane(values.DATA_PLANE, label)
-
-
-def _counts(container: Container, settings: PlanSettings) -> bool:
-    """Whether a container wants a proxy. Raises UnusableLabel if its label says neither."""
-    if ENABLE in container.labels:
-        return values.boolean(ENABLE, container.labels[ENABLE])
-    return settings.expose_by_default and bool(_own(container) or container.master_uri)
+def _wants_proxy(container: Container, settings: PlanSettings) -> bool:
+    enabled = values.enabled(container.labels)
+    if enabled is None:
+        return settings.expose_by_default and bool(_own(container) or container.master_uri)
+    return enabled
 
 
 def _own(container: Container) -> list[str]:
@@ -175,41 +141,26 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
         return
     for name in own:
         if name not in LABELS:
-            yield f"label {name} is unknown and ignored; {_nearest(name)}"
+            near = _near(name, 0.75)
+            fix = f"did you mean {near[0]}?" if near else f"there are {', '.join(LABELS)}"
+            yield f"label {name} is unknown and ignored; {fix}"
     if own and ENABLE not in container.labels and not settings.expose_by_default:
         yield f"{listed(f'label {name}' for name in own)} ignored: add the label {ENABLE}=true"
-
-
-def _nearest(name: str) -> str:
-    near = _near(name, 0.75)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(LABELS)}"
 
 
 def _near(name: str, cutoff: float) -> list[str]:
     return difflib.get_close_matches(name.lower(), LABELS, n=1, cutoff=cutoff)
 
 
-def _advertise_host(container: Container, settings: PlanSettings) -> str:
-    """What the label says, else the option; empty without both. Raises UnusableLabel."""
-    label, option = container.labels.get(ADVERTISE_HOST), settings.advertise_host
-    if label is not None:
-        return values.host(f"label {ADVERTISE_HOST}={values.quoted(label)}", label)
-    source = f"the operator's --advertise-host {values.quoted(option)}"
-    return values.host(source, option) if option else ""
-
-
-def _advertised(container: Container, uri: str, observed: HostState) -> str:
+def _advertised(request: Member, observed: HostState) -> str:
     """This host's address towards a master, else what a proxy for it advertises already.
 
     A name that can't be resolved for a moment must not take a proxy away.
     """
-    towards = observed.advertise.get(master(Key(uri, "")).host)
-    there = [sandbox for sandbox in observed.sandboxes if sandbox.key.master_uri == uri]
+    towards = observed.advertise.get(master(request.key).host, "")
+    uri, networks = request.key.master_uri, request.container.networks
+    there = [box for box in observed.sandboxes if box.key.master_uri == uri]
     if towards or not there:
-        return towards or ""
-
-    def rank(key: Key) -> tuple[bool, Key]:
-        joined = {n for s in there if s.key == key for n in s.container.networks}
-        return not joined & container.networks, key
-
-    return min({sandbox.key for sandbox in there}, key=rank).advertise_host
+        return towards
+    near = {box.key for box in there if box.container.networks & networks}
+    return min(near or {box.key for box in there}).advertise_host

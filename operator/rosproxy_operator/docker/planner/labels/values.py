@@ -1,12 +1,25 @@
-"""The values of users' labels."""
+"""What each of a container's labels says, and which master it means.
+
+Each function that reads a label raises UnusableLabel for a value that can't be.
+"""
 
 import re
+from collections.abc import Collection, Mapping
 from typing import get_args
+from urllib.parse import urlsplit
 
-from rosproxy.net.addresses import is_address, is_loopback
+from rosproxy.net.addresses import HostPort, is_address, is_loopback
+from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.docker.planner.model import MOST_PORTS
+from rosproxy_operator.docker.planner.model import (
+    MOST_PORTS,
+    Container,
+    HostState,
+    Key,
+    PlanSettings,
+)
+from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
 
 ENABLE = "rosproxy.enable"
 MASTER_URI = "rosproxy.master-uri"
@@ -16,7 +29,15 @@ NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
 LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE)
 
+ALIAS = "rosproxy"
+"""The name under which every proxy is found on the networks of its containers."""
+BUILT_IN = frozenset({"bridge", "host", "none"})
+"""Networks that every engine has. No names resolve on them, so no proxy can be found there."""
+_SHARED = "container:"
+_PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
+
+Labels = Mapping[str, str]
 
 
 class UnusableLabel(Exception):
@@ -28,42 +49,69 @@ def quoted(value: str) -> str:
     return repr(bounded(value, 80))
 
 
-def boolean(label: str, value: str) -> bool:
-    """``true`` or ``false``. Raises UnusableLabel."""
-    word = value.strip().lower()
+def named(label: str, labels: Labels) -> str:
+    """A label that is there, and what it says, as users are told of it."""
+    return f"label {label}={quoted(labels[label])}"
+
+
+def enabled(labels: Labels) -> bool | None:
+    """Whether a container wants a proxy; None if it does not say."""
+    if ENABLE not in labels:
+        return None
+    word = labels[ENABLE].strip().lower()
     if word not in ("true", "false"):
-        raise UnusableLabel(
-            f"label {label}={quoted(value)} is neither true nor false: write {label}=true"
-        )
+        text = f"{named(ENABLE, labels)} is neither true nor false: write {ENABLE}=true"
+        raise UnusableLabel(text)
     return word == "true"
 
 
-def count(label: str, value: str) -> int:
-    """A number of ports. Raises UnusableLabel."""
-    word = value.strip()
+def ports(labels: Labels) -> int:
+    """How many ports the proxy is to have at least, or 0."""
+    if PORTS not in labels:
+        return 0
+    word = labels[PORTS].strip()
     if not re.fullmatch(r"[0-9]{1,6}", word) or not 1 <= int(word) <= MOST_PORTS:
         raise UnusableLabel(
-            f"label {label}={quoted(value)} is not a number from 1 to {MOST_PORTS}: give how many "
-            f"ports the whole proxy is to have, one for each node, e.g. {label}=32"
+            f"{named(PORTS, labels)} is not a number from 1 to {MOST_PORTS}: give how many "
+            f"ports the whole proxy is to have, one for each node, e.g. {PORTS}=32"
         )
     return int(word)
 
 
-def data_plane(label: str, value: str) -> DataPlane:
-    """One of the proxy's data planes. Raises UnusableLabel."""
+def data_plane(labels: Labels) -> DataPlane | None:
+    """One of the proxy's data planes, or None."""
+    if DATA_PLANE not in labels:
+        return None
     planes: tuple[DataPlane, ...] = get_args(DataPlane)
-    word = value.strip().lower()
     for plane in planes:
-        if word == plane:
+        if labels[DATA_PLANE].strip().lower() == plane:
             return plane
     raise UnusableLabel(
-        f"label {label}={quoted(value)} is none of {', '.join(planes)}: write {label}=kernel for a "
-        "proxy that lets the kernel forward, or leave it out"
+        f"{named(DATA_PLANE, labels)} is none of {', '.join(planes)}: write {DATA_PLANE}=kernel "
+        "for a proxy that lets the kernel forward, or leave it out"
     )
 
 
-def host(source: str, value: str) -> str:
-    """A host's name in lower case, or its address. Raises UnusableLabel, which names ``source``."""
+def advertise_host(labels: Labels, settings: PlanSettings) -> str:
+    """This host's name in lower case, or its address: the label's, else the option's, or empty."""
+    if ADVERTISE_HOST in labels:
+        return _host(named(ADVERTISE_HOST, labels), labels[ADVERTISE_HOST])
+    option = settings.advertise_host
+    return _host(f"the operator's --advertise-host {quoted(option)}", option) if option else ""
+
+
+def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
+    """The container's user-defined networks but the uplink, or the one that its label names."""
+    owner = _owner(container, observed)
+    own = (owner.networks or _soon(owner, observed)) - BUILT_IN - {uplink}
+    if NETWORK in container.labels:
+        return frozenset({_named_network(container.labels, own)})
+    if not own:
+        raise UnusableLabel(_why_none(owner))
+    return own
+
+
+def _host(source: str, value: str) -> str:
     bare = value.strip().removeprefix("[").removesuffix("]").lower()
     if not is_address(bare) and not _HOST.fullmatch(bare):
         raise UnusableLabel(
@@ -76,3 +124,131 @@ def host(source: str, value: str) -> str:
             "others reach this host"
         )
     return bare
+
+
+def _soon(container: Container, observed: HostState) -> frozenset[str]:
+    """The network of a container that the engine is just creating, and lists without any."""
+    if container.state != "created":
+        return frozenset()
+    mode = container.network_mode
+    return frozenset(one.name for one in observed.networks if mode in (one.name, one.id))
+
+
+def _named_network(labels: Labels, own: frozenset[str]) -> str:
+    """The network that the label means; compose puts its project's name in front."""
+    label = labels[NETWORK]
+    for name in (label, f"{labels.get('com.docker.compose.project')}_{label}"):
+        if name in own:
+            return name
+    there = ", ".join(sorted(own)) or "none that is user-defined"
+    raise UnusableLabel(
+        f"{named(NETWORK, labels)} names no network of the container; it has: {there}"
+    )
+
+
+def _owner(container: Container, observed: HostState) -> Container:
+    """The container whose networks it has: itself, or the one that it shares them with."""
+    met = {container.id}
+    while container.network_mode.startswith(_SHARED):
+        wanted = container.network_mode.removeprefix(_SHARED)
+        found = next((one for one in observed.containers if wanted in (one.id, one.name)), None)
+        if found is None or found.id in met:
+            raise UnusableLabel(
+                f"shares the network of a container ({quoted(wanted)}) that is not there: start "
+                "that one, then create this one anew"
+            )
+        met.add(found.id)
+        container = found
+    return container
+
+
+def _why_none(owner: Container) -> str:
+    fix = "attach it to a user-defined network: docker network create ros; docker run --network ros"
+    if "host" in (*owner.networks, owner.network_mode):
+        return (
+            f"is on the host's own network, where its nodes need no proxy: {fix}, or take its "
+            "labels off"
+        )
+    if "bridge" in owner.networks or owner.network_mode in ("bridge", "default"):
+        return f"is only on the default bridge network, where no names resolve: {fix}"
+    return f"is on no network: {fix}"
+
+
+def master_uri(container: Container, settings: PlanSettings, proxies: Collection[str]) -> str:
+    """The URI of the real master: from the label, else the environment, else the settings.
+
+    ``proxies`` are names of the operator's own containers. Raises UnusableLabel if there is none
+    or it can't be one.
+    """
+    if MASTER_URI in container.labels:
+        source = named(MASTER_URI, container.labels)
+        return _parse_master(source, container.labels[MASTER_URI], proxies)
+    where = parse_slave_uri(container.master_uri)
+    if container.master_uri and not (where and _names_proxy(where.host.lower(), proxies)):
+        source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+        return _parse_master(source, container.master_uri, proxies)
+    if settings.master_uri:
+        source = f"the operator's --master-uri {quoted(settings.master_uri)}"
+        return _parse_master(source, settings.master_uri, proxies)
+    raise UnusableLabel(
+        f"no master is known: add the label {MASTER_URI}=http://HOST:11311 with the real master, "
+        "or start the operator with --master-uri"
+    )
+
+
+def looks_for(container: Container, key: Key) -> tuple[str, str]:
+    """The name by which a container's nodes look for their proxy, and what is wrong with it.
+
+    The name is empty if no alias can help. The second text is empty if nothing is wrong.
+    """
+    if not container.master_uri:
+        return ALIAS, ""
+    where = parse_slave_uri(container.master_uri)
+    variable = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
+    right = master(key)
+    fix = f"set ROS_MASTER_URI=http://{ALIAS}:{right.port}"
+    if where is None:
+        return "", f"{variable} is not of the form http://HOST:11311: {fix}"
+    host = where.host.lower()
+    if not is_address(host) and host in (ALIAS, right.host, proxy_name(key)):
+        if where.port == right.port:
+            return host, ""
+        return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
+    return "", f"{variable} {_wrong_master(host, key, fix)}"
+
+
+def _wrong_master(host: str, key: Key, fix: str) -> str:
+    if is_proxy_name(host):
+        return f"names another master's proxy, its own is {proxy_name(key)}: {fix}"
+    if is_loopback(host):
+        return f"is the container itself: {fix}"
+    if is_address(host):
+        return (
+            "is an address, so its nodes go around the proxy and can't be reached from outside: "
+            f"{fix}, or use the name of the master's host"
+        )
+    return f"is not its master {key.master_uri}, so its nodes go elsewhere: {fix}"
+
+
+def _names_proxy(host: str, proxies: Collection[str]) -> bool:
+    return host == ALIAS or host in proxies or is_proxy_name(host)
+
+
+def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:
+    """A master's URI in its one form: host in lower case, no slash at the end."""
+    where = parse_slave_uri(uri.strip())
+    path = urlsplit(uri.strip()).path.rstrip("/") if where else ""
+    if where is None or not where.host.isascii() or not _PATH.fullmatch(path):
+        raise UnusableLabel(f"{source} is not of the form http://HOST:11311")
+    host = where.host.lower()
+    if is_loopback(host):
+        raise UnusableLabel(
+            f"{source} is the container itself, where no master runs: give the name of the "
+            f"master's host, or set ROS_MASTER_URI=http://{ALIAS}:{where.port} and the label "
+            f"{MASTER_URI}"
+        )
+    if _names_proxy(host, proxies):
+        raise UnusableLabel(
+            f"{source} names a proxy: give the real master, e.g. {MASTER_URI}=http://robot:11311"
+        )
+    return slave_uri(HostPort(host, where.port), path)
