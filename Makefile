@@ -17,7 +17,7 @@ OPERATOR_IMAGE := $(REGISTRY:%=%/)rosproxy-operator
 LAYERS ?=
 # Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
 BENCH ?=
-SOURCES := proxy operator tests scripts
+SOURCES := proxy operator examples tests scripts
 
 $(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
 	@scripts/venv.sh $(VENV)
@@ -37,7 +37,7 @@ help: ## list the targets
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
-	@$(BIN)/python -m rosproxy.demo
+	@$(BIN)/python -m examples.demo
 
 .PHONY: test
 test: $(VENV)/.dev ## unit and integration tests; and a smoke test with real ROS and Docker, which it installs, as root on Debian or Ubuntu

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rosproxy.demo.proxy_process import clean_environment
+from examples.demo.proxy_process import clean_environment
 from tests.ros.processes import Process, descendants, stop_all
 from tests.ros.topology import Place
 

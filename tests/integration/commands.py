@@ -4,7 +4,7 @@ import asyncio
 import sys
 from dataclasses import dataclass
 
-from rosproxy.demo.proxy_process import clean_environment
+from examples.demo.proxy_process import clean_environment
 from tests.integration.proxy import Proxy
 
 

@@ -10,9 +10,9 @@ import pytest
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web import RequestPayloadError
 
-from rosproxy.demo import fake_http
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo import fake_http
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from tests.integration.net import MASTER, NODE
 from tests.integration.process import Process
 from tests.integration.proxy import Proxy, settings_for

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
-from rosproxy.demo.fake_http import Where, call, where
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import Header
+from examples.demo.fake_http import Where, call, where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import Header
 from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 
 MASTER = "127.0.1.1"

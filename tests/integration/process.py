@@ -9,8 +9,8 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from rosproxy.demo.fake_http import Where
-from rosproxy.demo.proxy_process import clean_environment
+from examples.demo.fake_http import Where
+from examples.demo.proxy_process import clean_environment
 from tests.integration.net import PROXY
 from tests.integration.proxy import options_for
 

@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from examples.demo.fake_http import Where, free_ports, where
+from examples.demo.fake_node import FakeNode
 from rosproxy.app import App
-from rosproxy.demo.fake_http import Where, free_ports, where
-from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings
 from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until

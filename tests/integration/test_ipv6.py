@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     HOST,

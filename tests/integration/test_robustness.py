@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import Where
+from examples.demo.fake_http import Where
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS

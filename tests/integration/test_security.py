@@ -5,7 +5,7 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, ok, value
+from examples.demo.fake_http import Answer, FakeHttpServer, FakeRequest, ok, value
 from tests.integration.net import (
     HOST,
     NODE,

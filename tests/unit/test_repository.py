@@ -10,7 +10,9 @@ import click
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted(path for root in ("proxy", "operator") for path in (ROOT / root).rglob("*.py"))
+SOURCES = sorted(
+    path for root in ("proxy", "operator", "examples") for path in (ROOT / root).rglob("*.py")
+)
 REFERENCE = ROOT / "docs/reference"
 MADE = {".venv", "build", "node_modules"}
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not MADE & set(page.relative_to(ROOT).parts))

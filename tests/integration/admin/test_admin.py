@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from rosproxy.demo.fake_http import End
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import End
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from rosproxy.telemetry.metrics import MOST_NAMES, Traffic
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (

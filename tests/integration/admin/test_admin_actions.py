@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from rosproxy.demo.fake_http import End, free_ports
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import End, free_ports
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.commands import admin_url, run

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import End, Where, where
-from rosproxy.demo.proxy_process import clean_environment
+from examples.demo.fake_http import End, Where, where
+from examples.demo.proxy_process import clean_environment
 from rosproxy.settings import SettingError
 from tests.integration.net import (
     HOST,

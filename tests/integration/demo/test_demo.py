@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from rosproxy.demo.fake_http import value
-from rosproxy.demo.players import Listener, Player, Talker
-from rosproxy.demo.proxy_process import ProxyProcess
-from rosproxy.demo.scenario import NAMES_ONLY, Scenario, count
-from rosproxy.demo.screen import frame, print_summary, show
+from examples.demo.fake_http import value
+from examples.demo.players import Listener, Player, Talker
+from examples.demo.proxy_process import ProxyProcess
+from examples.demo.scenario import NAMES_ONLY, Scenario, count
+from examples.demo.screen import frame, print_summary, show
 
-DEMO = [sys.executable, "-m", "rosproxy.demo", "--seconds", "4"]
+DEMO = [sys.executable, "-m", "examples.demo", "--seconds", "4"]
 
 
 def finish(timeout, *options):
@@ -65,7 +65,7 @@ async def test_a_proxy_that_comes_back_as_another_is_noticed(monkeypatch):
 
     async def start_elsewhere(self):
         if self.state == "killed":
-            monkeypatch.setattr("rosproxy.demo.scenario.PATIENCE", 2.0)
+            monkeypatch.setattr("examples.demo.scenario.PATIENCE", 2.0)
             self.options = ["--bind=127.0.2.1", *self.options]
         return await start(self)
 
@@ -80,7 +80,7 @@ async def test_what_did_not_work_is_named(monkeypatch):
         return 6
 
     monkeypatch.setattr(Player, "add", add_wrongly)
-    monkeypatch.setattr("rosproxy.demo.scenario.RECOVERY_SECONDS", -1.0)
+    monkeypatch.setattr("examples.demo.scenario.RECOVERY_SECONDS", -1.0)
     scenario = Scenario(4, NAMES_ONLY)
     scenario.talker.answers["getPid"] = value([1, "", 7])
     await scenario.play()

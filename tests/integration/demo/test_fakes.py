@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from rosproxy.demo.players import Listener, Refused, Talker
+from examples.demo.players import Listener, Refused, Talker
 from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, rpc, until
 
 TYPE = "std_msgs/String"

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode, Header
 from rosproxy.admin.client import AdminClient
-from rosproxy.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports, ok, value
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode, Header
 from rosproxy.doctor.collect import DoctorOptions, collect
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import diagnose

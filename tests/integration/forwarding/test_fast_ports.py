@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import Where
+from examples.demo.fake_http import Where
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
 from rosproxy.forwarding.kernel import syncer

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from typing import Any
 
-from rosproxy.demo.fake_http import Where, value, where
+from examples.demo.fake_http import Where, value, where
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import OUTSIDE, connect, exchange, post, read_header, topic_header, until
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import free_ports, where
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import free_ports, where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.clients.master import MasterClient, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind
 from tests.integration.admin_calls import news, post

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import End, Where, ok, value, where
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import End, Where, ok, value, where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from tests.integration.admin.test_admin import metrics
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (

@@ -5,8 +5,8 @@ import socket
 
 import pytest
 
-from rosproxy.demo.fake_http import End, free_ports, ok, value
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import End, free_ports, ok, value
+from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.net import (
     HOST,

@@ -4,7 +4,7 @@ import asyncio
 import os
 from time import monotonic
 
-from rosproxy.demo.fake_http import End
+from examples.demo.fake_http import End
 from rosproxy.ros1.context import Context
 from tests.integration.net import (
     HOST,

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
+from examples.demo.fake_http import where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from rosproxy.admin.client import AdminClient
-from rosproxy.demo.fake_http import where
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
 from rosproxy.doctor.collect import DoctorOptions, collect
 from rosproxy.doctor.facts import Reach
 from tests.integration.admin_calls import post, tell

@@ -6,7 +6,7 @@ from contextlib import AsyncExitStack
 
 import pytest
 
-from rosproxy.demo.fake_http import End, free_ports, value
+from examples.demo.fake_http import End, free_ports, value
 from tests.integration.net import NODE, OUTSIDE, connect, post, refuses, rpc, until, xml
 
 ODD = [5, "x", [], ["ab", "cd", "ef"], [[["/t", [5]]], [], []], [["/t"], [], []], {"a": 1}]

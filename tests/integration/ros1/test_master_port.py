@@ -5,7 +5,7 @@ import xmlrpc.client
 
 import pytest
 
-from rosproxy.demo.fake_http import End, ok
+from examples.demo.fake_http import End, ok
 from tests.integration.net import (
     HOST,
     NODE,

@@ -5,8 +5,8 @@ from ipaddress import ip_network
 
 import pytest
 
-from rosproxy.demo.fake_http import value
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import value
+from examples.demo.fake_node import FakeNode
 from tests.integration.net import (
     HOST,
     NODE,

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import where
-from rosproxy.demo.fake_node import FakeNode
+from examples.demo.fake_http import where
+from examples.demo.fake_node import FakeNode
 from tests.integration.net import looks, refuses, until
 from tests.integration.proxy import Proxy
 

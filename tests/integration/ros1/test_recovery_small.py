@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from rosproxy.demo.fake_http import where
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
-from rosproxy.demo.players import Adder, Listener, Talker
+from examples.demo.fake_http import where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
+from examples.demo.players import Adder, Listener, Talker
 from tests.integration.net import (
     HOST,
     NODE,

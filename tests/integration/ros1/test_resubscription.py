@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from examples.demo.fake_http import End
+from examples.demo.fake_http import value as answer
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
 from rosproxy import app
-from rosproxy.demo.fake_http import End
-from rosproxy.demo.fake_http import value as answer
-from rosproxy.demo.fake_master import FakeMaster
-from rosproxy.demo.fake_node import FakeNode
 from rosproxy.ros1.upkeep import resubscriber
 from tests.integration.net import (
     OTHER_NODE,

@@ -1,4 +1,4 @@
-"""`python -m rosproxy.demo`: play the demonstration and say whether it worked."""
+"""`python -m examples.demo`: play the demonstration and say whether it worked."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from dataclasses import asdict
 import click
 from rich.console import Console
 
-from rosproxy.demo.scenario import Scenario
-from rosproxy.demo.screen import print_summary, show
+from examples.demo.scenario import Scenario
+from examples.demo.screen import print_summary, show
 
 INTERRUPTED = 130
 

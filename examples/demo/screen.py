@@ -11,8 +11,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from rosproxy.demo.players import Actor, Adder, Listener, Talker
-from rosproxy.demo.scenario import Scenario
+from examples.demo.players import Actor, Adder, Listener, Talker
+from examples.demo.scenario import Scenario
 
 EVENTS_SHOWN = 8
 

@@ -14,9 +14,9 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from rosproxy.demo.fake_http import Streams, Where, connect, where
-from rosproxy.demo.fake_master import CALL_ERRORS
-from rosproxy.demo.fake_node import STRING, FakeNode, Header, read_header
+from examples.demo.fake_http import Streams, Where, connect, where
+from examples.demo.fake_master import CALL_ERRORS
+from examples.demo.fake_node import STRING, FakeNode, Header, read_header
 from rosproxy.ros1.protocol.tcpros import encode_header
 
 RATE = 20

@@ -17,10 +17,10 @@ from ipaddress import ip_address, ip_network
 from time import monotonic
 from typing import Any
 
-from rosproxy.demo.fake_http import free_ports, is_free, where
-from rosproxy.demo.fake_master import CALL_ERRORS, FakeMaster
-from rosproxy.demo.players import Actor, Adder, Listener, Talker, in_words
-from rosproxy.demo.proxy_process import DemoError, ProxyProcess
+from examples.demo.fake_http import free_ports, is_free, where
+from examples.demo.fake_master import CALL_ERRORS, FakeMaster
+from examples.demo.players import Actor, Adder, Listener, Talker, in_words
+from examples.demo.proxy_process import DemoError, ProxyProcess
 
 PATIENCE = 30.0
 """Seconds that anything may take, so that what is slow can be told from what never comes."""

@@ -15,7 +15,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from rosproxy.demo.fake_http import (
+from examples.demo.fake_http import (
     Answer,
     End,
     FakeHttpServer,

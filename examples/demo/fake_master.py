@@ -21,7 +21,7 @@ from functools import partial
 from typing import Any
 from xmlrpc.client import Fault
 
-from rosproxy.demo.fake_http import Answer, FakeHttpServer, FakeRequest, authority, call, value
+from examples.demo.fake_http import Answer, FakeHttpServer, FakeRequest, authority, call, value
 
 Triple = tuple[int, str, Any]
 Provider = tuple[str, str]
