@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
-from rosproxy.admin.requests import read_master_address, read_news, read_nothing
+from rosproxy.admin.requests import ContainerNews, MasterAddress, Nothing, read
 from rosproxy.admin.server import AdminServer
 from rosproxy.admin.state_metrics import StateCollector
 from rosproxy.admin.status import describe
@@ -82,7 +82,17 @@ class App:
         leases.server = slave = SlaveApi(context, leases, self.alias, self._adopter, self.tcpros)
         self._servers = [slave.server]
         self._acceptors: list[Acceptor] = []
-        self._admin = self._make_admin()
+        self._containers = ContainerEvents(
+            context, leases, registrar, self._adopter, self._recovery, self.tcpros, plane
+        )
+        actions = {
+            "/probe": self._probe,
+            "/containers": self._handle_news,
+            "/master-address": self._set_master_address,
+            "/retire": self._retire,
+        }
+        metrics, token = context.metrics.registry, settings.admin_token
+        self._admin = AdminServer(metrics, self.status, self._unready, actions, token)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""
@@ -139,25 +149,6 @@ class App:
         monitor = self.master_monitor
         return to_json(describe(self.context, monitor, self.tcpros, self.alias, self.plane))
 
-    def _make_admin(self) -> AdminServer:
-        self._containers = ContainerEvents(
-            self.context,
-            self.leases,
-            self.registrar,
-            self._adopter,
-            self._recovery,
-            self.tcpros,
-            self.plane,
-        )
-        actions = {
-            "/probe": self._probe,
-            "/containers": self._handle_news,
-            "/master-address": self._set_master_address,
-            "/retire": self._retire,
-        }
-        metrics, token = self.context.metrics.registry, self.settings.admin_token
-        return AdminServer(metrics, self.status, self._unready, actions, token)
-
     def _unready(self) -> str | None:
         if self.context.retired:
             return "retired: nothing is registered any more"
@@ -170,18 +161,18 @@ class App:
 
     async def _handle_news(self, body: Any) -> dict[str, Any]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted."""
-        news = read_news(body)
+        news = read(body, ContainerNews)
         arrived = [(one.address, one.names) for one in news.arrived]
         return {**await self._containers.handle(news.gone, news.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many nodes were unregistered."""
-        read_nothing(body)
+        read(body, Nothing)
         return {"unregistered": await self._containers.retire()}
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""
-        address, upstream = read_master_address(body), self.context.upstream
+        address, upstream = read(body, MasterAddress).address, self.context.upstream
         if address != upstream.master_address:
             log.info("master %s is looked for at %s", self.settings.master_uri, address)
             upstream.master_address = address

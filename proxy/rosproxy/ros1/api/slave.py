@@ -33,11 +33,7 @@ REGISTRATION_GRACE = 0.5
 
 
 class SlaveApi:
-    """Answers at the ports of nodes inside, each of which stands for all of its node.
-
-    Slave API calls are forwarded to the node behind the port at which they arrive; its topics and
-    services, which speak TCPROS, are left to ``tcpros``.
-    """
+    """Answers at the ports of nodes inside; TCPROS, for topics and services, by ``tcpros``."""
 
     def __init__(
         self,
@@ -123,8 +119,8 @@ class SlaveApi:
         reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
         said = slave_api.topic_port(parsed, reply)
         if said is not None:
-            endpoint.note_tcpros_port(said.port, said.topic)
-            port = await self._leases.fast_port(endpoint, said.port) or endpoint.port
+            endpoint.note_tcpros_port(said, parsed.string(1) or "")
+            port = await self._leases.fast_port(endpoint, said) or endpoint.port
             visit = self._visit(endpoint, call, port)
         return slave_api.export_reply(parsed, reply, visit, addressing)
 

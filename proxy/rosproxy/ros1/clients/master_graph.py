@@ -1,7 +1,7 @@
 """Reading the ROS graph from the master."""
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 
 import msgspec
 
@@ -24,14 +24,7 @@ async def read_registrations(upstream: MasterClient) -> dict[str, list[Registrat
 async def read_graph(upstream: MasterClient) -> Graph:
     """What each node has registered, and where it is. Raises Unreachable, MasterError."""
     held = await read_registrations(upstream)
-    return await locate(upstream, held, held)
-
-
-async def locate(
-    upstream: MasterClient, held: Mapping[str, Sequence[Registration]], nodes: Iterable[str]
-) -> Graph:
-    """What nodes have registered, with where some of them are. Raises Unreachable."""
-    return Graph(held, await look_up_nodes(upstream, nodes))
+    return Graph(held, await look_up_nodes(upstream, held))
 
 
 async def look_up_nodes(upstream: MasterClient, nodes: Iterable[str]) -> dict[str, str]:

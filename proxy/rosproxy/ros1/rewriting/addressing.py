@@ -95,10 +95,6 @@ class Addressing:
         endpoint = self.stands_for(uri)
         return self._import(endpoint, asker) if endpoint else uri
 
-    def import_slaves(self, uris: Sequence[str], asker: Asker) -> list[str]:
-        """The same for a list; it keeps order and length."""
-        return [self.import_slave(uri, asker) for uri in uris]
-
     def import_service(self, uri: str, service: str, asker: Asker) -> str:
         """The form of a service URI from outside that an inside node can use."""
         endpoint = self._endpoint_at(parse_service_uri(uri))

@@ -21,14 +21,6 @@ _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
 @dataclass(frozen=True, slots=True)
-class TopicPort:
-    """The TCPROS port on which a node serves a topic, as it told a subscriber."""
-
-    topic: str
-    port: int
-
-
-@dataclass(frozen=True, slots=True)
 class Visit:
     """A call at an endpoint.
 
@@ -97,11 +89,11 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
     )
 
 
-def topic_port(call: Call, reply: bytes) -> TopicPort | None:
-    """The port that a reply to ``requestTopic`` names, if it is one for TCPROS."""
-    triple, topic = ros_triple(xmlrpc.parse_reply(reply)), call.string(1)
+def topic_port(call: Call, reply: bytes) -> int | None:
+    """The port that a reply to ``requestTopic`` names for a topic, if it is one for TCPROS."""
+    triple = ros_triple(xmlrpc.parse_reply(reply))
     said = tcpros_address(triple) if triple else None
-    return TopicPort(topic, said.port) if topic and said else None
+    return said.port if said and call.string(1) else None
 
 
 def ros_triple(value: Value | None) -> Value | None:

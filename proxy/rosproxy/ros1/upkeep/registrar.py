@@ -186,8 +186,8 @@ class Registrar:
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
         """The same for an endpoint's node, with URIs that it can use."""
-        asker = self._context.node_asker(endpoint)
-        imported = self._context.addressing.import_slaves(publishers, asker)
+        asker, addressing = self._context.node_asker(endpoint), self._context.addressing
+        imported = [addressing.import_slave(uri, asker) for uri in publishers]
         await self._alias.listen_for(publishers)
         return await self._update(endpoint.slave, topic, imported)
 

@@ -184,7 +184,7 @@ def test_two_containers_with_the_same_uri_each_mean_their_own(
 ) -> None:
     addressing, one, other = two_with_the_same_uri()
     who = make_asker(asker)
-    assert addressing.import_slaves([one, other], who) == [first, second]
+    assert [addressing.import_slave(uri, who) for uri in (one, other)] == [first, second]
     assert [addressing.export_slave(uri, who) for uri in (first, second)] == [one, other]
 
 

@@ -117,11 +117,11 @@ def test_a_uri_comes_back_as_it_was_after_its_node_has_gone(
     addressing, endpoints = topology
     given, back = data.draw(askers(addressing))
     outside = [addressing.advertised_uri(endpoint) for endpoint in endpoints]
-    inside = addressing.import_slaves(outside, given)
+    inside = [addressing.import_slave(uri, given) for uri in outside]
     for endpoint in data.draw(st.lists(st.sampled_from(endpoints), unique_by=id)):
         addressing.registry.remove(endpoint)
     assert [addressing.export_slave(uri, back) for uri in inside] == outside
-    again = addressing.import_slaves(outside, back)
+    again = [addressing.import_slave(uri, back) for uri in outside]
     assert [addressing.export_slave(uri, back) for uri in again] == outside
 
 
