@@ -160,13 +160,11 @@ class App:
         return to_json(await probe_range(self.context, self.leases))
 
     async def _handle_news(self, body: Any) -> dict[str, Any]:
-        """``POST /containers``: how many nodes were unregistered, moved and adopted."""
         news = read(body, ContainerNews)
         arrived = [(one.address, one.names) for one in news.arrived]
         return {**await self._containers.handle(news.gone, news.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
-        """``POST /retire``: how many nodes were unregistered."""
         read(body, Nothing)
         return {"unregistered": await self._containers.retire()}
 

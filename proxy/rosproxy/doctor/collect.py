@@ -35,7 +35,6 @@ from rosproxy.doctor.rules.pair import connected
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
-from rosproxy.ros1.clients.master_graph import look_up_nodes, look_up_services
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.telemetry.metrics import Metrics
@@ -151,13 +150,13 @@ class _Collector:
         """What the master knows, and who of it answers. Raises Unreachable, MasterError."""
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
-        uris = await look_up_nodes(self._master, names)
+        uris = await self._master.look_up("lookupNode", names)
         nodes = {name: NodeFacts(name, uris.get(name, "")) for name in names}
         facts = replace(
             facts,
             graph=graph,
             clock=await self._simulated_time(),
-            service_uris=await look_up_services(self._master, graph.services),
+            service_uris=await self._master.look_up("lookupService", graph.services),
         )
         tried = facts.scope.nodes if facts.names else names
         nodes |= await _gather(tried, lambda name: self._try_node(facts, nodes[name]))

@@ -24,11 +24,7 @@ from rosproxy.ros1.upkeep.recovery import Recovery
 
 
 class MasterApi:
-    """Forwards master API calls, rewritten, and keeps the registry in step with the master.
-
-    Calls that register wait for the ``recovery``: a node that registered before would get
-    another port, and the master would shut it down for having moved.
-    """
+    """Forwards master API calls, rewritten, and keeps the registry in step with the master."""
 
     def __init__(
         self,

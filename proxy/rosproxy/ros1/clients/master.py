@@ -2,21 +2,25 @@
 
 ``post_to_…`` sends a document as it is and gives the reply's bytes: that is how calls of nodes are
 forwarded. ``call_…`` makes a call of the proxy's own and gives the value of the ROS triple
-``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once.
+``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once. ``read_graph``
+and ``look_up`` ask it for the ROS graph.
 """
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
 import aiohttp
+import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.net.http_client import HttpClient
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import Graph, read_state
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.telemetry.metrics import Metrics
 
@@ -130,6 +134,31 @@ class MasterClient:
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_result_of(result) for result in results]
         return values
+
+    async def read_registrations(self) -> dict[str, list[Registration]]:
+        """What each node has registered. Raises Unreachable, MasterError."""
+        state, types = await asyncio.gather(
+            self.call_master("getSystemState"), self.call_master("getTopicTypes")
+        )
+        try:
+            return read_state(state, types)
+        except msgspec.ValidationError as error:
+            raise MasterError(f"getSystemState: {error}") from None
+
+    async def read_graph(self) -> Graph:
+        """What each node has registered, and where it is. Raises Unreachable, MasterError."""
+        held = await self.read_registrations()
+        return Graph(held, await self.look_up("lookupNode", held))
+
+    async def look_up(self, method: str, names: Iterable[str]) -> dict[str, str]:
+        """The URIs of those nodes (``lookupNode``) or services (``lookupService``) that it knows.
+
+        Raises Unreachable.
+        """
+        wanted = sorted(names)
+        uris = await self.multicall([(method, [CALLER_ID, name]) for name in wanted])
+        found = zip(wanted, uris, strict=True)
+        return {name: uri for name, uri in found if isinstance(uri, str)}
 
     async def post_to_node(
         self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"

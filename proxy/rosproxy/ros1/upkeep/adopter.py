@@ -15,7 +15,6 @@ from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.master_graph import look_up_nodes, read_graph
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
@@ -66,7 +65,7 @@ class Adopter:
         if not inside:
             return 0
         async with self._one_at_a_time:
-            graph = await read_graph(context.upstream)
+            graph = await context.upstream.read_graph()
             nodes = policy.find_direct(graph, inside, context.addressing)
             infos = await self._inspect({place for node in nodes for place in node.places})
             topics = {place: info.topics for place, info in infos.items()}
@@ -83,7 +82,8 @@ class Adopter:
         if caller_id in endpoint.caller_ids and not endpoint.direct:
             return
         uri = await self._look_up(caller_id)
-        if uri and uri != self._advertised(endpoint) and known_as(endpoint, uri):
+        advertised = self._context.addressing.advertised_uri(endpoint)
+        if uri and uri != advertised and known_as(endpoint, uri):
             log.info("%s was registered as %s around the proxy; taken over", caller_id, uri)
             try:
                 async with self._one_at_a_time:
@@ -104,7 +104,7 @@ class Adopter:
                 uri = await self._look_up(name)
         except (TimeoutError, Unreachable):
             return False
-        advertised = self._advertised(endpoint)
+        advertised = self._context.addressing.advertised_uri(endpoint)
         if not policy.has_name_still(endpoint, uri, advertised):
             return False
         log.info("%s registered around the proxy; not shut down", name)
@@ -150,7 +150,8 @@ class Adopter:
                 endpoint.release()
         adopted = {name: e for name, (e, _) in former.items() if name in e.caller_ids}
         for name, endpoint in adopted.items():
-            log.info("%s adopted: %s", name, self._advertised(endpoint))
+            uri = self._context.addressing.advertised_uri(endpoint)
+            log.info("%s adopted: %s", name, uri)
         return len(adopted)
 
     async def _make_endpoint(
@@ -187,7 +188,5 @@ class Adopter:
         self._context.problems.add(name, why)
 
     async def _look_up(self, caller_id: str) -> str | None:
-        return (await look_up_nodes(self._context.upstream, [caller_id])).get(caller_id)
-
-    def _advertised(self, endpoint: Endpoint) -> str:
-        return self._context.addressing.advertised_uri(endpoint)
+        known = await self._context.upstream.look_up("lookupNode", [caller_id])
+        return known.get(caller_id)

@@ -57,9 +57,8 @@ class ContainerEvents:
     ) -> dict[str, int]:
         """``POST /containers``: how many nodes were unregistered, moved and adopted.
 
-        ``gone``: addresses that no container has any more; ``moved``: old address to new address;
-        ``arrived``: containers that may have nodes. All of it is safe to be told again.
-        Raises Unreachable, MasterError, once all has been tried.
+        ``moved``: old address to new address. All of it is safe to be told again. Raises
+        Unreachable, MasterError, once all has been tried.
         """
         steps = {
             "moved": partial(self._move, moved),

@@ -22,7 +22,6 @@ from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.master_graph import read_graph
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.upkeep.policy import recovery as policy
@@ -102,7 +101,7 @@ class Recovery:
 
     async def _recover(self) -> None:
         self._context.refresh_networks()
-        graph = await read_graph(self._context.upstream)
+        graph = await self._context.upstream.read_graph()
         claims = await self._settle(policy.claims(graph, self._context.addressing))
         endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
         self._plane.recovered(endpoints)

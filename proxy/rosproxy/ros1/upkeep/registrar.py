@@ -15,7 +15,6 @@ from dataclasses import replace
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
-from rosproxy.ros1.clients.master_graph import look_up_nodes, look_up_services, read_registrations
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -58,7 +57,8 @@ class Registrar:
         A name that somebody else holds by now is left to them; what it holds with a former URI
         of the same node is taken back first.
         """
-        at_master = await look_up_nodes(self._context.upstream, {one.caller_id for _, one in held})
+        names = {one.caller_id for _, one in held}
+        at_master = await self._context.upstream.look_up("lookupNode", names)
         kept: list[Held] = []
         former: dict[str, tuple[Endpoint, str]] = {}
         for endpoint, one in held:
@@ -103,7 +103,7 @@ class Registrar:
     async def register_lost(self) -> None:
         """Register what the master no longer has of live nodes. Raises Unreachable, MasterError."""
         started = self._context.now()
-        state = await read_registrations(self._context.upstream)
+        state = await self._context.upstream.read_registrations()
         ours = {
             held: endpoint
             for endpoint, held in self._context.registry.registrations()
@@ -255,11 +255,10 @@ class Registrar:
         if not former:
             return [], {}
         upstream, uris = self._context.upstream, {name: uri for name, (_, uri) in former.items()}
-        state = await read_registrations(upstream)
+        state = await upstream.read_registrations()
         mine = [one for name in uris for one in state.get(name, [])]
-        services = await look_up_services(
-            upstream, {one.name for one in mine if one.kind is Kind.SERVICE}
-        )
+        provided = {one.name for one in mine if one.kind is Kind.SERVICE}
+        services = await upstream.look_up("lookupService", provided)
         free = policy.free_calls(mine, uris, services)
         values = await upstream.multicall([*free, *policy.release_calls(uris, CALLER_ID)])
         params, known = policy.read_release(uris, values[len(free) :])

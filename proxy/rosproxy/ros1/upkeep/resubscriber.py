@@ -21,7 +21,6 @@ from collections.abc import Iterable, Sequence
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
-from rosproxy.ros1.clients.master_graph import look_up_nodes, read_registrations
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -110,12 +109,12 @@ class Resubscriber:
         the publishers are asked (``ask``), those served by UDPROS are told as well. Raises
         Unreachable, MasterError.
         """
-        held = await read_registrations(self._context.upstream)
+        held = await self._context.upstream.read_registrations()
         wanted = policy.subscriptions(held, endpoints, self._context.addressing)
         left = policy.without_relay(wanted, self._tcpros.topic_connections())
         if not left:
             return set()
-        graph = Graph(held, await look_up_nodes(self._context.upstream, held))
+        graph = Graph(held, await self._context.upstream.look_up("lookupNode", held))
         left = self._through_proxy(graph, left)
         bus = await self._read_buses(left) if ask else {}
         if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
