@@ -58,7 +58,8 @@ class DockerClient:
 
     def container(self, name: str) -> Json:
         """Everything about a container, by id or name."""
-        return dict(self._call(READ_TIMEOUT, "inspect_container", name))
+        found: Json = self._call(READ_TIMEOUT, "inspect_container", name)
+        return found
 
     def networks(self) -> list[Json]:
         """All networks."""

@@ -6,12 +6,53 @@ inspection of a container tells. Whatever the engine has nothing to say of may b
 
 from collections.abc import Iterable
 from ipaddress import IPv4Network, ip_network
-from typing import Any
+from typing import Any, TypedDict
 
+import msgspec
+
+from rosproxy_operator.docker.client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
 
-Json = dict[str, Any]
 _NEVER = "0001-"
+
+
+class _State(TypedDict, total=False):
+    Status: str | None
+    StartedAt: str | None
+
+
+class _Config(TypedDict, total=False):
+    Env: list[str] | None
+    Hostname: str | None
+
+
+class _Binding(TypedDict, total=False):
+    HostPort: str | None
+
+
+class _HostConfig(TypedDict, total=False):
+    PortBindings: dict[str, list[_Binding] | None] | None
+
+
+class _Endpoint(TypedDict, total=False):
+    Aliases: list[str] | None
+    DNSNames: list[str] | None
+
+
+class _NetworkSettings(TypedDict, total=False):
+    Networks: dict[str, _Endpoint | None] | None
+
+
+class _Inspection(TypedDict, total=False):
+    State: _State | None
+    Config: _Config | None
+    HostConfig: _HostConfig | None
+    NetworkSettings: _NetworkSettings | None
+
+
+def check_inspection(found: object) -> Json:
+    """What is read of an inspection. Raises msgspec.ValidationError if it is not of that form."""
+    return dict(msgspec.convert(found, _Inspection))
 
 
 def dig(found: Any, *keys: str) -> Any:

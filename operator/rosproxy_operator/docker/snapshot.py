@@ -10,6 +10,8 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
+import msgspec
+
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.resolver import THIS_HOST, MasterResolver
 from rosproxy_operator.common.threads import in_thread
@@ -81,7 +83,8 @@ class Inspector:
     The engine's list answers in milliseconds whatever happens. An inspection waits until the
     container's start is over, which takes 26 s with 1000 ports to publish. Nothing that is read
     from it changes but the aliases, and those only with the endpoints, whose ids are in the list.
-    ``late`` is called when some come after a look.
+    One that can't be read is told in the log, once, and is as good as none: it harms no other
+    container. ``late`` is called when some come after a look.
     """
 
     def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
@@ -89,6 +92,7 @@ class Inspector:
         self._known: dict[str, tuple[object, Json]] = {}
         self._asking: dict[str, asyncio.Task[None]] = {}
         self._marks: dict[str, object] = {}
+        self._unreadable: set[str] = set()
         self._turns = asyncio.Semaphore(MOST_INSPECTIONS)
 
     @property
@@ -116,6 +120,7 @@ class Inspector:
             for row in rows
         }
         self._known = {key: known for key, known in self._known.items() if key in self._marks}
+        self._unreadable &= self._marks.keys()
         asked = []
         for key, mark in self._marks.items():
             if key not in self._asking and self._known.get(key, (None,))[0] != mark:
@@ -130,9 +135,14 @@ class Inspector:
         try:
             async with self._turns:
                 inspected = await in_thread(self._engine.container, container)
-            self._known[container] = mark, inspected
+            self._known[container] = mark, engine_json.check_inspection(inspected)
+            self._unreadable.discard(container)
         except EngineError as error:
             log.debug("inspecting %s: %s", container[:12], error)
+        except msgspec.ValidationError as error:
+            if container not in self._unreadable:
+                log.warning("what the engine tells of %s can't be read: %s", container[:12], error)
+            self._unreadable.add(container)
         finally:
             del self._asking[container]
 

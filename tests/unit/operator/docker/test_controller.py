@@ -74,6 +74,25 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
     assert look.state.unresolved == {"robot"}
 
 
+@pytest.mark.parametrize(
+    "garbage", [[], {"Config": 1}, {"NetworkSettings": {"Networks": {"app": {"Aliases": [5]}}}}]
+)
+async def test_an_inspection_that_cannot_be_read_harms_no_other_container(
+    garbage: object, engine: FakeEngine, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine.add(captured.running() | {"Id": "c" * 64, "Names": ["/odd"]}, captured.inspected())
+    engine.knows[f"/containers/{'c' * 64}/json"] = garbage
+    looking = observer()
+    for _ in range(2):
+        look = await looking.look(5.0)
+        assert [container.name for container in look.state.containers] == ["talker"]
+        assert not look.state.busy
+    (told,) = caplog.messages
+    assert told.startswith(f"what the engine tells of {'c' * 12} can't be read: ")
+    engine.knows[f"/containers/{'c' * 64}/json"] = captured.inspected()
+    assert len((await looking.look(5.0)).state.containers) == 2
+
+
 async def test_a_list_that_is_behind_the_inspection_makes_busy(engine: FakeEngine) -> None:
     engine.knows[f"/containers/{'p' * 64}/json"]["State"] = {"Status": "exited"}
     look = await observer().look(5.0)
