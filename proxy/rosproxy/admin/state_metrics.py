@@ -40,7 +40,7 @@ class StateCollector(Collector):
                 "Of the ports left, those that serve topics meanwhile.",
                 fast_ports.held(endpoints),
             ),
-            ("leases_blocked", "Ports of the range held by other programs.", pool.blocked),
+            ("leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)),
             ("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)),
             (
                 "alias_ports",

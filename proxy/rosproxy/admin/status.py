@@ -78,7 +78,7 @@ def _ports(context: Context) -> document.PortsStatus:
         advertise=str(ports.advertise),
         used=len(context.registry),
         free=fast_ports.left(pool, context.registry),
-        blocked=pool.blocked,
+        blocked=len(pool.blocked),
     )
 
 
