@@ -90,21 +90,6 @@ class RangeProbe(msgspec.Struct, frozen=True):
     probes: tuple[PortProbe, ...] = ()
 
 
-def read_news(body: object) -> ContainerNews:
-    """The body of ``POST /containers``. Raises BodyError."""
-    return _read(body, ContainerNews)
-
-
-def read_master_address(body: object) -> str:
-    """The body of ``POST /master-address``: the address. Raises BodyError."""
-    return _read(body, MasterAddress).address
-
-
-def read_nothing(body: object) -> None:
-    """The body of a call that takes none. Raises BodyError."""
-    _read(body, Nothing)
-
-
 def read_probe(answer: object) -> RangeProbe:
     """The answer to ``POST /probe``; an empty one if it is of no use."""
     try:
@@ -113,7 +98,8 @@ def read_probe(answer: object) -> RangeProbe:
         return RangeProbe()
 
 
-def _read(body: object, kind: type[Body]) -> Body:
+def read_body(body: object, kind: type[Body]) -> Body:
+    """A decoded body as its type. Raises BodyError."""
     try:
         return msgspec.convert(body, kind)
     except msgspec.ValidationError as error:
