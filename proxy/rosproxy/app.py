@@ -15,10 +15,9 @@ from functools import partial
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
-from rosproxy.admin.requests import ContainerNews, MasterAddress, Nothing, read
+from rosproxy.admin.requests import ContainerNews, MasterAddress, Nothing, read_body
 from rosproxy.admin.server import AdminServer
-from rosproxy.admin.state_metrics import StateCollector
-from rosproxy.admin.status import describe
+from rosproxy.admin.status import ProxyState
 from rosproxy.admin.status_document import to_json
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import RANGE_OPTION, Leases
@@ -77,7 +76,8 @@ class App:
         self._admission = NodeAdmission(context, leases)
         self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
-        self.master_monitor = MasterMonitor(context, self._recovery, registrar)
+        self.master_monitor = monitor = MasterMonitor(context, self._recovery, registrar)
+        self._state = ProxyState(context, monitor, self.tcpros, self.alias, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(context, leases, self.alias, self._adopter, self.tcpros)
         self._servers = [slave.server]
@@ -107,10 +107,7 @@ class App:
             where = HostPort(settings.advertise_host, settings.publish_master)
             published = partial(serve_published, context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
-        state = StateCollector(
-            context.registry, self.tcpros, self.alias, self.master_monitor, self.plane
-        )
-        context.metrics.registry.register(state)
+        context.metrics.registry.register(self._state)
         with _binding("--admin-bind", settings.admin):
             await self._admin.start(settings.admin)
         repeat = context.tasks.repeat
@@ -146,8 +143,7 @@ class App:
 
     def status(self) -> dict[str, Any]:
         """The state as JSON."""
-        monitor = self.master_monitor
-        return to_json(describe(self.context, monitor, self.tcpros, self.alias, self.plane))
+        return to_json(self._state.status())
 
     def _unready(self) -> str | None:
         if self.context.retired:
@@ -160,17 +156,19 @@ class App:
         return to_json(await probe_range(self.context, self.leases))
 
     async def _handle_news(self, body: Any) -> dict[str, Any]:
-        news = read(body, ContainerNews)
+        """``POST /containers``: how many nodes were unregistered, moved and adopted."""
+        news = read_body(body, ContainerNews)
         arrived = [(one.address, one.names) for one in news.arrived]
         return {**await self._containers.handle(news.gone, news.moved, arrived)}
 
     async def _retire(self, body: Any) -> dict[str, Any]:
-        read(body, Nothing)
+        """``POST /retire``: how many nodes were unregistered."""
+        read_body(body, Nothing)
         return {"unregistered": await self._containers.retire()}
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""
-        address, upstream = read(body, MasterAddress).address, self.context.upstream
+        address, upstream = read_body(body, MasterAddress).address, self.context.upstream
         if address != upstream.master_address:
             log.info("master %s is looked for at %s", self.settings.master_uri, address)
             upstream.master_address = address

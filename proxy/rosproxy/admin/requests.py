@@ -98,8 +98,8 @@ def read_probe(answer: object) -> RangeProbe:
         return RangeProbe()
 
 
-def read(body: object, kind: type[Body]) -> Body:
-    """A body, from decoded JSON. Raises BodyError."""
+def read_body(body: object, kind: type[Body]) -> Body:
+    """A decoded body as its type. Raises BodyError."""
     try:
         return msgspec.convert(body, kind)
     except msgspec.ValidationError as error:

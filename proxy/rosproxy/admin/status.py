@@ -1,9 +1,12 @@
-"""The state of a running proxy as the document that ``/status`` serves."""
+"""The state of a running proxy: as the document that ``/status`` serves, and as metrics."""
 
 import os
 import time
+from collections.abc import Iterable
 
 import msgspec
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from rosproxy import __version__
 from rosproxy.admin import status_document as document
@@ -13,103 +16,151 @@ from rosproxy.leases import fast_ports
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.endpoint import STATES, Endpoint
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
 
-def describe(
-    context: Context, monitor: MasterMonitor, tcpros: TcprosServer, alias: Alias, plane: KernelPlane
-) -> document.ProxyStatus:
-    """Everything that ``rosproxy status`` and ``rosproxy doctor`` show."""
-    relays: dict[int, list[Relay]] = {}
-    for relay in tcpros.relays:
-        relays.setdefault(relay.port, []).append(relay)
-    endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
-    return document.ProxyStatus(
-        version=__version__,
-        pid=os.getpid(),
-        instance=context.instance,
-        retired=context.retired,
-        uptime=round(context.now() - context.metrics.started, 1),
-        settings=_settings(context),
-        master=_master(context, monitor),
-        ports=_ports(context),
-        data_plane=msgspec.convert(plane.status(), document.DataPlaneStatus),
-        alias_ports=msgspec.convert(alias.status(), tuple[document.AliasPortStatus, ...]),
-        nodes=tuple(_node(context, e, relays.get(e.port, []), plane) for e in endpoints),
-        problems=tuple(
-            document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
-            for p in context.problems.all()
-        ),
-    )
+class ProxyState(Collector):
+    """What there is to tell of a proxy, read when somebody asks."""
 
+    def __init__(
+        self,
+        context: Context,
+        monitor: MasterMonitor,
+        tcpros: TcprosServer,
+        alias: Alias,
+        plane: KernelPlane,
+    ) -> None:
+        self._context, self._monitor, self._tcpros = context, monitor, tcpros
+        self._alias, self._plane = alias, plane
 
-def _settings(context: Context) -> document.StatusSettings:
-    settings = context.settings
-    return document.StatusSettings(
-        master_port=settings.master_port,
-        publish_master=settings.publish_master,
-        advertise_host=settings.advertise_host,
-        bind=settings.bind,
-        inside_networks=tuple(map(str, context.addressing.networks)),
-        cleanup_after=settings.cleanup_after,
-        linger=settings.linger,
-    )
+    def status(self) -> document.ProxyStatus:
+        """Everything that ``rosproxy status`` and ``rosproxy doctor`` show."""
+        context = self._context
+        relays: dict[int, list[Relay]] = {}
+        for relay in self._tcpros.relays:
+            relays.setdefault(relay.port, []).append(relay)
+        endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
+        return document.ProxyStatus(
+            version=__version__,
+            pid=os.getpid(),
+            instance=context.instance,
+            retired=context.retired,
+            uptime=round(context.now() - context.metrics.started, 1),
+            settings=self._settings(),
+            master=self._master(),
+            ports=self._ports(),
+            data_plane=msgspec.convert(self._plane.status(), document.DataPlaneStatus),
+            alias_ports=msgspec.convert(self._alias.status(), tuple[document.AliasPortStatus, ...]),
+            nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
+            problems=tuple(
+                document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
+                for p in context.problems.all()
+            ),
+        )
 
+    def collect(self) -> Iterable[Metric]:
+        """The state as metrics: gauges, and counters of bytes."""
+        endpoints, pool = self._context.registry, self._context.registry.pool
+        forwarded = sum(endpoint.fast_connections for endpoint in endpoints)
+        for name, text, value in (
+            ("leases_used", "Ports held by inside nodes.", len(endpoints)),
+            ("leases_free", "Ports left for inside nodes.", fast_ports.left(pool, endpoints)),
+            (
+                "fast_ports",
+                "Of the ports left, those that serve topics meanwhile.",
+                fast_ports.held(endpoints),
+            ),
+            ("leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)),
+            ("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)),
+            (
+                "alias_ports",
+                "Ports that stand in for nodes on the master's host.",
+                len(self._alias.status()),
+            ),
+            ("master_up", "Whether the master answers.", bool(self._monitor.up)),
+            ("kernel_plane", "Whether the kernel forwards topics.", self._plane.syncer.usable),
+            ("kernel_connections", "TCPROS connections that the kernel forwards.", forwarded),
+        ):
+            yield GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
+        states = [endpoint.state for endpoint in endpoints]
+        by_state = GaugeMetricFamily(
+            "rosproxy_endpoints", "Inside nodes by state.", labels=["state"]
+        )
+        for state in STATES:
+            by_state.add_metric([state], states.count(state))
+        yield by_state
+        yield from self._bytes()
 
-def _master(context: Context, monitor: MasterMonitor) -> document.MasterStatus:
-    return document.MasterStatus(
-        uri=context.settings.master_uri,
-        address=context.upstream.reached_at,
-        pinned=context.upstream.master_address is not None,
-        up=bool(monitor.up),
-        error=monitor.error,
-        pid=monitor.pid,
-        since=round(context.now() - monitor.since, 1),
-        round_trip=monitor.round_trip,
-    )
+    def _bytes(self) -> Iterable[Metric]:
+        relayed = CounterMetricFamily(
+            "rosproxy_relayed_bytes",
+            "Bytes relayed by topic or service and direction.",
+            labels=["kind", "name", "direction"],
+        )
+        for labels, size in self._tcpros.traffic().totals():
+            relayed.add_metric(labels, size)
+        forwarded = CounterMetricFamily(
+            "rosproxy_kernel_bytes",
+            "Bytes of IP packets, headers included, that the kernel forwarded, by node.",
+            labels=["node", "direction"],
+        )
+        for labels, size in self._plane.traffic.totals():
+            forwarded.add_metric(labels[1:], size)
+        return relayed, forwarded
 
+    def _settings(self) -> document.StatusSettings:
+        settings = self._context.settings
+        return document.StatusSettings(
+            master_port=settings.master_port,
+            publish_master=settings.publish_master,
+            advertise_host=settings.advertise_host,
+            bind=settings.bind,
+            inside_networks=tuple(map(str, self._context.addressing.networks)),
+            cleanup_after=settings.cleanup_after,
+            linger=settings.linger,
+        )
 
-def _ports(context: Context) -> document.PortsStatus:
-    ports, pool = context.settings.ports, context.registry.pool
-    return document.PortsStatus(
-        listen=str(ports.listen),
-        advertise=str(ports.advertise),
-        used=len(context.registry),
-        free=fast_ports.left(pool, context.registry),
-        blocked=pool.blocked,
-    )
+    def _master(self) -> document.MasterStatus:
+        context, monitor = self._context, self._monitor
+        return document.MasterStatus(
+            uri=context.settings.master_uri,
+            address=context.upstream.reached_at,
+            pinned=context.upstream.master_address is not None,
+            up=bool(monitor.up),
+            error=monitor.error,
+            pid=monitor.pid,
+            since=round(context.now() - monitor.since, 1),
+            round_trip=monitor.round_trip,
+        )
 
+    def _ports(self) -> document.PortsStatus:
+        ports, registry = self._context.settings.ports, self._context.registry
+        return document.PortsStatus(
+            listen=str(ports.listen),
+            advertise=str(ports.advertise),
+            used=len(registry),
+            free=fast_ports.left(registry.pool, registry),
+            blocked=len(registry.pool.blocked),
+        )
 
-def _node(
-    context: Context, endpoint: Endpoint, relays: list[Relay], plane: KernelPlane
-) -> document.EndpointStatus:
-    return document.EndpointStatus(
-        nodes=tuple(endpoint.caller_ids),
-        uri=endpoint.uri,
-        address=str(endpoint.slave),
-        advertised_uri=context.addressing.advertised_uri(endpoint),
-        port=endpoint.port,
-        state=endpoint.state,
-        publishes=tuple(endpoint.names(Kind.PUBLISHER)),
-        subscribes=tuple(endpoint.names(Kind.SUBSCRIBER)),
-        services=tuple(endpoint.names(Kind.SERVICE)),
-        parameters=tuple(endpoint.names(Kind.PARAM)),
-        connections=tuple(map(_connection, relays)),
-        problems=tuple(problem.text for problem in context.problems.at(endpoint.port)),
-        data_plane=msgspec.convert(plane.status_of(endpoint), document.NodePlaneStatus),
-    )
-
-
-def _connection(relay: Relay) -> document.ConnectionStatus:
-    return document.ConnectionStatus(
-        kind=relay.kind,
-        name=relay.name,
-        caller_id=relay.caller_id,
-        peer=relay.peer,
-        sent=relay.sent,
-        received=relay.received,
-        sent_rate=round(relay.rates[0], 1),
-        received_rate=round(relay.rates[1], 1),
-    )
+    def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
+        problems = self._context.problems.at(endpoint.port)
+        return document.EndpointStatus(
+            nodes=tuple(endpoint.caller_ids),
+            uri=endpoint.uri,
+            address=str(endpoint.slave),
+            advertised_uri=self._context.addressing.advertised_uri(endpoint),
+            port=endpoint.port,
+            state=endpoint.state,
+            publishes=tuple(endpoint.names(Kind.PUBLISHER)),
+            subscribes=tuple(endpoint.names(Kind.SUBSCRIBER)),
+            services=tuple(endpoint.names(Kind.SERVICE)),
+            parameters=tuple(endpoint.names(Kind.PARAM)),
+            connections=msgspec.convert(
+                relays, tuple[document.ConnectionStatus, ...], from_attributes=True
+            ),
+            problems=tuple(problem.text for problem in problems),
+            data_plane=msgspec.convert(self._plane.status_of(endpoint), document.NodePlaneStatus),
+        )

@@ -224,18 +224,18 @@ def doctor(
 
     from rosproxy.cli import terminal
     from rosproxy.doctor import findings, rules
-    from rosproxy.doctor.collect import DoctorOptions, collect
+    from rosproxy.doctor.collect import collect
 
     if outside and not master_uri:
         raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
-    what = DoctorOptions(
+    asked = collect(
         None if outside else admin,
         master_uri or "",
         advertise_host or "",
         tuple(f"/{name.strip('/')}" for name in names),
         master_address,
     )
-    found = rules.diagnose(asyncio.run(collect(what)))
+    found = rules.diagnose(asyncio.run(asked))
     if as_json:
         terminal.write(json.dumps(findings.as_json(found), indent=2))
     else:

@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
@@ -48,36 +48,30 @@ Key = TypeVar("Key")
 Result = TypeVar("Result")
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorOptions:
-    """What to look at: the admin endpoint, and what is known in case that it doesn't answer.
+async def collect(
+    admin: AdminClient | None,
+    master_uri: str = "",
+    advertise_host: str = "",
+    names: tuple[str, ...] = (),
+    master_address: str | None = None,
+) -> DoctorFacts:
+    """Ask everybody, and change nothing.
 
-    Without ``admin`` no proxy is asked: the look of an outside machine. ``master_address`` is the
-    IP address at which the master's host is reached whatever its name leads to.
+    Without ``admin`` no proxy is asked: the look of an outside machine. What follows it is for the
+    case that it doesn't answer; ``master_address`` is the IP address at which the master's host is
+    reached whatever its name leads to.
     """
-
-    admin: AdminClient | None
-    master_uri: str = ""
-    advertise_host: str = ""
-    names: tuple[str, ...] = ()
-    master_address: str | None = None
-
-
-async def collect(options: DoctorOptions) -> DoctorFacts:
-    """Ask everybody, and change nothing."""
-    host = options.advertise_host
+    found = await resolve(advertise_host) if advertise_host else ()
     facts = DoctorFacts(
-        advertise_host=host,
-        advertised_addresses=tuple(await resolve(host)) if host else (),
-        names=options.names,
+        advertise_host=advertise_host, advertised_addresses=tuple(found), names=names
     )
-    if options.admin is None:
-        return await _look_beyond(facts, options.master_uri)
+    if admin is None:
+        return await _look_beyond(facts, master_uri)
     try:
-        return await _with_proxy(facts, options.admin)
+        return await _with_proxy(facts, admin)
     except AdminError as error:
         facts = replace(facts, admin_error=str(error))
-        return await _look_beyond(facts, options.master_uri, options.master_address)
+        return await _look_beyond(facts, master_uri, master_address)
 
 
 async def _with_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:

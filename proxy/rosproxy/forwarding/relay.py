@@ -58,8 +58,8 @@ class Relay:
 
     ``kind`` is topic or service and ``name`` which; ``caller_id`` and ``peer`` tell who connected
     from outside. ``sent`` are bytes towards outside, ``received`` bytes towards the inside node;
-    ``rates`` are both in bytes per second, as of the last `sample`. Without ``splice`` all bytes
-    are copied.
+    ``sent_rate`` and ``received_rate`` are in bytes per second, as of the last `sample`. Without
+    ``splice`` all bytes are copied.
     """
 
     port: int
@@ -73,7 +73,8 @@ class Relay:
     sent: int = 0
     received: int = 0
     failed: bool = False
-    rates: tuple[float, float] = (0.0, 0.0)
+    sent_rate: float = 0.0
+    received_rate: float = 0.0
     _sampled: tuple[float, int, int] = (0.0, 0, 0)
     _done: tuple[threading.Event, threading.Event] = field(
         default_factory=lambda: (threading.Event(), threading.Event())
@@ -105,7 +106,8 @@ class Relay:
         self._sampled = (now, self.sent, self.received)
         if before and now > before:
             passed = now - before
-            self.rates = (self.sent - sent) / passed, (self.received - received) / passed
+            self.sent_rate = round((self.sent - sent) / passed, 1)
+            self.received_rate = round((self.received - received) / passed, 1)
 
     def _start_direction(self, index: int, finished: Finished) -> bool:
         """Whether the direction could be started; if not, both sides are reset."""

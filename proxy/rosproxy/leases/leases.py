@@ -100,7 +100,7 @@ class Leases(Generic[_H]):
     async def retry_blocked(self) -> None:
         """Take in ports of the range that other programs have let go."""
         pool = self._holders.pool
-        before = pool.blocked_ports
+        before = sorted(pool.blocked)
         for port in filter(self._reserve, before):
             pool.unblock(port)
             log.info("port %d of the range is free now", port)

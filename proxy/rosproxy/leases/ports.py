@@ -50,28 +50,19 @@ class PortPool:
     """The free ports of a range.
 
     A port given back goes to the end of the queue, so that it is used again as late as possible:
-    peers that still hold its old meaning find nobody there instead of somebody else.
+    peers that still hold its old meaning find nobody there instead of somebody else. ``blocked``
+    are ports that another program on this machine holds.
     """
 
     def __init__(self, ports: PortRange) -> None:
         self.range = ports
         self._free = OrderedDict.fromkeys(ports.ports())
-        self._blocked: set[int] = set()
+        self.blocked: set[int] = set()
 
     @property
     def free(self) -> int:
         """How many ports are free."""
         return len(self._free)
-
-    @property
-    def blocked(self) -> int:
-        """How many ports another program holds."""
-        return len(self._blocked)
-
-    @property
-    def blocked_ports(self) -> list[int]:
-        """The ports that another program holds."""
-        return sorted(self._blocked)
 
     def take(self, prefer: int | None = None) -> int | None:
         """Take ``prefer`` if it is free, else the port that was free longest; None if none is."""
@@ -90,15 +81,15 @@ class PortPool:
 
     def give_back(self, port: int) -> None:
         """Return a port that was taken."""
-        if port not in self._blocked:
+        if port not in self.blocked:
             self._free[port] = None
 
     def unblock(self, port: int) -> None:
         """Take a port back that another program has let go."""
-        self._blocked.discard(port)
+        self.blocked.discard(port)
         self._free[port] = None
 
     def block(self, port: int) -> None:
-        """Never hand out this port: another program on this machine holds it."""
-        self._blocked.add(port)
+        """Never hand out this port."""
+        self.blocked.add(port)
         self._free.pop(port, None)

@@ -1,4 +1,4 @@
-"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.state_metrics`."""
+"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.status`."""
 
 import time
 from collections.abc import Collection, Iterator

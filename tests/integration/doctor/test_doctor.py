@@ -11,7 +11,7 @@ from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode, Header
 from rosproxy.admin.client import AdminClient
-from rosproxy.doctor.collect import DoctorOptions, collect
+from rosproxy.doctor.collect import collect
 from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import diagnose
 from rosproxy.ros1.protocol.tcpros import encode_header
@@ -51,7 +51,7 @@ async def register(
 async def examine(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[DoctorFinding]:
     """All findings."""
     admin = AdminClient(admin_url(proxy)) if proxy else None
-    return diagnose(await collect(DoctorOptions(admin, master_uri, "", names)))
+    return diagnose(await collect(admin, master_uri, "", names))
 
 
 async def faults(proxy: Proxy | None, *names: str, master_uri: str = "") -> list[DoctorFinding]:
@@ -279,9 +279,7 @@ async def test_services(proxy: Proxy, node: FakeNode) -> None:
 async def test_without_a_proxy_the_master_and_its_nodes_are_looked_at(
     listener: FakeNode, master: FakeMaster
 ) -> None:
-    found = diagnose(
-        await collect(DoctorOptions(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
-    )
+    found = diagnose(await collect(AdminClient(NOBODY), master.uri, "127.0.0.1", ("/chatter",)))
     errors = {f.check for f in found if f.severity is Severity.ERROR}
     assert errors == {"admin", "pair"}
 

@@ -8,7 +8,7 @@ from examples.demo.fake_http import where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.admin.client import AdminClient
-from rosproxy.doctor.collect import DoctorOptions, collect
+from rosproxy.doctor.collect import collect
 from rosproxy.doctor.facts import Reach
 from tests.integration.admin_calls import post, tell
 from tests.integration.commands import admin_url, run
@@ -131,7 +131,7 @@ async def test_the_doctor_asks_the_master_at_its_address(
     on_its_host = await make_node("/on_robot", MASTER, NAME)
     await on_its_host.publish(where(master.uri))
     proxy = await make_proxy(master_uri=uri_by_name(master), master_address=MASTER)
-    facts = await collect(DoctorOptions(AdminClient(admin_url(proxy))))
+    facts = await collect(AdminClient(admin_url(proxy)))
     assert facts.master is not None
     assert (facts.master.addresses, facts.master.attempt.reach) == ((MASTER,), Reach.ANSWERED)
     assert facts.nodes["/on_robot"].addresses == (MASTER,)
@@ -139,8 +139,8 @@ async def test_the_doctor_asks_the_master_at_its_address(
 
 
 async def test_the_doctor_without_a_proxy_is_told_the_address(master: FakeMaster) -> None:
-    options = DoctorOptions(AdminClient("127.0.0.1:9"), uri_by_name(master), master_address=MASTER)
-    facts = await collect(options)
+    admin = AdminClient("127.0.0.1:9")
+    facts = await collect(admin, uri_by_name(master), master_address=MASTER)
     assert facts.admin_error
     assert facts.master is not None
     assert facts.master.attempt.reach is Reach.ANSWERED

@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +14,7 @@ from rosproxy.admin.requests import (
     ContainerNews,
     MasterAddress,
     Nothing,
-    read,
+    read_body,
 )
 
 GOOD: list[tuple[Any, ContainerNews]] = [
@@ -34,7 +35,7 @@ GOOD: list[tuple[Any, ContainerNews]] = [
 
 @pytest.mark.parametrize(("body", "news"), GOOD)
 def test_news(body: Any, news: ContainerNews) -> None:
-    assert read(body, ContainerNews) == news
+    assert read_body(body, ContainerNews) == news
 
 
 BAD: list[tuple[Any, str]] = [
@@ -80,7 +81,7 @@ BAD: list[tuple[Any, str]] = [
 @pytest.mark.parametrize(("body", "complaint"), BAD)
 def test_a_mistake_names_its_field(body: Any, complaint: str) -> None:
     with pytest.raises(BodyError) as caught:
-        read(body, ContainerNews)
+        read_body(body, ContainerNews)
     assert str(caught.value).startswith(complaint)
 
 
@@ -91,9 +92,9 @@ JSON = st.recursive(
 FIELDS = st.sampled_from(["gone", "moved", "arrived", "address", "names"])
 
 
-def complaint_of(kind: type[ContainerNews | MasterAddress | Nothing], body: Any) -> str:
+def complaint_of(kind: type[msgspec.Struct], body: Any) -> str:
     try:
-        read(body, kind)
+        read_body(body, kind)
     except BodyError as error:
         return str(error)
     return ""
@@ -108,16 +109,16 @@ def test_anything_else_is_a_mistake_in_one_short_line(body: Any) -> None:
 
 
 def test_a_master_address() -> None:
-    assert read({"address": "192.0.2.7"}, MasterAddress).address == "192.0.2.7"
+    assert read_body({"address": "192.0.2.7"}, MasterAddress).address == "192.0.2.7"
 
 
 @pytest.mark.parametrize("body", [{}, {"address": "robot"}, {"address": None}, [], {"adress": "x"}])
 def test_a_bad_master_address(body: Any) -> None:
     with pytest.raises(BodyError, match=r"address|the body"):
-        read(body, MasterAddress)
+        read_body(body, MasterAddress)
 
 
 def test_no_body() -> None:
-    read({}, Nothing)
+    read_body({}, Nothing)
     with pytest.raises(BodyError, match="unknown field `x`; known: none"):
-        read({"x": 1}, Nothing)
+        read_body({"x": 1}, Nothing)

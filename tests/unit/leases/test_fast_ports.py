@@ -84,7 +84,7 @@ def test_a_fast_port_that_another_program_holds_is_blocked() -> None:
     registry, endpoint = one_admitted(4)
     fast_ports.claim(registry.pool, endpoint)
     fast_ports.give_back(registry.pool, endpoint, blocked=True)
-    assert registry.pool.blocked_ports == [1002]
+    assert registry.pool.blocked == {1002}
     assert registry.pool.free == 2
     assert not fast_ports.claim(registry.pool, endpoint)
 

@@ -16,22 +16,16 @@ from rosproxy.net.addresses import HostPort
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``."""
+    """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``.
+
+    Its ``state`` is ESTABLISHED while both sides have said yes and none has ended it, and SYN_SENT
+    while the node has not answered yet.
+    """
 
     state: str
     peer: HostPort
     port: int
     node: HostPort
-
-    @property
-    def open(self) -> bool:
-        """Whether both sides have said yes and none has ended it."""
-        return self.state == "ESTABLISHED"
-
-    @property
-    def unanswered(self) -> bool:
-        """Whether the node has not answered yet."""
-        return self.state == "SYN_SENT"
 
 
 def read(text: str, marks: Marks) -> list[Flow]:
@@ -42,7 +36,8 @@ def read(text: str, marks: Marks) -> list[Flow]:
 
 def peers(flows: Iterable[Flow], address: str) -> dict[str, int]:
     """How many open connections each peer has with the node at an address."""
-    return dict(Counter(f.peer.host for f in flows if f.open and f.node.host == address))
+    there = (flow for flow in flows if flow.node.host == address)
+    return dict(Counter(flow.peer.host for flow in there if flow.state == "ESTABLISHED"))
 
 
 class Watch:
@@ -54,7 +49,8 @@ class Watch:
 
     def look(self, flows: Sequence[Flow], now: float) -> list[Flow]:
         """Those among the connections that there are at a time."""
-        self._since = {flow: self._since.get(flow, now) for flow in flows if flow.unanswered}
+        waiting = (flow for flow in flows if flow.state == "SYN_SENT")
+        self._since = {flow: self._since.get(flow, now) for flow in waiting}
         return [flow for flow, since in self._since.items() if now - since >= self._patience]
 
 

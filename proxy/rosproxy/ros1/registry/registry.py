@@ -114,7 +114,7 @@ class Registry:
         """The error for a node that can't get a port."""
         return RangeExhausted(
             f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} leases "
-            f"held, {self.pool.blocked} taken by other programs); give the proxy a larger "
+            f"held, {len(self.pool.blocked)} taken by other programs); give the proxy a larger "
             "--port-range (ROSPROXY_PORT_RANGE)"
         )
 

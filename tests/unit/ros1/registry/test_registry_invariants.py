@@ -144,7 +144,7 @@ class Registries(RuleBasedStateMachine):
     @invariant()
     def every_port_is_free_held_or_blocked(self) -> None:
         pool, held = self.registry.pool, set(self.registry.by_port)
-        assert pool.free + len(held) + pool.blocked == len(PORTS)
+        assert pool.free + len(held) + len(pool.blocked) == len(PORTS)
         assert not held & self.blocked
         assert all(port in PORTS for port in held)
 
