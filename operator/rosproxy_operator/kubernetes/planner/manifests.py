@@ -9,7 +9,6 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.resources.model import ClusterNode, Json, MasterSpec, RosProxy
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
@@ -26,6 +25,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     proxy_name,
     service_name,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 USER = 10001
 """The image's own user."""

@@ -27,7 +27,6 @@ from rosproxy_operator.kubernetes.planner.reconcile import (
     site_of,
 )
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.view import view
 from rosproxy_operator.kubernetes.resources.model import (
@@ -39,6 +38,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPlace,
     RosProxy,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
 from rosproxy_operator.kubernetes.status import status as statuses
 

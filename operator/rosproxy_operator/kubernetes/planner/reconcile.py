@@ -25,7 +25,6 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import View, serves
 from rosproxy_operator.kubernetes.resources.model import (
@@ -39,6 +38,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id
 from rosproxy_operator.kubernetes.resources.values import host_problem
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""

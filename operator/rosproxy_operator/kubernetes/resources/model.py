@@ -122,7 +122,7 @@ class ClusterNode:
     """A node of the cluster. ``addresses`` are by their type, the first of each.
 
     ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
-    ``spec.podCIDRs``; ``cordoned`` is ``spec.unschedulable``.
+    ``spec.podCIDRs``.
     """
 
     name: str
@@ -131,7 +131,6 @@ class ClusterNode:
     advertise_host: str = ""
     pod_networks: tuple[str, ...] = ()
     ready: bool = True
-    cordoned: bool = False
     deleting: bool = False
 
 

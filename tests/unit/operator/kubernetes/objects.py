@@ -10,7 +10,6 @@ from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.model import (
@@ -26,6 +25,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
     Stuck,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 SETTINGS = ClusterSettings(image="rosproxy:1")
 STAMP = "2026-01-01T00:00:00Z"
