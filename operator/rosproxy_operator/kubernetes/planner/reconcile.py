@@ -31,6 +31,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     ClusterSnapshot,
     MasterSpec,
+    Obstacle,
     ProxyPlace,
     ProxyPod,
     ProxyService,
@@ -73,14 +74,6 @@ class ClusterContext:
     def lost(self, node: str) -> float:
         """The seconds until a node that is missing counts as gone."""
         return LOST_FOR - (self.now - self.state.lost.get(node, self.now))
-
-
-@dataclass(frozen=True, slots=True)
-class Obstacle:
-    """What keeps a proxy from being made or changed, told with the node's name before it."""
-
-    reason: str
-    text: str
 
 
 def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:

@@ -10,7 +10,6 @@ from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.resources.model import (
-    ClusterFinding,
     Name,
     ProxyPlace,
     ProxyPod,
@@ -248,7 +247,6 @@ class World:
             and place.node in f"{one.subject} {one.text}".split(": ")[0] + one.text
             and fatal in (None, one.fatal)
             for one in found.problems
-            if isinstance(one, ClusterFinding)
         )
 
     def check_addresses(self, unready: set[str]) -> None:
