@@ -24,8 +24,7 @@ from rosproxy.cli.options import (
     log_options,
     setting_errors,
 )
-from rosproxy.net.addresses import HostPort
-from rosproxy_operator.common.settings import read_bind, read_image
+from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
 from rosproxy_operator.docker.settings import (
     DEFAULT_ADMIN,
@@ -43,7 +42,23 @@ from rosproxy_operator.kubernetes.settings import (
     read_object_name,
 )
 
-IMAGE = Parsed("image", read_image)
+
+def _read_image(text: str) -> str:
+    """The name of a container image. Raises ValueError."""
+    if not text or any(c.isspace() for c in text):
+        raise ValueError(f"{text!r} is not the name of an image")
+    return text
+
+
+def _read_bind(example: HostPort, optional: bool, text: str) -> HostPort | None:
+    """``host:port`` to listen on; ``none`` is None where ``optional``. Raises ValueError."""
+    where = parse_host_port(text)
+    if where is None and not (optional and text == "none"):
+        raise ValueError(f"{text!r} is not of the form {example}")
+    return where
+
+
+IMAGE = Parsed("image", _read_image)
 NAME = Parsed("namespace/name", read_name)
 
 
@@ -51,7 +66,7 @@ def _bind_option(
     name: str, example: HostPort, text: str, optional: bool = False
 ) -> Callable[[Command], Command]:
     """Where to listen: by default at the example, or if that is ``optional`` nowhere."""
-    kind = Parsed("address:port", partial(read_bind, example, optional))
+    kind = Parsed("address:port", partial(_read_bind, example, optional))
     return click.option(name, type=kind, default="none" if optional else str(example), help=text)
 
 

@@ -11,6 +11,7 @@ from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.model import (
     Name,
     NodeState,
+    Obstacle,
     Pod,
     ProxyPod,
     ProxyReport,
@@ -131,7 +132,9 @@ def test_status_is_in_the_definition() -> None:
     )
     states = (
         NodeState("n", "192.0.2.1", ports, proxy, (pod,), answer),
-        NodeState("m", "192.0.2.2", None, None, (pod,), None, "no ports", "PortsExhausted"),
+        NodeState(
+            "m", "192.0.2.2", None, None, (pod,), None, Obstacle("PortsExhausted", "no ports")
+        ),
     )
     service = ProxyService(own.id, "c", "w", "192.0.2.9", "f")
     status = status_of(own, states, (), service, "http://robot:11311", "2026-01-01T00:00:00Z")

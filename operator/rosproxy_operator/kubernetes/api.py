@@ -55,7 +55,10 @@ _RBAC = re.compile(
     r'(?: in the namespace "(?P<namespace>[^"]*)")?'
 )
 _TERMINATING = "because it is being terminated"
-"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted."""
+"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted.
+
+Nothing can be created there, and nothing is to be.
+"""
 _TEST_FAILED = "the server rejected our request due to an error in our request"
 """All that the API server says when a ``test`` of a JSON patch fails."""
 _LONGEST = 500

@@ -30,10 +30,8 @@ from rosproxy_operator.kubernetes.proxy_sync import address_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     Failure,
-    InvalidRosProxy,
     Json,
     Name,
-    RosProxy,
 )
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
@@ -105,7 +103,7 @@ class ClusterApplier:
             return None
         quiet = isinstance(action, PatchStatus | Emit)
         try:
-            await in_thread(self._do, action, observed)
+            await in_thread(self._do, action)
         except ApiError as error:
             if error.kind in _nothing_left(action):
                 log.debug("%s: nothing to do: %s", line(action), error)
@@ -124,7 +122,7 @@ class ClusterApplier:
         self._counted(action, "failed")
         return failure
 
-    def _do(self, action: Action, observed: ClusterSnapshot) -> None:
+    def _do(self, action: Action) -> None:
         api = self._api
         match action:
             case CreateService():
@@ -147,7 +145,11 @@ class ClusterApplier:
                     ],
                 )
             case PatchStatus():
-                _patch_status(api, action, observed)
+                operations: list[Json] = [
+                    {"op": "test", "path": "/metadata/uid", "value": action.uid},
+                    {"op": "add", "path": "/status", "value": action.status},
+                ]
+                api.patch(f"{PLURAL}/status", action.of, operations)
             case Emit():
                 _emit(api, action)
 
@@ -241,18 +243,6 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
             f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
             "or rename the RosProxy",
         )
-
-
-def _patch_status(api: Api, action: PatchStatus, observed: ClusterSnapshot) -> None:
-    """Replace the whole status, of the RosProxy with this uid only."""
-    every: tuple[RosProxy | InvalidRosProxy, ...] = observed.rosproxies
-    every += tuple(observed.unusable.values())
-    uid = next(one.uid for one in every if one.id == action.of)
-    operations: list[Json] = [
-        {"op": "test", "path": "/metadata/uid", "value": uid},
-        {"op": "add", "path": "/status", "value": action.status},
-    ]
-    api.patch(f"{PLURAL}/status", action.of, operations)
 
 
 def _emit(api: Api, event: Emit) -> None:

@@ -86,7 +86,7 @@ class KubernetesController:
         took = time.monotonic() - started
         self._metrics.look_time.observe(took)
         log.debug("looked in %.3f s", took)
-        self.event_filter.learn(seen)
+        self.event_filter.last = seen
         self._proxy_sync.report_gone(planned.gone)
         await self._applier.carry_out(planned.actions, seen)
         if self._applier.failures != seen.failures:

@@ -23,15 +23,12 @@ class EventFilter:
     """Tells whether an event says anything new about anything that a look would read.
 
     In doubt it does. What is thrown away here by mistake is seen with the next look all the same.
+    ``last`` is what the last look has found.
     """
 
     def __init__(self) -> None:
-        self._last: ClusterSnapshot | None = None
+        self.last: ClusterSnapshot | None = None
         self._seen: dict[str, Any] = {}
-
-    def learn(self, snapshot: ClusterSnapshot) -> None:
-        """Take note of what the last look has found."""
-        self._last = snapshot
 
     def rosproxy(self, type: str | None, body: Json) -> bool:
         """Whether an event of a RosProxy matters: not if only its status has changed."""
@@ -45,16 +42,14 @@ class EventFilter:
         """Whether an event of a pod matters: of a proxy, or one that a RosProxy selects or has."""
         if is_own(words(body, "metadata", "labels")):
             return self._new(type, body, lambda body: (objects.proxy_pod(body), objects.pod(body)))
-        last, pod = self._last, objects.pod(body)
-        if last is not None and pod.uid not in last.selected:
-            choice = chosen(pod, last.rosproxies)
-            if not choice.rosproxy and not choice.finding:
-                return False
+        last, pod = self.last, objects.pod(body)
+        if last is not None and pod.uid not in last.selected and not chosen(pod, last.rosproxies):
+            return False
         return self._new(type, body, objects.pod)
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the operator's own, or a master's."""
-        masters = self._last.masters if self._last else {}
+        masters = self.last.masters if self.last else {}
         meta = part(body, "metadata")
         matters = is_own(words(meta, "labels")) or objects.name_of(meta) in masters
         return matters and self._new(type, body, lambda body: body.get("spec"))

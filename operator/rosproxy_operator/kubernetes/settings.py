@@ -7,15 +7,35 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import SettingError
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
 DEFAULT_LIVENESS = HostPort("0.0.0.0", 8080)
 DEFAULT_WEBHOOK = HostPort("0.0.0.0", 9443)
+NODE_PORTS = PortRange(30000, 32767)
+"""The API server's own default of --service-node-port-range."""
+EPHEMERAL = PortRange(32768, 60999)
+"""Linux's own default of net.ipv4.ip_local_port_range."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterSettings:
+    """The operator's options that decide what is planned.
+
+    ``image`` and ``image_pull_policy`` are those of proxies whose RosProxy names none; an empty
+    policy leaves it to Kubernetes. ``node_ports`` is the API server's --service-node-port-range,
+    ``ephemeral`` the range from which the nodes' kernels take ports for connections: no hostPort
+    is taken from either.
+    """
+
+    image: str = "rosproxy:latest"
+    image_pull_policy: str = ""
+    node_ports: PortRange = NODE_PORTS
+    ephemeral: PortRange = EPHEMERAL
 
 
 @dataclass(frozen=True, slots=True)

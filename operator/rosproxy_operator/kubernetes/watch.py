@@ -41,10 +41,6 @@ _PERIOD = 300
 _FORBIDDEN = re.compile(r"APIForbiddenError\(\W?(?P<text>.*)")
 
 
-class NotAlive(Exception):
-    """The operator is not alive."""
-
-
 class Endless:
     """Seconds between the tries of a request, without end: kopf would give up and end otherwise."""
 
@@ -184,11 +180,11 @@ class ClusterWatch:
         # As long as there are no credentials, kopf is not to end for it.
         kopf.on.login(registry=handlers, backoff=5.0)(kopf.login_via_client)
 
-        # Otherwise it would be tried again for a minute before the probe is answered.
-        @kopf.on.probe(registry=handlers, id="alive", errors=kopf.ErrorsMode.PERMANENT)
+        @kopf.on.probe(registry=handlers, id="alive")
         async def alive(**_: Any) -> str:
             if reason := controller.dead():
-                raise NotAlive(reason)
+                # Anything else would be tried again for a minute before the probe is answered.
+                raise kopf.PermanentError(reason)
             return "ok"
 
         def on(matters: Callable[[str | None, Any], bool], *resource: str) -> None:

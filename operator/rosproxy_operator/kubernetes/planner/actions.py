@@ -2,7 +2,7 @@
 
 import msgspec
 
-from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.model import Json, Name, Reference
 
 
 class ClusterAction(msgspec.Struct, frozen=True):
@@ -54,18 +54,19 @@ class SetImage(ObjectAction, frozen=True):
 
 
 class PatchStatus(ClusterAction, frozen=True):
-    """Replace the status of a RosProxy."""
+    """Replace the status of a RosProxy, if it still has this uid."""
 
+    uid: str
     status: Json
 
 
 class Emit(ClusterAction, frozen=True):
-    """Make a Kubernetes Event. ``about`` is its ``involvedObject``.
+    """Make a Kubernetes Event.
 
     ``type`` is Normal or Warning. The same event is made once, and counted when it comes again.
     """
 
-    about: Json
+    about: Reference
     type: str
     reason: str
     message: str

@@ -19,7 +19,6 @@ from rosproxy_operator.common.allocation import (
     overlap,
     within,
 )
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
 from rosproxy_operator.kubernetes.planner.view import (
     View,
@@ -36,6 +35,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
 )
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 
 @dataclass(frozen=True, slots=True)

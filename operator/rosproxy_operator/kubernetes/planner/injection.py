@@ -27,9 +27,9 @@ from rosproxy_operator.kubernetes.resources.names import (
     master_uri,
     service_id,
 )
+from rosproxy_operator.kubernetes.resources.objects import VARIABLE
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 
-VARIABLE = "ROS_MASTER_URI"
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the API server's picture of a static pod: a change of it changes no container."""
 _KINDS = ("initContainers", "containers")

@@ -9,8 +9,13 @@ from typing import Any
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
-from rosproxy_operator.kubernetes.resources.model import ClusterNode, Json, MasterSpec, RosProxy
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterNode,
+    Json,
+    MasterSpec,
+    Name,
+    RosProxy,
+)
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
     ADVERTISE_HOST,
@@ -23,9 +28,10 @@ from rosproxy_operator.kubernetes.resources.names import (
     PORT_RANGE,
     TOKEN_VARIABLE,
     own_labels,
-    proxy_name,
-    service_name,
+    proxy_id,
+    service_id,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 USER = 10001
 """The image's own user."""
@@ -82,7 +88,7 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
         PORT_RANGE: str(site.ports),
         ADVERTISE_HOST: site.advertise_host,
     }
-    metadata = _metadata(of, proxy_name(of.id.name, site.node.name), notes)
+    metadata = _metadata(of, proxy_id(of.id, site.node.name), notes)
     spec = {**_spec(site), "containers": [{**container, "image": ""}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec}
     known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
@@ -93,7 +99,7 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     """A RosProxy's Service, under one address the proxy on each pod's own node."""
     notes: dict[str, str] = {}
-    metadata = _metadata(rosproxy, service_name(rosproxy.id.name), notes)
+    metadata = _metadata(rosproxy, service_id(rosproxy.id), notes)
     spec: dict[str, Any] = {
         "type": "ClusterIP",
         "selector": metadata["labels"],
@@ -147,7 +153,7 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _metadata(of: RosProxy, name: str, annotations: dict[str, str]) -> dict[str, Any]:
+def _metadata(of: RosProxy, id: Name, annotations: dict[str, str]) -> dict[str, Any]:
     owner = {
         "apiVersion": API_VERSION,
         "kind": KIND,
@@ -156,8 +162,8 @@ def _metadata(of: RosProxy, name: str, annotations: dict[str, str]) -> dict[str,
         "controller": True,
     }
     return {
-        "name": name,
-        "namespace": of.id.namespace,
+        "name": id.name,
+        "namespace": id.namespace,
         "labels": own_labels(of.id.name),
         "annotations": annotations,
         "ownerReferences": [owner],

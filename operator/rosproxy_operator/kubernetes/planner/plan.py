@@ -10,14 +10,12 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
-    Obstacle,
     advertise_host,
     ends,
     master_of,
@@ -27,7 +25,6 @@ from rosproxy_operator.kubernetes.planner.reconcile import (
     site_of,
 )
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
 from rosproxy_operator.kubernetes.planner.view import view
 from rosproxy_operator.kubernetes.resources.model import (
@@ -36,11 +33,14 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     Json,
     NodeState,
+    Obstacle,
     ProxyPlace,
     RosProxy,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
-from rosproxy_operator.kubernetes.status import status as statuses
+from rosproxy_operator.kubernetes.status.findings import findings, invalid_finding
+from rosproxy_operator.kubernetes.status.status import status_of, status_of_invalid
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class ClusterPlan:
     """
 
     actions: tuple[Action, ...] = ()
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[ClusterFinding, ...] = ()
     state: ClusterState = field(default_factory=ClusterState)
     gone: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     again_in: float | None = None
@@ -78,7 +78,7 @@ def plan(
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(seen, settings, decided, ranges, retries, now)
     actions = list(reconcile_orphans(context))
-    problems: list[Problem] = [*seen.findings]
+    problems = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
     for of, rosproxy in sorted(seen.rosproxies.items()):
         own = list(reconcile_service(context, rosproxy))
@@ -89,12 +89,12 @@ def plan(
         service = context.own_service(rosproxy)
         master, _ = master_of(rosproxy, observed)
         uri = master.uri if master else ""
-        status = statuses.status_of(rosproxy, states, found, service, uri, stamp)
+        status = status_of(rosproxy, states, found, service, uri, stamp)
         problems += found
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
-        problems.append(statuses.invalid_finding(bad))
-        actions += _patch(context, bad, statuses.status_of_invalid(bad, stamp))
+        problems.append(invalid_finding(bad))
+        actions += _patch(context, bad, status_of_invalid(bad, stamp))
     every = tuple(dict.fromkeys(problems))
     new = events.warnings(every, decided.reported, now)
     gone = departures.gone(observed, decided, now)
@@ -124,8 +124,7 @@ def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
             proxy=current,
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
-            problem=site.text if isinstance(site, Obstacle) else "",
-            reason=site.reason if isinstance(site, Obstacle) else "",
+            obstacle=site if isinstance(site, Obstacle) else None,
         )
 
 
@@ -134,14 +133,14 @@ def _problems(
     of: RosProxy,
     states: tuple[NodeState, ...],
     moved: Iterable[ClusterFinding],
-) -> tuple[Problem, ...]:
+) -> tuple[ClusterFinding, ...]:
     """All that is wrong with a RosProxy."""
     service = context.own_service(of)
     address = service.cluster_ip if service else ""
     pods = context.view.taken.get(of.id, ()) if address else ()
     others = (*context.view.findings, *moved, *context.ranges.findings)
     return (
-        *statuses.findings(of, states, context.retries.failures(of.id)),
+        *findings(of, states, context.retries.failures(of.id)),
         *(one for one in others if one.of == of.id),
         *filter(None, (unwired(pod, of, address) for pod in pods)),
     )
@@ -158,4 +157,4 @@ def _patch(
         conditions = [{**one, "lastTransitionTime": ""} for one in status.get("conditions", ())]
         said = json.dumps({**status, "conditions": conditions}, sort_keys=True, default=str)
         if context.retries.ask(Task(of.id, "status", of.id, said)):
-            yield PatchStatus(of.id, status)
+            yield PatchStatus(of.id, of.uid, status)

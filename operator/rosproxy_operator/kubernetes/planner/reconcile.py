@@ -25,13 +25,13 @@ from rosproxy_operator.kubernetes.planner.actions import (
 from rosproxy_operator.kubernetes.planner.allocation import ClusterRanges
 from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import View, serves
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     ClusterSnapshot,
     MasterSpec,
+    Obstacle,
     ProxyPlace,
     ProxyPod,
     ProxyService,
@@ -39,6 +39,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id
 from rosproxy_operator.kubernetes.resources.values import host_problem
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
@@ -73,14 +74,6 @@ class ClusterContext:
     def lost(self, node: str) -> float:
         """The seconds until a node that is missing counts as gone."""
         return LOST_FOR - (self.now - self.state.lost.get(node, self.now))
-
-
-@dataclass(frozen=True, slots=True)
-class Obstacle:
-    """What keeps a proxy from being made or changed, told with the node's name before it."""
-
-    reason: str
-    text: str
 
 
 def master_of(rosproxy: RosProxy, observed: ClusterSnapshot) -> tuple[MasterSpec | None, str]:

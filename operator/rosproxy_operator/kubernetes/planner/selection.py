@@ -1,7 +1,6 @@
 """Which pods a RosProxy takes."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
@@ -20,17 +19,6 @@ _ANY = "true"
 _TEXTS = {"In": "{0} in {1}", "NotIn": "{0} notin {1}", "Exists": "{0}", "DoesNotExist": "!{0}"}
 """The operators of a label selector as the API server takes them, of a key and listed values."""
 _PART_OF_LABEL = "app.kubernetes.io/part-of"
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The RosProxy that a pod has, if any, and why it has none though it was selected.
-
-    The finding's reason is Ambiguous or HostNetwork.
-    """
-
-    rosproxy: RosProxy | None = None
-    finding: ClusterFinding | None = None
 
 
 def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
@@ -53,30 +41,31 @@ def label_selector(spec: RosProxySpec, name: str) -> str:
     return ",".join([*equal, *others, f"{INJECT} notin {_listed(OFF)}"])
 
 
-def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> Choice:
+def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
     """The RosProxy of a pod, of those of any namespace that are not being deleted.
 
-    Of several it is the one that the pod's label names.
+    Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
+    says why it has none though it was selected; None: it was not.
     """
     taking = sorted((one for one in rosproxies if _selects(one, pod)), key=lambda one: one.id)
     named = [one for one in taking if one.id.name == pod.labels.get(INJECT)]
     if not taking:
-        return Choice()
+        return None
     if not named and len(taking) > 1:
         names = [one.id.name for one in taking]
         text = (
             f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to "
             f"one of them, as {INJECT}={names[0]}"
         )
-        return Choice(finding=pod_finding(pod, taking[0], "Ambiguous", text))
+        return pod_finding(pod, taking[0], "Ambiguous", text)
     of = (named or taking)[0]
     if pod.host_network:
         text = (
             "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
             f"none: take hostNetwork off, or the label {INJECT}"
         )
-        return Choice(finding=pod_finding(pod, of, "HostNetwork", text))
-    return Choice(of)
+        return pod_finding(pod, of, "HostNetwork", text)
+    return of
 
 
 def pod_finding(

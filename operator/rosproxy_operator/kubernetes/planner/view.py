@@ -109,8 +109,8 @@ def _taken(
     """Which RosProxy has taken which pods, and what is wrong with that."""
     there = [pod for pod in observed.pods if not (pod.ended or pod.deleting or is_own(pod.labels))]
     choices = [(chosen(pod, rosproxies.values()), pod) for pod in there]
-    taken = grouped((choice.rosproxy.id, pod) for choice, pod in choices if choice.rosproxy)
-    return taken, [choice.finding for choice, _ in choices if choice.finding]
+    taken = grouped((one.id, pod) for one, pod in choices if isinstance(one, RosProxy))
+    return taken, [one for one, _ in choices if isinstance(one, ClusterFinding)]
 
 
 def _wanted(

@@ -122,7 +122,7 @@ class ClusterNode:
     """A node of the cluster. ``addresses`` are by their type, the first of each.
 
     ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
-    ``spec.podCIDRs``; ``cordoned`` is ``spec.unschedulable``.
+    ``spec.podCIDRs``.
     """
 
     name: str
@@ -131,7 +131,6 @@ class ClusterNode:
     advertise_host: str = ""
     pod_networks: tuple[str, ...] = ()
     ready: bool = True
-    cordoned: bool = False
     deleting: bool = False
 
 
@@ -230,13 +229,23 @@ class ProxyReport:
 
 
 @dataclass(frozen=True, slots=True)
+class Obstacle:
+    """What keeps a proxy from being made or changed, told with the node's name before it.
+
+    ``reason`` is the same in one CamelCase word.
+    """
+
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class NodeState:
     """What one RosProxy has on one node, and what it gets there: a line of its status.
 
     ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
     told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
     had. ``proxy`` is the pod that serves the node, None where there is none yet or any more.
-    ``problem`` is what keeps the node without one, ``reason`` the same in one CamelCase word.
     """
 
     name: str
@@ -245,8 +254,7 @@ class NodeState:
     proxy: ProxyPod | None = None
     pods: tuple[Pod, ...] = ()
     answer: ProxyReport | None = None
-    problem: str = ""
-    reason: str = ""
+    obstacle: Obstacle | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,27 +58,18 @@ def is_own(labels: Mapping[str, str]) -> bool:
     return all(labels.get(label) == value for label, value in _OWN.items()) and PROXY_OF in labels
 
 
-def service_name(of: str) -> str:
-    """The name of a RosProxy's Service."""
-    return f"{_PREFIX}{of}"
-
-
 def service_id(of: Name) -> Name:
     """The namespace and name of a RosProxy's Service."""
-    return Name(of.namespace, service_name(of.name))
-
-
-def proxy_name(of: str, node: str) -> str:
-    """The name of a RosProxy's pod on a node, always the same, so that there are never two."""
-    digest = hashlib.sha256(f"{of} {node}".encode()).hexdigest()[:_DIGITS]
-    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{of}--{digest}"))
-    slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
-    return "-".join(part for part in (f"{_PREFIX}{of}", slug, digest) if part)
+    return Name(of.namespace, f"{_PREFIX}{of.name}")
 
 
 def proxy_id(of: Name, node: str) -> Name:
-    """The namespace and name of a RosProxy's pod on a node."""
-    return Name(of.namespace, proxy_name(of.name, node))
+    """The name of a RosProxy's pod on a node, always the same, so that there are never two."""
+    digest = hashlib.sha256(f"{of.name} {node}".encode()).hexdigest()[:_DIGITS]
+    room = min(_SLUG, _LONGEST - len(f"{_PREFIX}{of.name}--{digest}"))
+    slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
+    parts = (f"{_PREFIX}{of.name}", slug, digest)
+    return Name(of.namespace, "-".join(part for part in parts if part))
 
 
 def master_uri(cluster_ip: str) -> str:

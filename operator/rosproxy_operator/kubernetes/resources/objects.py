@@ -36,7 +36,6 @@ def node(obj: Json) -> ClusterNode:
         advertise_host=word(part(meta, "annotations"), names.ADVERTISE_HOST).strip(),
         pod_networks=tuple(one for one in networks if one and isinstance(one, str)),
         ready=_is_ready(status),
-        cordoned=spec.get("unschedulable") is True,
         deleting=is_deleted(meta),
     )
 

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -38,17 +37,17 @@ class NewEvents:
 
 
 def warnings(
-    problems: Iterable[Problem], reported: Mapping[ClusterFinding, float], now: float
+    problems: Iterable[ClusterFinding], reported: Mapping[ClusterFinding, float], now: float
 ) -> NewEvents:
     """Warning Events for problems that were not there before.
 
     One that comes and goes all the time is told once. After a restart of the operator all are
     told again: who makes the Events counts those that are there already.
 
-    Only Findings that are about an object become Events. ``reported`` is that of the last look, or
+    Only findings that are about an object become Events. ``reported`` is that of the last look, or
     nothing; ``now`` is on its clock, in seconds.
     """
-    found = dict.fromkeys(one for one in problems if isinstance(one, ClusterFinding) and one.about)
+    found = dict.fromkeys(one for one in problems if one.about)
     new = [one for one in found if one not in reported]
     late = set(new[MOST:])
     recent = {one: then for one, then in reported.items() if now - then < QUIET}
@@ -58,7 +57,7 @@ def warnings(
 
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
-    of = _about(Reference(KIND, rosproxy.id, rosproxy.uid))
+    of = Reference(KIND, rosproxy.id, rosproxy.uid)
     return tuple(
         Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
         for action in actions
@@ -73,14 +72,20 @@ def event_body(event: Emit, now: float) -> Json:
     ``now`` is in seconds of Unix time.
     """
     about = event.about
-    what = "\n".join([about["uid"], event.type, event.reason, event.message])
+    what = "\n".join([about.uid, event.type, event.reason, event.message])
     digest = hashlib.sha256(what.encode()).hexdigest()[:16]
-    name = f"{about['name'][:_LONGEST_NAME].rstrip('.-')}.{digest}"
+    name = f"{about.id.name[:_LONGEST_NAME].rstrip('.-')}.{digest}"
     return {
         "apiVersion": "v1",
         "kind": "Event",
-        "metadata": {"name": name, "namespace": about["namespace"]},
-        "involvedObject": about,
+        "metadata": {"name": name, "namespace": about.id.namespace},
+        "involvedObject": {
+            "apiVersion": API_VERSION if about.kind == KIND else "v1",
+            "kind": about.kind,
+            "namespace": about.id.namespace,
+            "name": about.id.name,
+            "uid": about.uid,
+        },
         "type": event.type,
         "reason": event.reason,
         "message": event.message,
@@ -112,24 +117,13 @@ def stamp(now: float) -> str:
     return datetime.fromtimestamp(now, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _about(reference: Reference) -> Json:
-    """An Event's ``involvedObject``."""
-    return {
-        "apiVersion": API_VERSION if reference.kind == KIND else "v1",
-        "kind": reference.kind,
-        "namespace": reference.id.namespace,
-        "name": reference.id.name,
-        "uid": reference.uid,
-    }
-
-
 def _warning(finding: ClusterFinding) -> Emit:
     """A problem of the object itself needs no name there."""
     reference = finding.about
     assert reference is not None  # noqa: S101 - `warnings` takes no others
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
-    return Emit(finding.of, _about(reference), "Warning", finding.reason, _bounded(text))
+    return Emit(finding.of, reference, "Warning", finding.reason, _bounded(text))
 
 
 def _result_of(action: Action) -> Iterator[tuple[str, str]]:

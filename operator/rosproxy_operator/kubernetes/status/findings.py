@@ -28,8 +28,6 @@ NO_MASTER = "MasterUnreachable"
 WARNS = "ProxyWarns"
 _LONGEST = 600
 _ENFORCE = "pod-security.kubernetes.io/enforce"
-_TERMINATING = "because it is being terminated"
-"""The namespace is being deleted: nothing can be created there, and nothing is to be."""
 
 
 def findings(
@@ -39,7 +37,7 @@ def findings(
 
     Each has a reason; those that users are to be told by an Event have ``about``.
     """
-    found = [_refused(rosproxy, one) for one in failures if _TERMINATING not in one.text]
+    found = [_refused(rosproxy, one) for one in failures]
     for state in sorted(states, key=lambda one: one.name):
         found.extend(of_node(rosproxy, state))
     return tuple(dict.fromkeys(found))
@@ -47,10 +45,8 @@ def findings(
 
 def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
     """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
-    node = f"node {state.name}"
-    if state.problem:
-        default = EXHAUSTED if state.range is None else "Problem"
-        yield _finding(rosproxy, node, state.problem, state.reason or default)
+    if state.obstacle is not None:
+        yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypeGuard
 
 from rosproxy.telemetry.text import clean, plural, shorten
-from rosproxy_operator.common.problem import Problem, bounded
+from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
@@ -23,12 +23,8 @@ from rosproxy_operator.kubernetes.status.findings import (
     CONFLICT,
     EXHAUSTED,
     NO_MASTER,
-    findings,
-    invalid_finding,
     of_node,
 )
-
-__all__ = ["findings", "invalid_finding", "status_of", "status_of_invalid"]
 
 READY, PORTS, MASTER, DEGRADED = "Ready", "PortsAllocated", "MasterReachable", "Degraded"
 LONGEST = 1024
@@ -58,7 +54,7 @@ class Condition:
 def status_of(
     rosproxy: RosProxy,
     states: tuple[NodeState, ...],
-    problems: tuple[Problem, ...],
+    problems: tuple[ClusterFinding, ...],
     service: ProxyService | None,
     master: str,
     stamp: str,
@@ -216,16 +212,12 @@ def _read(was: Json) -> Condition:
     return Condition(*(word(was, key) for key in ("type", "status", "reason", "message")))
 
 
-def _one_line(problem: Problem) -> str:
+def _one_line(problem: ClusterFinding) -> str:
     return f"{problem.subject}: {problem.text}"
 
 
-def _reason_of(problem: Problem) -> str:
-    return problem.reason if isinstance(problem, ClusterFinding) else "Problem"
-
-
 def _ready(
-    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[Problem], nodes: int
+    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[ClusterFinding], nodes: int
 ) -> Condition:
     if not wanted:
         fix = "give pods the labels that spec.podSelector asks for"
@@ -238,7 +230,7 @@ def _ready(
         return Condition(READY, "True", "Serving", text)
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:
-        return Condition(READY, "False", _reason_of(blocking[0]), _one_line(blocking[0]))
+        return Condition(READY, "False", blocking[0].reason, _one_line(blocking[0]))
     name, proxy = waiting[0].name, waiting[0].proxy
     doing = "its proxy is being created"
     if proxy is not None and not proxy.pod.deleting:
@@ -246,13 +238,12 @@ def _ready(
     return Condition(READY, "False", "ProxiesStarting", f"node {name}: {doing}")
 
 
-def _of_pod(problem: Problem) -> bool:
+def _of_pod(problem: ClusterFinding) -> bool:
     """Whether it concerns one of the users' pods, without which the others are served."""
-    about = problem.about if isinstance(problem, ClusterFinding) else None
-    return about is not None and about.kind == "Pod"
+    return problem.about is not None and problem.about.kind == "Pod"
 
 
-def _allocated(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Condition:
+def _allocated(wanted: Sequence[NodeState], problems: Sequence[ClusterFinding]) -> Condition:
     if not wanted:
         return Condition(PORTS, "True", _NO_PODS, "no pod is selected, so no ports are needed")
     lacking = [state for state in wanted if state.range is None]
@@ -260,17 +251,19 @@ def _allocated(wanted: Sequence[NodeState], problems: Sequence[Problem]) -> Cond
     if not lacking and not refused:
         return Condition(PORTS, "True", "Allocated", "every node with selected pods has its ports")
     reason = CONFLICT if refused else EXHAUSTED
-    lines = [_one_line(one) for one in problems if _reason_of(one) in (CONFLICT, EXHAUSTED)]
+    lines = [_one_line(one) for one in problems if one.reason in (CONFLICT, EXHAUSTED)]
     names = ", ".join(state.name for state in (*refused, *lacking))
     return Condition(PORTS, "False", reason, "; ".join(lines) or f"node {names}: no ports yet")
 
 
-def _reached(states: Sequence[NodeState], problems: Sequence[Problem], former: Json) -> Condition:
+def _reached(
+    states: Sequence[NodeState], problems: Sequence[ClusterFinding], former: Json
+) -> Condition:
     """Of proxies that are not asked yet nothing is known: what was so far holds on."""
     proxies = [state for state in states if state.proxy is not None]
     answers = [one.answer for one in proxies if one.answer is not None and one.answer.answered]
     if not all(answer.master_up for answer in answers):
-        lines = [_one_line(one) for one in problems if _reason_of(one) == NO_MASTER]
+        lines = [_one_line(one) for one in problems if one.reason == NO_MASTER]
         return Condition(MASTER, "False", NO_MASTER, "; ".join(lines) or "it is not reached")
     if not proxies:
         return Condition(MASTER, "Unknown", "NoProxies", "there is no proxy that could tell")
@@ -281,8 +274,8 @@ def _reached(states: Sequence[NodeState], problems: Sequence[Problem], former: J
     return next(map(_read, was), unknown)
 
 
-def _degraded(problems: Sequence[Problem]) -> Condition:
+def _degraded(problems: Sequence[ClusterFinding]) -> Condition:
     if not problems:
         return Condition(DEGRADED, "False", "AsExpected", "nothing is wrong")
     lines = "; ".join(map(_one_line, problems))
-    return Condition(DEGRADED, "True", _reason_of(problems[0]), lines)
+    return Condition(DEGRADED, "True", problems[0].reason, lines)

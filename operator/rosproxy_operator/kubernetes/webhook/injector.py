@@ -99,12 +99,12 @@ class Injector:
         pod = objects.pod(body)
         found, unusable = rosproxies(self._api.rosproxies(pod.id.namespace, SOON))
         usable = [each for each in found.values() if not each.deleting]
-        choice = chosen(pod, usable)
-        if choice.rosproxy is not None:
-            address, hold = self._address(choice.rosproxy, dry_run)
-            return wire(body, master_uri(address), choice.rosproxy.spec.host_aliases), hold
-        if choice.finding is not None:
-            return Wiring(warnings=(NOT_WIRED + choice.finding.text,)), 0.0
+        of = chosen(pod, usable)
+        if isinstance(of, RosProxy):
+            address, hold = self._address(of, dry_run)
+            return wire(body, master_uri(address), of.spec.host_aliases), hold
+        if of is not None:
+            return Wiring(warnings=(NOT_WIRED + of.text,)), 0.0
         text = nobody(pod, usable)
         why = [f"RosProxy {one.id.name}: {one.text}" for one in unusable.values()]
         return Wiring(warnings=("; ".join([NOT_WIRED + text, *why]),) if text else ()), 0.0

@@ -3,8 +3,8 @@
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
     Json,
     MasterSpec,
     Name,
@@ -18,8 +18,9 @@ from rosproxy_operator.kubernetes.resources.model import (
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_name, service_name
-from rosproxy_operator.kubernetes.status.status import findings, status_of
+from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_id, service_id
+from rosproxy_operator.kubernetes.status.findings import findings
+from rosproxy_operator.kubernetes.status.status import status_of
 
 Obj = dict[str, Any]
 
@@ -57,7 +58,7 @@ def pod_obj(name: str = "talker", labels: Obj | None = None, **spec: Any) -> Obj
 
 def proxy_obj(of: str = "arm", node: str = "node1", status: Obj | None = None) -> Obj:
     """A proxy's pod."""
-    name = proxy_name(of, node)
+    name = proxy_id(Name(NAMESPACE, of), node).name
     owner = {
         "apiVersion": "rosproxy.io/v1alpha1",
         "kind": "RosProxy",
@@ -102,7 +103,7 @@ def service_obj(of: str = "arm", **meta: Any) -> Obj:
     owners = proxy_obj(of)["metadata"]["ownerReferences"]
     return {
         "metadata": {
-            "name": service_name(of),
+            "name": service_id(Name(NAMESPACE, of)).name,
             "namespace": NAMESPACE,
             "uid": "uid-service",
             "labels": own_labels(of),
@@ -131,7 +132,7 @@ def pod(name: str = "talker", labels: Obj | None = None, **more: Any) -> Pod:
 
 def proxy(node: str = "node1", ready: bool = True, **more: Any) -> ProxyPod:
     """A proxy that has been read."""
-    name = proxy_name("arm", node)
+    name = proxy_id(Name(NAMESPACE, "arm"), node).name
     own = pod(name, own_labels("arm"), node=node, ip="10.244.1.9", **more.pop("pod", {}))
     of = Name(NAMESPACE, "arm")
     return ProxyPod(own, of, "uid-arm", node, RANGE, "f", "rosproxy:1", ready=ready, **more)
@@ -163,7 +164,10 @@ SERVICE = ProxyService(Name("robots", "arm"), "uid-arm", "uid-service", CLUSTER_
 
 
 def status(
-    *states: NodeState, of: RosProxy | None = None, more: tuple[Problem, ...] = (), **given: Any
+    *states: NodeState,
+    of: RosProxy | None = None,
+    more: tuple[ClusterFinding, ...] = (),
+    **given: Any,
 ) -> Json:
     """The status that follows from some nodes; ``more`` problems besides those that they have."""
     one = of or rosproxy()

@@ -82,9 +82,9 @@ class Clusters(World):
 
     def namesake(self, n: int, m: int) -> None:
         """A pod that is called as a proxy would be."""
-        name = names.proxy_name(pick(ROSPROXIES, n), pick(list(NODES), m))
-        if self.nodes and Name(NAMESPACE, name) not in self.cluster.state.pods:
-            self.cluster.add_pod(name, pick(self.nodes, n), {})
+        id = names.proxy_id(Name(NAMESPACE, pick(ROSPROXIES, n)), pick(list(NODES), m))
+        if self.nodes and id not in self.cluster.state.pods:
+            self.cluster.add_pod(id.name, pick(self.nodes, n), {})
 
     def register(self, n: int, _: int) -> None:
         """ROS nodes of all pods on a node register at its proxies, before anybody knows them."""

@@ -10,11 +10,9 @@ from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import Action, CreateProxy, Emit, PatchStatus
 from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources.model import (
-    ClusterFinding,
     ClusterNode,
     ClusterSnapshot,
     MasterSpec,
@@ -26,6 +24,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
     Stuck,
 )
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 SETTINGS = ClusterSettings(image="rosproxy:1")
 STAMP = "2026-01-01T00:00:00Z"
@@ -170,8 +169,7 @@ def status(found: ClusterPlan, of: Name = ROBOT) -> Mapping[str, Any]:
 
 def told(found: ClusterPlan, reason: str) -> list[str]:
     """The texts of findings with a reason."""
-    some = (one for one in found.problems if isinstance(one, ClusterFinding))
-    return [f"{one.subject}: {one.text}" for one in some if one.reason == reason]
+    return [f"{one.subject}: {one.text}" for one in found.problems if one.reason == reason]
 
 
 def ports_of(action: Any) -> str:

@@ -21,12 +21,12 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.planner.settings import ClusterSettings
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources import objects as parse
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Name, ProxyReport
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 NAMESPACE = "ros"
 BAD_IMAGE = "no-such-image"

@@ -20,7 +20,12 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name, RosProxy
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterSnapshot,
+    Name,
+    Reference,
+    RosProxy,
+)
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from rosproxy_operator.kubernetes.resources.spec import rosproxy
 from tests.unit.operator.kubernetes.api_server import ApiServer
@@ -28,7 +33,7 @@ from tests.unit.operator.kubernetes.builders_api import NAMESPACE, proxy_obj, ro
 
 OF = Name(NAMESPACE, "arm")
 OWNER = {"apiVersion": "rosproxy.io/v1alpha1", "kind": "RosProxy", "name": "arm", "uid": "uid-arm"}
-ABOUT = {"kind": "RosProxy", "namespace": NAMESPACE, "name": "arm", "uid": "uid-arm"}
+ABOUT = Reference("RosProxy", Name(NAMESPACE, "arm"), "uid-arm")
 
 
 class Carried:
@@ -141,7 +146,7 @@ async def test_another_image(server: ApiServer, carry: Carried) -> None:
 async def test_a_status_is_replaced_whole(server: ApiServer, carry: Carried) -> None:
     old = {"message": "old", "perNode": [{"name": "a"}, {"name": "b"}]}
     server.put("rosproxies", rosproxy_obj(status=old), NAMESPACE)
-    await carry.out(PatchStatus(OF, {"perNode": []}), rosproxies=(seen(old),))
+    await carry.out(PatchStatus(OF, seen().uid, {"perNode": []}), rosproxies=(seen(old),))
     held = server.get("rosproxies", "arm", NAMESPACE)
     assert held["status"] == {"perNode": []}
     assert held["spec"] == rosproxy_obj()["spec"]
@@ -154,7 +159,7 @@ async def test_the_status_of_a_new_rosproxy_of_that_name_is_left_alone(
     again = rosproxy_obj()
     again["metadata"]["uid"] = "another"
     server.put("rosproxies", again, NAMESPACE)
-    await carry.out(PatchStatus(OF, {"nodes": 1}))
+    await carry.out(PatchStatus(OF, seen().uid, {"nodes": 1}))
     assert server.get("rosproxies", "arm", NAMESPACE)["status"] == {}
     assert not carry.applier.problems
 
@@ -164,12 +169,12 @@ async def test_a_status_that_cannot_be_written_is_a_problem_until_it_can(
 ) -> None:
     server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     server.refuse("PATCH", "rosproxies", 422, "status.nodes: Invalid value")
-    await carry.out(PatchStatus(OF, {"nodes": "?"}))
+    await carry.out(PatchStatus(OF, seen().uid, {"nodes": "?"}))
     (problem,) = carry.applier.problems.values()
     assert problem.subject == f"rosproxy {OF}"
     assert problem.text == "its status can't be written: status.nodes: Invalid value"
     server.refusals.clear()
-    await carry.out(PatchStatus(OF, {"nodes": 2}))
+    await carry.out(PatchStatus(OF, seen().uid, {"nodes": 2}))
     assert not carry.applier.problems
 
 
@@ -184,7 +189,7 @@ async def test_a_failure_stops_no_other_action_but_what_tells_of_success(
         service,
         Emit(OF, ABOUT, "Normal", "ProxyCreated", "created"),
         Emit(OF, ABOUT, "Warning", "Invalid", "warned"),
-        PatchStatus(OF, {"nodes": 1}),
+        PatchStatus(OF, seen().uid, {"nodes": 1}),
     )
     assert [failure.text for failure in carry.applier.failures[OF]] == [
         'violates PodSecurity "baseline:latest": hostPort'
@@ -234,7 +239,7 @@ async def test_an_event_is_made_once_and_counted_now_and_then(
     for _ in range(3):
         await carry.out(event)
     (made,) = server.all("events")
-    assert (made["count"], made["involvedObject"]) == (1, ABOUT)
+    assert (made["count"], made["involvedObject"]["uid"]) == (1, ABOUT.uid)
     assert made["metadata"]["namespace"] == NAMESPACE
     made["lastTimestamp"] = "2026-01-01T00:00:00Z"
     await carry.out(event)

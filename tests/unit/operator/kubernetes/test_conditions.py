@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.proxy_sync import no_answer
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Failure,
     MasterSpec,
     Name,
+    Obstacle,
     ProxyReport,
     Reference,
     Stuck,
 )
-from rosproxy_operator.kubernetes.status.status import findings
+from rosproxy_operator.kubernetes.status.findings import findings
 from tests.unit.operator.kubernetes.builders_api import (
     answer,
     judged,
@@ -77,7 +77,9 @@ def test_a_proxy_that_does_not_run(why, reason, said):
 
 def test_a_node_without_ports():
     text = "no 32 free ports in a row between 11400 and 11410: widen spec.portWindow"
-    found = status(state(range=None, proxy=None, answer=None, problem=text))
+    found = status(
+        state(range=None, proxy=None, answer=None, obstacle=Obstacle("PortsExhausted", text))
+    )
 
     for type in ("Ready", "PortsAllocated"):
         assert judged(found, type) == ("False", "PortsExhausted")
@@ -87,7 +89,8 @@ def test_a_node_without_ports():
 
 
 def test_another_reason_for_a_node_without_proxy():
-    found = status(state(proxy=None, answer=None, problem="is not ready", reason="NodeNotReady"))
+    obstacle = Obstacle("NodeNotReady", "is not ready")
+    found = status(state(proxy=None, answer=None, obstacle=obstacle))
 
     assert judged(found, "Ready") == ("False", "NodeNotReady")
 
@@ -139,7 +142,9 @@ def test_a_pod_that_is_left_out_keeps_the_others_ready():
 
 
 def test_a_problem_without_a_reason():
-    found = status(state(proxy=None, answer=None), more=(Problem("service x", "is not there"),))
+    found = status(
+        state(proxy=None, answer=None), more=(ClusterFinding("service x", "is not there"),)
+    )
 
     assert judged(found, "Ready") == ("False", "Problem")
     assert message(found) == "service x: is not there"
@@ -200,12 +205,6 @@ def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
 
     assert found.text.endswith(fix)
     assert len(found.text) <= 600
-
-
-def test_a_namespace_that_is_being_deleted_is_no_problem():
-    text = "unable to create new content in namespace robots because it is being terminated"
-
-    assert findings(rosproxy(), (), (Failure("robots/x", text),)) == ()
 
 
 def test_findings_are_told_at_the_rosproxy():

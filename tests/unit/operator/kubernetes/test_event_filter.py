@@ -18,7 +18,7 @@ def cluster(**more: Any) -> ClusterSnapshot:
 @pytest.fixture
 def event_filter() -> EventFilter:
     one = EventFilter()
-    one.learn(cluster())
+    one.last = cluster()
     return one
 
 
@@ -42,7 +42,7 @@ def test_pods_that_nobody_selects_do_not_matter(event_filter: EventFilter) -> No
 
 
 def test_a_pod_that_lost_its_label_matters(event_filter: EventFilter) -> None:
-    event_filter.learn(cluster(selected=frozenset({"uid-talker"})))
+    event_filter.last = cluster(selected=frozenset({"uid-talker"}))
     assert event_filter.pod("MODIFIED", pod_obj("talker", {}))
 
 
@@ -78,7 +78,7 @@ def test_a_nodes_heartbeat_does_not_matter(event_filter: EventFilter) -> None:
 def test_services_of_masters_matter(event_filter: EventFilter) -> None:
     service = {"metadata": {"name": "roscore", "namespace": "ros", "uid": "u"}, "spec": {}}
     assert not event_filter.service("ADDED", service)
-    event_filter.learn(cluster(masters={Name("ros", "roscore"): ("", "no such")}))
+    event_filter.last = cluster(masters={Name("ros", "roscore"): ("", "no such")})
     assert event_filter.service("ADDED", service)
     assert not event_filter.service("MODIFIED", service)
 

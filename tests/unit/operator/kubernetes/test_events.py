@@ -1,6 +1,5 @@
 """Which Kubernetes Events are made."""
 
-from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -9,7 +8,14 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, Reference
-from rosproxy_operator.kubernetes.status.events import LONGEST, MOST, QUIET, results, warnings
+from rosproxy_operator.kubernetes.status.events import (
+    LONGEST,
+    MOST,
+    QUIET,
+    event_body,
+    results,
+    warnings,
+)
 from tests.unit.operator.kubernetes.builders_api import proxy_obj, rosproxy
 
 ARM = Name("robots", "arm")
@@ -26,7 +32,7 @@ def test_a_problem_that_is_new_is_told():
     (emit,) = found.emits
     assert (emit.of, emit.type, emit.reason) == (ARM, "Warning", "PortsExhausted")
     assert emit.message == "node node1: no ports"
-    assert emit.about == {
+    assert event_body(emit, 0.0)["involvedObject"] == {
         "apiVersion": "rosproxy.io/v1alpha1",
         "kind": "RosProxy",
         "namespace": "robots",
@@ -37,14 +43,13 @@ def test_a_problem_that_is_new_is_told():
 
 
 def test_a_pods_problem_is_told_at_the_pod():
-    about = Reference("Pod", Name("robots", "talker"), "uid-talker")
-    one = ClusterFinding(
-        "pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=about
-    )
+    pod = Reference("Pod", Name("robots", "talker"), "uid-talker")
+    one = ClusterFinding("pod robots/talker", "is not wired", reason="NotWired", of=ARM, about=pod)
 
     (emit,) = warnings([one], {}, 0.0).emits
 
-    assert (emit.about["apiVersion"], emit.about["kind"]) == ("v1", "Pod")
+    about = event_body(emit, 0.0)["involvedObject"]
+    assert (about["apiVersion"], about["kind"]) == ("v1", "Pod")
     assert emit.message == "is not wired"
 
 
@@ -76,7 +81,7 @@ def test_another_text_is_another_problem():
 
 
 def test_problems_without_an_object_make_no_event():
-    assert warnings([finding(about=None), Problem("x", "y")], {}, 0.0).emits == ()
+    assert warnings([finding(about=None)], {}, 0.0).emits == ()
 
 
 def test_the_same_problem_twice_makes_one_event():
@@ -106,7 +111,7 @@ def test_what_is_done_is_told():
         CreateProxy(ARM, "node1", body),
         SetImage(ARM, pod, "u", "rosproxy:2"),
         DeleteProxy(ARM, pod, "u", "no selected pod is left on node1"),
-        PatchStatus(ARM, {}),
+        PatchStatus(ARM, "uid-arm", {}),
         SetImage(Name("robots", "leg"), pod, "u", "rosproxy:3"),
     ]
 
@@ -118,4 +123,4 @@ def test_what_is_done_is_told():
         ("Normal", "ImageSet", f"gave pod {pod.name} the image rosproxy:2"),
         ("Normal", "ProxyDeleted", f"deleted pod {pod.name}: no selected pod is left on node1"),
     ]
-    assert {one.about["uid"] for one in found} == {"uid-arm"}
+    assert {one.about for one in found} == {OF_ARM}

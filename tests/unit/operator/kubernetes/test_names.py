@@ -11,20 +11,24 @@ LABEL = st.from_regex(r"[a-z0-9]([-a-z0-9]{0,44}[a-z0-9])?", fullmatch=True)
 SUBDOMAIN = st.lists(LABEL, min_size=1, max_size=5).map(".".join)
 
 
+def proxy_name(of: str, node: str) -> str:
+    return names.proxy_id(Name("ros", of), node).name
+
+
 def test_a_proxys_name_says_whose_it_is_and_where() -> None:
-    assert names.proxy_name("robot", "worker-1.example.org") == (
-        "rosproxy-robot-worker-1-example-org-e6cda6"
+    assert (
+        proxy_name("robot", "worker-1.example.org") == "rosproxy-robot-worker-1-example-org-e6cda6"
     )
 
 
 def test_nodes_whose_names_look_alike_have_proxies_of_different_names() -> None:
-    assert names.proxy_name("robot", "a.b") != names.proxy_name("robot", "a-b")
-    assert names.proxy_name("a-b", "c") != names.proxy_name("a", "b-c")
+    assert proxy_name("robot", "a.b") != proxy_name("robot", "a-b")
+    assert proxy_name("a-b", "c") != proxy_name("a", "b-c")
 
 
 @given(LABEL, SUBDOMAIN)
 def test_a_proxys_name_is_always_a_host_name(of: str, node: str) -> None:
-    name = names.proxy_name(of, node)
+    name = proxy_name(of, node)
     assert len(name) <= 63
     assert set(name) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
     assert name.startswith(f"rosproxy-{of}-")
@@ -33,7 +37,7 @@ def test_a_proxys_name_is_always_a_host_name(of: str, node: str) -> None:
 
 @given(LABEL)
 def test_a_services_name_is_a_label(of: str) -> None:
-    assert len(names.service_name(of)) <= 63
+    assert len(names.service_id(Name("ros", of)).name) <= 63
 
 
 def test_names_are_in_the_rosproxys_namespace() -> None:

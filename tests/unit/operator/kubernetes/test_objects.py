@@ -48,7 +48,14 @@ def test_a_node():
     assert found.addresses == {"InternalIP": "10.88.0.11", "Hostname": "node1"}
     assert found.advertise_host == "arm.example"
     assert found.pod_networks == ("10.244.1.0/24", "fd00:1::/64")
-    assert (found.ready, found.cordoned, found.deleting) == (True, False, False)
+    assert (found.ready, found.deleting) == (True, False)
+
+
+def test_a_cordoned_node_is_as_any_other():
+    spec = {"spec": {"podCIDR": "10.244.1.0/24"}}
+    cordoned = {"spec": {**spec["spec"], "unschedulable": True}}
+
+    assert node(cordoned) == node(spec)
 
 
 @pytest.mark.parametrize("status", ["False", "Unknown"])
@@ -61,7 +68,7 @@ def test_a_node_whose_kubelet_is_gone_is_not_ready(status):
 def test_a_node_that_was_just_made_is_not_ready_and_has_nothing():
     found = node({"metadata": {"name": "node3"}, "spec": {"unschedulable": True}})
 
-    assert (found.ready, found.cordoned, found.pod_networks) == (False, True, ())
+    assert (found.ready, found.pod_networks) == (False, ())
 
 
 def test_a_pod():

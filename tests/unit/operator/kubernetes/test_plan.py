@@ -99,11 +99,6 @@ def test_other_pods_get_no_proxy(other: Any) -> None:
     assert done(look(observed(rosproxy(), service(), other))) == []
 
 
-def test_a_cordoned_node_gets_its_proxy_nonetheless() -> None:
-    found = look(scene(node(cordoned=True)))
-    assert kinds(found) == [CreateProxy]
-
-
 def test_on_a_node_that_is_not_ready_nothing_is_created_nor_deleted() -> None:
     away = node(ready=False)
     found = look(scene(away))

@@ -15,7 +15,12 @@ from rosproxy_operator.kubernetes.planner.selection import (
     nobody,
     on_node,
 )
-from rosproxy_operator.kubernetes.resources.model import ClusterNode, Name, Selector
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
+    ClusterNode,
+    Name,
+    Selector,
+)
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 
@@ -107,7 +112,7 @@ def test_the_api_server_gives_exactly_the_pods_that_are_taken(selector, labels):
 
     asked = server_side(label_selector(one.spec, one.id.name), labels)
 
-    assert asked is (chosen(pod(labels=labels), [one]).rosproxy is one)
+    assert asked is (chosen(pod(labels=labels), [one]) is one)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +127,7 @@ def test_the_api_server_gives_exactly_the_pods_that_are_taken(selector, labels):
 def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
     one = rosproxy()
 
-    assert chosen(pod(**more), [one]).rosproxy is (one if taken else None)
+    assert chosen(pod(**more), [one]) is (one if taken else None)
 
 
 @pytest.mark.parametrize(
@@ -136,19 +141,19 @@ def test_a_pod_is_taken_by_its_label_in_its_namespace(more, taken):
     ],
 )
 def test_pods_that_no_selector_takes(labels):
-    assert chosen(pod(labels=labels), [rosproxy(selector=ALL)]) == chosen(pod(), [])
+    assert chosen(pod(labels=labels), [rosproxy(selector=ALL)]) is None
 
 
 def test_a_rosproxy_that_is_being_deleted_takes_no_pod():
     gone, new = rosproxy("gone", deleting=True), rosproxy("new")
 
-    assert chosen(pod(), [gone, new]).rosproxy is new
+    assert chosen(pod(), [gone, new]) is new
 
 
 def test_of_two_the_label_decides():
     arm, leg = rosproxy("arm", ALL), rosproxy("leg", ALL)
 
-    assert chosen(pod(labels={INJECT: "leg"}), [arm, leg]).rosproxy is leg
+    assert chosen(pod(labels={INJECT: "leg"}), [arm, leg]) is leg
 
 
 @pytest.mark.parametrize("labels", [{INJECT: "true"}, {}, {INJECT: "third"}])
@@ -157,22 +162,20 @@ def test_a_pod_that_two_select_has_none(labels):
 
     found = chosen(pod(labels=labels), [leg, arm])
 
-    assert found.rosproxy is None
-    assert found.finding is not None
-    assert (found.finding.reason, found.finding.of) == ("Ambiguous", arm.id)
-    assert found.finding.subject == "pod robots/talker"
-    assert found.finding.about is not None
-    assert (found.finding.about.kind, found.finding.about.uid) == ("Pod", "uid-talker")
-    assert "arm and leg" in found.finding.text
-    assert f"{INJECT}=arm" in found.finding.text
+    assert isinstance(found, ClusterFinding)
+    assert (found.reason, found.of) == ("Ambiguous", arm.id)
+    assert found.subject == "pod robots/talker"
+    assert found.about is not None
+    assert (found.about.kind, found.about.uid) == ("Pod", "uid-talker")
+    assert "arm and leg" in found.text
+    assert f"{INJECT}=arm" in found.text
 
 
 def test_a_pod_in_its_nodes_own_network_is_left_out():
     found = chosen(pod(host_network=True), [rosproxy()])
 
-    assert found.rosproxy is None
-    assert found.finding is not None
-    assert (found.finding.reason, found.finding.of) == ("HostNetwork", Name("robots", "arm"))
+    assert isinstance(found, ClusterFinding)
+    assert (found.reason, found.of) == ("HostNetwork", Name("robots", "arm"))
 
 
 def test_a_pod_that_is_not_labelled_needs_no_warning():

@@ -10,16 +10,17 @@ from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     NodeState,
+    Obstacle,
     ProxyReport,
     Reference,
     Selector,
     Stuck,
 )
+from rosproxy_operator.kubernetes.status.findings import invalid_finding
 from rosproxy_operator.kubernetes.status.status import (
     LONGEST,
     MOST_NAMES,
     MOST_NODES,
-    invalid_finding,
     status_of_invalid,
 )
 from tests.unit.operator.kubernetes.builders_api import (
@@ -251,8 +252,7 @@ _states = st.lists(
         _proxies,
         st.sampled_from([(), (pod(),)]),
         _answers,
-        st.sampled_from(["", "wrong"]),
-        st.sampled_from(["", "Reason", "no reason"]),
+        st.none() | st.builds(Obstacle, st.sampled_from(["Reason", "no reason"]), st.just("wrong")),
     ),
     max_size=3,
     unique_by=lambda one: one.name,

@@ -9,7 +9,12 @@ from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
-from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, ProxyPlace, ProxyPod
+from rosproxy_operator.kubernetes.resources.model import (
+    Name,
+    ProxyPlace,
+    ProxyPod,
+    RosProxy,
+)
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     SETTINGS,
@@ -189,10 +194,10 @@ class World:
         rosproxies = [parse_rosproxy.rosproxy(copy.deepcopy(r)) for r in state.rosproxies.values()]
         wanted = set()
         for pod in map(objects.pod, state.pods.values()):
-            of = chosen(pod, rosproxies).rosproxy
+            of = chosen(pod, rosproxies)
             node = state.nodes.get(pod.node)
             if (
-                of
+                isinstance(of, RosProxy)
                 and node
                 and not pod.ended
                 and not pod.deleting
@@ -242,7 +247,6 @@ class World:
             and place.node in f"{one.subject} {one.text}".split(": ")[0] + one.text
             and fatal in (None, one.fatal)
             for one in found.problems
-            if isinstance(one, ClusterFinding)
         )
 
     def check_addresses(self, unready: set[str]) -> None:
