@@ -70,14 +70,14 @@ class RosProxy:
     def the_proxy(self, node: str = "node1", seconds: float = 30) -> Proxy:
         """The proxy on a node, once it is ready."""
 
+        ready: list[Proxy] = []
+
         def there() -> bool:
-            found = self.proxy_on(node)
-            return found is not None and found.ready
+            ready[:] = [one for one in self.proxies if one.on == node and one.ready]
+            return bool(ready)
 
         wait_until(there, seconds, lambda: f"a proxy of {self} on {node}: {self.tell()}")
-        found = self.proxy_on(node)
-        assert found is not None
-        return found
+        return ready[0]
 
     def condition(self, kind: str) -> Json:
         found = [c for c in self.status.get("conditions", []) if c["type"] == kind]
