@@ -19,6 +19,8 @@ from enum import Enum
 from typing import Any
 from urllib.parse import urlsplit
 
+from rosproxy.net.resolver import resolve
+
 Where = tuple[str, int]
 """Host and port."""
 Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -131,8 +133,12 @@ def authority(address: Where) -> str:
 
 async def connect(address: Where, source: str = "") -> Streams:
     """Open a connection, from `source` if it is of the same family. Raises OSError."""
-    local = (source, 0) if source and ":" not in address[0] else None
-    return await asyncio.open_connection(*address, local_addr=local)
+    # Not by the event loop: uvloop's look-up logs a traceback when who waits for it is cancelled.
+    found = await resolve(address[0])
+    if not found:
+        raise OSError(f"{address[0]} has no address")
+    local = (source, 0) if source and ":" not in found[0] else None
+    return await asyncio.open_connection(found[0], address[1], local_addr=local)
 
 
 class FakeTcpServer:
