@@ -194,7 +194,7 @@ class DockerController:
         return problems
 
     def _port_taken(self, name: str, port: int | None) -> None:
-        self._memory = self._memory.port_taken(name, [port] if port else None, time.monotonic())
+        self._memory = self._memory.port_taken(name, port, time.monotonic())
 
     def _hear(self, connected: bool) -> None:
         """Take note of an event, or of a new connection: what happened before was missed."""

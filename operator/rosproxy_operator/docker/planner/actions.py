@@ -46,7 +46,7 @@ class CreateSandbox:
 class Create:
     """Create a proxy's container in the namespace of the one named ``sandbox``; don't start it.
 
-    ``replaces`` names the one whose token it takes over, if any.
+    ``replaces`` names the one in whose place it comes, if any.
     """
 
     name: str

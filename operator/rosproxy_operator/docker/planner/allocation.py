@@ -47,8 +47,8 @@ def _concluded(
     memory: DockerMemory, sandbox: Sandbox, refusal: PortRefusal, now: float
 ) -> DockerMemory:
     served, moved = memory.served.get(sandbox.key), dict(memory.moved)
-    named = {port for port in refusal.ports or () if port in sandbox.range}
-    hit = named or set(sandbox.range.ports())
+    port = refusal.port
+    hit = {port} if port and port in sandbox.range else set(sandbox.range.ports())
     fresh = {port for port in hit if served is None or port not in served}
     if served is not None and not fresh:
         if now - refusal.since < RETRY_FOR:

@@ -14,11 +14,11 @@ _HAS_SERVED = SERVING | {"exited", "dead", "removing"}
 class PortRefusal:
     """The engine didn't start a sandbox because of its ports.
 
-    ``since`` is when it first said so. ``ports`` are those that it named; None if it named none.
+    ``since`` is when it first said so. ``port`` is the one that it named; None if it named none.
     """
 
     since: float
-    ports: frozenset[int] | None
+    port: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +39,10 @@ class DockerMemory:
     taken: Mapping[int, float] = field(default_factory=dict)
     moved: Mapping[Key, Move] = field(default_factory=dict)
 
-    def port_taken(self, name: str, ports: Iterable[int] | None, now: float) -> "DockerMemory":
-        """Note that the engine could not start the sandbox ``name``: ports are taken.
-
-        ``ports`` are those that it named; None or nothing if it is not known which.
-        """
+    def port_taken(self, name: str, port: int | None, now: float) -> "DockerMemory":
+        """Note that the engine could not start the sandbox ``name``: a port of it is taken."""
         known = self.refusals.get(name)
-        refusal = PortRefusal(known.since if known else now, frozenset(ports or ()) or None)
+        refusal = PortRefusal(known.since if known else now, port)
         return replace(self, refusals={**self.refusals, name: refusal})
 
 

@@ -1,7 +1,6 @@
 """A pure engine: what actions do to a host, and what must never be done to it."""
 
 import itertools
-from collections.abc import Collection
 from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortRange
@@ -49,9 +48,9 @@ class Failed(Exception):
 class Refused(Failed):
     """A container can't be started because of its ports."""
 
-    def __init__(self, ports: Collection[int]) -> None:
-        super().__init__(f"ports are taken: {sorted(ports)}")
-        self.ports = ports
+    def __init__(self, port: int | None) -> None:
+        super().__init__(f"a port is taken: {port}")
+        self.port = port
 
 
 @dataclass
@@ -241,7 +240,7 @@ class Engine:
             if name not in self.networks or known not in ("", self.networks[name].id):
                 raise Failed(f"network {name} not found")
         if taken := self.conflicts(box):
-            raise Refused({min(taken)} if self.names_ports else ())
+            raise Refused(min(taken) if self.names_ports else None)
         home = self.home(box)
         if box.mode and (home is None or home.state not in STARTED):
             raise Failed("cannot join network of a non running container")
@@ -308,7 +307,7 @@ class Controller:
             self.engine.apply(action)
         except Refused as error:
             assert isinstance(action, Start)
-            self.memory = self.memory.port_taken(action.name, error.ports, self.now)
+            self.memory = self.memory.port_taken(action.name, error.port, self.now)
             return error
         except Failed as error:
             return error

@@ -1,6 +1,5 @@
 """What is done in which order, rule by rule. That it always ends well: test_plan_convergence."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -518,20 +517,18 @@ def test_exhausted() -> None:
     )
 
 
-def refused(
-    seen: HostState, ports: Iterable[int] | None, memory: DockerMemory, now: float
-) -> DockerPlan:
-    return look(seen, memory=memory.port_taken(PORTS, ports, now), now=now)
+def refused(seen: HostState, port: int | None, memory: DockerMemory, now: float) -> DockerPlan:
+    return look(seen, memory=memory.port_taken(PORTS, port, now), now=now)
 
 
 @pytest.mark.parametrize(
-    ("ports", "then"), [([11410], PortRange(11411, 11442)), (None, NEXT), ([99], NEXT)]
+    ("port", "then"), [(11410, PortRange(11411, 11442)), (None, NEXT), (99, NEXT)]
 )
 def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
-    ports: list[int] | None, then: PortRange
+    port: int | None, then: PortRange
 ) -> None:
     seen = observed(container(), sandboxes=[sandbox(state="created", networks=())])
-    found = refused(seen, ports, DockerMemory(), 0.0)
+    found = refused(seen, port, DockerMemory(), 0.0)
     assert found.actions[:4] == (
         Rename(PORTS, f"{PORTS}-old"),
         new_sandbox(then),
@@ -543,18 +540,18 @@ def test_a_new_sandbox_that_is_refused_gets_the_next_ports(
     assert look(seen, memory=forgets, now=300.0).actions != found.actions
 
 
-@pytest.mark.parametrize("ports", [[11410], None])
-def test_ports_that_have_served_are_tried_for_a_while(ports: list[int] | None) -> None:
+@pytest.mark.parametrize("port", [11410, None])
+def test_ports_that_have_served_are_tried_for_a_while(port: int | None) -> None:
     seen = observed(
         container(), sandboxes=[sandbox(state="exited", networks=())], proxies=[proxy()]
     )
-    first = refused(seen, ports, DockerMemory(), 100.0)
+    first = refused(seen, port, DockerMemory(), 100.0)
     assert first.actions[0] == Start(PORTS)
     assert first.again_in == 1.0
-    then = refused(seen, ports, first.memory, 119.9)
+    then = refused(seen, port, first.memory, 119.9)
     assert then.actions[0] == Start(PORTS)
-    last = refused(seen, ports, then.memory, 120.0)
-    assert created(last) == (PortRange(11411, 11442) if ports else NEXT)
+    last = refused(seen, port, then.memory, 120.0)
+    assert created(last) == (PortRange(11411, 11442) if port else NEXT)
     assert f"HAS LEFT ITS PORTS 11400-11431 for {created(last)}" in port_problem(last)
     assert last.memory.moved == {KEY: Move(RANGE, 120.0)}
     assert last.memory.served == {}
@@ -564,8 +561,8 @@ def test_added_ports_that_are_refused_are_given_up() -> None:
     memory = look(observed(container(labels=ASKS_FOR_40), **both())).memory
     longer = sandbox(ports=LONGER, state="created", networks=())
     seen = observed(container(labels=ASKS_FOR_40), sandboxes=[longer])
-    for ports in ([11435], None):
-        found = refused(seen, ports, memory, 1.0)
+    for port in (11435, None):
+        found = refused(seen, port, memory, 1.0)
         assert created(found) == RANGE
         assert "it keeps its 32" in port_problem(found)
 
