@@ -10,7 +10,7 @@ bin=${CLUSTER_BIN:-${XDG_CACHE_HOME:-$HOME/.cache}/rosproxy/cluster}
 
 declare -A package_of=(
   [containerd]=containerd [runc]=runc [iptables]=iptables [ip]=iproute2 [gcc]=gcc
-  [nsenter]=util-linux [conntrack]=conntrack
+  [nsenter]=util-linux [conntrack]=conntrack [sysctl]=procps
 )
 missing=()
 for command in "${!package_of[@]}"; do

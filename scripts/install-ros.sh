@@ -10,6 +10,6 @@ need install-ros \
     python3-rosbag python3-rosnode python3-rosparam python3-rosservice python3-rostopic \
     python3-roslaunch python3-rosmsg python3-std-srvs \
     libroscpp-dev libstd-msgs-dev libactionlib-dev libtopic-tools-dev \
-    g++ pkg-config iproute2 nftables conntrack libcap2-bin util-linux hostname
+    g++ pkg-config iproute2 nftables conntrack libcap2-bin procps util-linux hostname
 install_missing
 echo "install-ros: installed$missing"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 _PROGRAMS = (
     *("roscore", "rostopic", "rosbag", "g++", "pkg-config"),
-    *("ip", "nft", "conntrack", "setcap", "unshare"),
+    *("ip", "nft", "conntrack", "setcap", "sysctl", "unshare"),
 )
 _FILES = (
     "/usr/include/ros/ros.h",

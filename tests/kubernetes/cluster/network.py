@@ -13,7 +13,14 @@ from tests.kubernetes.cluster.layout import (
     Node,
 )
 
-_FORWARD = tuple(("FORWARD", side, BRIDGE, "-j", "ACCEPT") for side in ("-i", "-o"))
+_FORWARD = (
+    ("FORWARD", "-i", BRIDGE, "-j", "ACCEPT"),
+    ("FORWARD", "-o", BRIDGE, "-j", "ACCEPT"),
+    # A pod that calls a Service before its node's kube-proxy knows it must not end at another
+    # node's: only this machine finds Services by way of a node (`route_services`).
+    ("FORWARD", "-i", BRIDGE, "-d", SERVICE_NETWORK, "-j", "DROP"),
+)
+"""Each is put before the former ones."""
 _ROBOT_CABLE = "rpxrobot"
 
 
