@@ -174,7 +174,7 @@ class Executor:
             try:
                 await self._one(action, carry_out)
             except PortTaken as error:
-                self._port_taken(getattr(action, "name", ""), error.port)
+                self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
                 problem = Problem(_subject(group.key), f"{action}: {error}")

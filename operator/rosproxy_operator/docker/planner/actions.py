@@ -4,7 +4,9 @@ Containers are named, not numbered: a plan may start what it has yet to create. 
 action says what it does, in one plain and harmless line.
 """
 
-from dataclasses import dataclass
+from typing import ClassVar
+
+import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
@@ -12,127 +14,121 @@ from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
 
 
-@dataclass(frozen=True, slots=True)
-class CreateNetwork:
-    """Create the uplink network, an ordinary bridge."""
+class Action(msgspec.Struct, frozen=True):
+    """Something to be done to the container or network ``name``; its text begins with ``does``."""
 
+    does: ClassVar[str]
     name: str
 
     def __str__(self) -> str:
-        return clean(f"create network {self.name}, a bridge: the uplink of all proxies")
+        return clean(f"{self.does} {self.name}{self._more()}")
+
+    def _more(self) -> str:
+        """The rest of the text."""
+        return ""
 
 
-@dataclass(frozen=True, slots=True)
-class CreateSandbox:
-    """Create a sandbox on the uplink network, without starting it.
+class CreateNetwork(Action, frozen=True):
+    """Create the uplink network, an ordinary bridge."""
+
+    does = "create network"
+
+    def _more(self) -> str:
+        return ", a bridge: the uplink of all proxies"
+
+
+class _CreateContainer(Action, frozen=True):
+    """Create one of a proxy's two containers, without starting it."""
+
+    does = "create container"
+    key: Key
+    range: PortRange
+
+
+class CreateSandbox(_CreateContainer, frozen=True):
+    """Create a sandbox on the uplink network.
 
     With ``forwards`` the kernel may forward packets in its network namespace.
     """
 
-    name: str
-    key: Key
-    range: PortRange
     fingerprint: str = ""
     forwards: bool = False
 
-    def __str__(self) -> str:
-        return clean(
-            f"create container {self.name}: it holds ports {self.range} for the proxy of the "
-            f"master {self.key.master_uri}"
-        )
+    def _more(self) -> str:
+        return f": it holds ports {self.range} for the proxy of the master {self.key.master_uri}"
 
 
-@dataclass(frozen=True, slots=True)
-class Create:
-    """Create a proxy's container in the namespace of the one named ``sandbox``; don't start it.
+class Create(_CreateContainer, frozen=True):
+    """Create the container in which a proxy runs, in the namespace of the one named ``sandbox``.
 
     ``replaces`` names the one in whose place it comes, if any.
     """
 
-    name: str
-    key: Key
-    range: PortRange
     sandbox: str
     data_plane: DataPlane = "auto"
     fingerprint: str = ""
     replaces: str = ""
 
-    def __str__(self) -> str:
+    def _more(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
         rights = ", with NET_ADMIN" if self.data_plane == "kernel" else ""
-        return clean(
-            f"create container {self.name}: proxy of the master {self.key.master_uri} at "
-            f"{self.key.advertise_host}, ports {self.range} of {self.sandbox}{rights}{instead}"
+        return (
+            f": proxy of the master {self.key.master_uri} at {self.key.advertise_host}, "
+            f"ports {self.range} of {self.sandbox}{rights}{instead}"
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(Action, frozen=True):
     """Start a container that was created or has stopped."""
 
-    name: str
-
-    def __str__(self) -> str:
-        return clean(f"start container {self.name}")
+    does = "start container"
 
 
-@dataclass(frozen=True, slots=True)
-class Restart:
+class Restart(Action, frozen=True):
     """End a proxy and start it again: it runs in a namespace that is there no more."""
 
-    name: str
-
-    def __str__(self) -> str:
-        return clean(f"restart container {self.name}")
+    does = "restart container"
 
 
-@dataclass(frozen=True, slots=True)
-class Unpause:
+class Unpause(Action, frozen=True):
     """Resume a container that was paused."""
 
-    name: str
-
-    def __str__(self) -> str:
-        return clean(f"resume container {self.name}")
+    does = "resume container"
 
 
-@dataclass(frozen=True, slots=True)
-class Rename:
+class Rename(Action, frozen=True):
     """Give a container another name."""
 
-    name: str
+    does = "rename container"
     to: str
 
-    def __str__(self) -> str:
-        return clean(f"rename container {self.name} to {self.to}")
+    def _more(self) -> str:
+        return f" to {self.to}"
 
 
-@dataclass(frozen=True, slots=True)
-class Connect:
+class Connect(Action, frozen=True):
     """Join a sandbox to a network under these aliases."""
 
-    name: str
+    does = "connect container"
     network: str
     aliases: tuple[str, ...]
 
-    def __str__(self) -> str:
+    def _more(self) -> str:
         names = f" as {', '.join(self.aliases)}" if self.aliases else ""
-        return clean(f"connect container {self.name} to network {self.network}{names}")
+        return f" to network {self.network}{names}"
 
 
-@dataclass(frozen=True, slots=True)
-class Disconnect:
+class Disconnect(Action, frozen=True):
     """Take a sandbox off a network."""
 
-    name: str
+    does = "disconnect container"
     network: str
 
-    def __str__(self) -> str:
-        return clean(f"disconnect container {self.name} from network {self.network}")
+    def _more(self) -> str:
+        return f" from network {self.network}"
 
 
-@dataclass(frozen=True, slots=True)
-class Remove:
+class Remove(Action, frozen=True):
     """Kill and remove a container.
 
     With ``retire`` the proxy's nodes are unregistered at the master first: nobody takes over. With
@@ -140,25 +136,11 @@ class Remove:
     forwards there would never be closed.
     """
 
-    name: str
+    does = "remove container"
     why: str
     retire: bool = False
     stop: bool = False
 
-    def __str__(self) -> str:
+    def _more(self) -> str:
         after = ", after unregistering its nodes at the master" if self.retire else ""
-        return clean(f"remove container {self.name} ({self.why}){after}")
-
-
-Action = (
-    CreateNetwork
-    | CreateSandbox
-    | Create
-    | Start
-    | Restart
-    | Unpause
-    | Rename
-    | Connect
-    | Disconnect
-    | Remove
-)
+        return f" ({self.why}){after}"

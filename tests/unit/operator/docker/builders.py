@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from msgspec import structs
+
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
@@ -87,7 +89,7 @@ def sandbox(
     places = [place(n, *aliases) if isinstance(n, str) else n for n in networks]
     own = container(
         name,
-        own_labels(replace(create, fingerprint=made)),
+        own_labels(structs.replace(create, fingerprint=made)),
         [place(settings.uplink, name), *places],
         state,
         ports=ports.ports(),
@@ -111,7 +113,7 @@ def proxy(
     create = Create(name, key, ports, sandbox_name(key))
     made = made or proxy_fingerprint(create, settings, image)
     mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
-    labels = own_labels(replace(create, fingerprint=made))
+    labels = own_labels(structs.replace(create, fingerprint=made))
     own = container(name, labels, [], state, mode=mode)
     return Proxy(key, replace(own, started_at=started_at), ports, made)
 

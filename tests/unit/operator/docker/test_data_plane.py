@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from rosproxy.settings import DataPlane
 from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox
@@ -63,8 +64,8 @@ def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
 
 def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
-    box = sandbox_fingerprint(replace(SANDBOX, forwards=forwards), SETTINGS)
-    process = proxy_fingerprint(replace(PROXY, data_plane=plane), SETTINGS, IMAGE)
+    box = sandbox_fingerprint(structs.replace(SANDBOX, forwards=forwards), SETTINGS)
+    process = proxy_fingerprint(structs.replace(PROXY, data_plane=plane), SETTINGS, IMAGE)
     return sandbox(made=box), proxy(made=process)
 
 
@@ -106,14 +107,16 @@ def test_the_first_container_of_a_host(plane: DataPlane) -> None:
 
 
 def test_the_capability_is_for_the_kernel_plane_alone() -> None:
-    host = container_config(replace(PROXY, data_plane="kernel"), SETTINGS, "t", "")["HostConfig"]
+    host = container_config(structs.replace(PROXY, data_plane="kernel"), SETTINGS, "t", "")[
+        "HostConfig"
+    ]
     assert host["CapAdd"] == ["NET_ADMIN"]
     assert host["CapDrop"] == ["ALL"]
     assert host["SecurityOpt"] == ["no-new-privileges:false"]
     assert host["ReadonlyRootfs"] is True
     assert not {"Privileged", "Binds", "Devices", "Sysctls"} & host.keys()
     for plane in ("auto", "splice", "copy"):
-        spec = replace(PROXY, data_plane=plane)
+        spec = structs.replace(PROXY, data_plane=plane)
         host = container_config(spec, SETTINGS, "t", "")["HostConfig"]
         assert "CapAdd" not in host
         assert host["SecurityOpt"] == ["no-new-privileges:true"]
@@ -121,14 +124,14 @@ def test_the_capability_is_for_the_kernel_plane_alone() -> None:
 
 @pytest.mark.parametrize("plane", ["auto", "kernel", "splice", "copy"])
 def test_the_proxy_is_told(plane: DataPlane) -> None:
-    body = container_config(replace(PROXY, data_plane=plane), SETTINGS, "t", "")
+    body = container_config(structs.replace(PROXY, data_plane=plane), SETTINGS, "t", "")
     told = [pair for pair in body["Env"] if pair.startswith("ROSPROXY_DATA_PLANE=")]
     assert told == ([] if plane == "auto" else [f"ROSPROXY_DATA_PLANE={plane}"])
     assert body["User"] == "10001:10001"
 
 
 def test_the_sandbox_forwards_and_gets_no_capability() -> None:
-    host = sandbox_config(replace(SANDBOX, forwards=True), SETTINGS)["HostConfig"]
+    host = sandbox_config(structs.replace(SANDBOX, forwards=True), SETTINGS)["HostConfig"]
     assert host["Sysctls"] == {
         "net.ipv4.ip_local_port_range": "1024 11000",
         "net.ipv4.ip_forward": "1",
@@ -139,7 +142,7 @@ def test_the_sandbox_forwards_and_gets_no_capability() -> None:
 
 
 def test_the_plan_names_the_capability() -> None:
-    texts = [str(replace(PROXY, data_plane=plane)) for plane in ("kernel", "splice")]
+    texts = [str(structs.replace(PROXY, data_plane=plane)) for plane in ("kernel", "splice")]
     assert ["NET_ADMIN" in text for text in texts] == [True, False]
 
 

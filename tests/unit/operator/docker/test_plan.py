@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import Move
@@ -60,14 +61,14 @@ ASKS_FOR_40 = {**ENABLED, "rosproxy.ports": "40"}
 
 def new_sandbox(ports: PortRange = RANGE, name: str = PORTS) -> CreateSandbox:
     made = CreateSandbox(name, KEY, ports)
-    return replace(made, fingerprint=sandbox_fingerprint(made, SETTINGS))
+    return structs.replace(made, fingerprint=sandbox_fingerprint(made, SETTINGS))
 
 
 def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
     made = Create(NAME, KEY, ports, home, replaces=replaces)
-    return replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image))
+    return structs.replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image))
 
 
 def look(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
@@ -95,7 +96,7 @@ def test_ports_are_published_on_each_address_asked_for() -> None:
 def test_the_proxy_accepts_its_environment(port: int) -> None:
     """A second roscore is often at 11312, where the admin endpoint usually is."""
     key = Key(f"http://robot:{port}", HERE)
-    body = container_config(replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
+    body = container_config(structs.replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
     settings = settings_of(dict(pair.split("=", 1) for pair in body["Env"]))
     assert settings.admin.port == admin_port(key)
     assert reserved_ports(key) == {port, settings.admin.port}
@@ -103,23 +104,25 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
 
 def test_what_makes_a_sandbox_anew() -> None:
     now = sandbox_fingerprint(SANDBOX, SETTINGS)
-    renamed = replace(SANDBOX, name="other", fingerprint="")
+    renamed = structs.replace(SANDBOX, name="other", fingerprint="")
     assert now == sandbox_fingerprint(renamed, replace(SETTINGS, image="other", grace=1.0))
-    assert now != sandbox_fingerprint(replace(SANDBOX, range=RANGE), SETTINGS)
-    assert now != sandbox_fingerprint(replace(SANDBOX, forwards=True), SETTINGS)
+    assert now != sandbox_fingerprint(structs.replace(SANDBOX, range=RANGE), SETTINGS)
+    assert now != sandbox_fingerprint(structs.replace(SANDBOX, forwards=True), SETTINGS)
     assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, publish=("::",)))
     assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, uplink="0-other"))
 
 
 def test_what_makes_a_proxy_anew() -> None:
     now = proxy_fingerprint(PROXY, SETTINGS, IMAGE)
-    renamed = replace(PROXY, name="other", sandbox="another", fingerprint="", replaces="old")
+    renamed = structs.replace(
+        PROXY, name="other", sandbox="another", fingerprint="", replaces="old"
+    )
     other = replace(SETTINGS, image="other", publish=("::",))
     assert now == proxy_fingerprint(renamed, other, IMAGE)
     assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2")
-    assert now != proxy_fingerprint(replace(PROXY, range=RANGE), SETTINGS, IMAGE)
+    assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE)
     elsewhere = Key(KEY.master_uri, "192.0.2.11")
-    assert now != proxy_fingerprint(replace(PROXY, key=elsewhere), SETTINGS, IMAGE)
+    assert now != proxy_fingerprint(structs.replace(PROXY, key=elsewhere), SETTINGS, IMAGE)
 
 
 def test_fingerprints_stay_as_they_were() -> None:
