@@ -5,6 +5,7 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from rosproxy.net.addresses import HostPort, is_loopback
@@ -21,19 +22,9 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
 
     Raises SettingError if they don't go together.
     """
-    settings = PlanSettings(
-        master_uri=options["master_uri"] or "",
-        advertise_host=options["advertise_host"] or "",
-        ports=options["ports"],
-        window=options["port_window"],
-        publish=options["publish_address"],
-        image=options["proxy_image"],
-        expose_by_default=options["expose_by_default"],
-        grace=options["grace"],
-        uplink=options["uplink"],
-        data_plane=options["data_plane"],
-    )
-    window, ports = settings.window, settings.ports
+    named = {field.name: options[field.name] for field in fields(PlanSettings)}
+    settings = PlanSettings(**named)
+    window, ports = settings.port_window, settings.ports
     if len(window) < ports:
         raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")
     return settings

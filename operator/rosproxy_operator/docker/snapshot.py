@@ -175,7 +175,7 @@ class DockerObserver:
         rows, found, image = await asyncio.gather(
             in_thread(self._engine.containers),
             in_thread(self._engine.networks),
-            in_thread(self._engine.image_id, self._settings.image),
+            in_thread(self._engine.image_id, self._settings.proxy_image),
         )
         # What is the operator's own is inspected at each look: a proxy's container has no network
         # by which to see that it was started anew, and the list is late to tell that one has ended.

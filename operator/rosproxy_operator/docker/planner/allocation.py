@@ -123,7 +123,7 @@ class _Allocation:
 
     def fill(self, desired: Desired, frozen: bool) -> None:
         """Give a key more ports if it has too few, or a range if it has none."""
-        key, count, window = desired.key, desired.ports, self.settings.window
+        key, count, window = desired.key, desired.ports, self.settings.port_window
         blocked, held = self.blocked | reserved_ports(key), self.held(key)
         kept = self.given.get(key)
         if kept is None:

@@ -20,20 +20,20 @@ WINDOW = PortRange(11400, 65535)
 
 @dataclass(frozen=True, slots=True)
 class PlanSettings:
-    """The operator's options that decide what is planned.
+    """The operator's options that decide what is planned, by their names.
 
-    ``master_uri``, ``advertise_host`` (both may be empty) and ``data_plane`` are for containers
-    without a label of their own. ``ports`` is the least number that a proxy gets, ``window`` where
-    they are looked for, ``publish`` the host's addresses on which they are published. ``grace`` is
-    in seconds: how long a proxy outlives its last container.
+    ``master_uri``, ``advertise_host`` (None if not given) and ``data_plane`` are for containers
+    without a label of their own. ``ports`` is the least number that a proxy gets, ``port_window``
+    where they are looked for, ``publish_address`` the host's addresses on which they are published.
+    ``grace`` is in seconds: how long a proxy outlives its last container.
     """
 
-    master_uri: str = ""
-    advertise_host: str = ""
+    master_uri: str | None = None
+    advertise_host: str | None = None
     ports: int = 32
-    window: PortRange = WINDOW
-    publish: tuple[str, ...] = ("0.0.0.0",)
-    image: str = "rosproxy:latest"
+    port_window: PortRange = WINDOW
+    publish_address: tuple[str, ...] = ("0.0.0.0",)
+    proxy_image: str = "rosproxy:latest"
     expose_by_default: bool = False
     grace: float = 60.0
     uplink: str = "0-rosproxy"

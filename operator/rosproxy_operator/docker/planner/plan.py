@@ -111,9 +111,9 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     """What keeps proxies from being created."""
     if not observed.image_id:
         return Problem(
-            f"proxy image {settings.image}",
-            f"not on this host: docker pull {settings.image}, or in rosproxy's sources: "
-            f"docker build --target proxy -t {settings.image} .",
+            f"proxy image {settings.proxy_image}",
+            f"not on this host: docker pull {settings.proxy_image}, or in rosproxy's sources: "
+            f"docker build --target proxy -t {settings.proxy_image} .",
         )
     for network in observed.networks:
         if network.name == settings.uplink and (network.internal or network.driver != "bridge"):

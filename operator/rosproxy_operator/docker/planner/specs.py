@@ -142,11 +142,11 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
     if made.forwards:
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
-        f"{port}/tcp": [{"HostIp": address, "HostPort": str(port)} for address in settings.publish]
+        f"{port}/tcp": [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
         for port in made.range.ports()
     }
     return {
-        "Image": settings.image,
+        "Image": settings.proxy_image,
         "User": _USER,
         "Entrypoint": ["sleep"],
         "Cmd": ["infinity"],
@@ -182,7 +182,7 @@ def container_config(
         "ROSPROXY_MASTER_ADDRESS": master_address,
     }
     return {
-        "Image": settings.image,
+        "Image": settings.proxy_image,
         "User": _USER,
         "Env": [f"{name}={value}" for name, value in variables.items() if value],
         "Labels": own_labels(made),

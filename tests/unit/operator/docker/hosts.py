@@ -30,7 +30,9 @@ from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engi
 
 HERE = "192.0.2.10"
 ROBOT = Key("http://robot:11311", HERE)
-SETTINGS = PlanSettings(advertise_host=HERE, ports=2, window=PortRange(11400, 11415), grace=10.0)
+SETTINGS = PlanSettings(
+    advertise_host=HERE, ports=2, port_window=PortRange(11400, 11415), grace=10.0
+)
 EPHEMERAL = PortRange(11414, 11500)
 MASTERS = ("http://robot:11311", "http://arm:11312", "http://192.0.2.9:11402")
 NETWORKS = ("app", "lab", "inner", "0-early", "0-inner")
@@ -320,7 +322,7 @@ class Hosts:
         fatal = {problem.subject for problem in found.problems if problem.fatal}
         told = {problem.subject for problem in found.problems}
         for key in sorted({member.key for member in live}):
-            if not fatal & {f"proxy image {SETTINGS.image}", f"proxy {proxy_name(key)}"}:
+            if not fatal & {f"proxy image {SETTINGS.proxy_image}", f"proxy {proxy_name(key)}"}:
                 mine = [member for member in live if member.key == key]
                 plane = chosen_plane(mine, SETTINGS.data_plane)
                 self.check_key(key, {n for member in mine for n in member.networks & fine}, plane)

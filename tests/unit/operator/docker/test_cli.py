@@ -17,7 +17,7 @@ def test_the_defaults() -> None:
     assert make_plan_settings(options) == PlanSettings()
     assert options["admin_bind"] == DEFAULT_ADMIN
     assert options["resync"] == 30.0
-    assert PlanSettings().publish == ("0.0.0.0",)
+    assert PlanSettings().publish_address == ("0.0.0.0",)
     assert PlanSettings().uplink == "0-rosproxy"
 
 

@@ -114,7 +114,7 @@ async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
     controller = DockerController(SETTINGS, 30.0, metrics)
     problems = await controller.run_once(0.5)
     assert [problem.subject for problem in problems] == [
-        f"proxy image {SETTINGS.image}",
+        f"proxy image {SETTINGS.proxy_image}",
         f"proxy {proxy_name(KEY)}",
     ]
     assert controller.unready() is None

@@ -324,7 +324,7 @@ def test_a_controller_killed_before_the_old_sandbox_went_goes_on() -> None:
 
 
 def test_another_publish_address_replaces_both() -> None:
-    settings = replace(SETTINGS, publish=("192.0.2.10",))
+    settings = replace(SETTINGS, publish_address=("192.0.2.10",))
     found = actions(observed(container(), **both()), settings=settings)
     assert found[0] == Rename(PORTS, f"{PORTS}-old")
     assert found[2] == Remove(NAME, "its sandbox is made anew", stop=True)
@@ -352,7 +352,7 @@ def test_without_an_image_nothing_is_created() -> None:
 
 
 def test_without_an_image_everything_is_kept() -> None:
-    settings = replace(SETTINGS, publish=("::",), ports=40)
+    settings = replace(SETTINGS, publish_address=("::",), ports=40)
     found = look(observed(container(), image="", **both()), settings=settings)
     assert found.actions == ()
     assert [problem.fatal for problem in found.problems] == [False]
@@ -508,7 +508,7 @@ def test_more_ports_that_can_not_be_had() -> None:
 
 
 def test_exhausted() -> None:
-    settings = replace(SETTINGS, window=PortRange(11400, 11430))
+    settings = replace(SETTINGS, port_window=PortRange(11400, 11430))
     found = look(observed(container()), settings=settings)
     assert found.actions == ()
     assert port_problem(found) == (
@@ -594,7 +594,7 @@ def test_problems_of_one_key_do_not_touch_another() -> None:
         container("a", {**ENABLED, "rosproxy.ports": "none"}),
         container("a", networks=("gone",)),
     ):
-        settings = replace(SETTINGS, window=PortRange(11400, 11463))
+        settings = replace(SETTINGS, port_window=PortRange(11400, 11463))
         found = look(observed(bad, container("b", ON_ARM), **arm), settings=settings)
         assert [group for group in found.groups if group.key == ARM] == list(alone.groups)
 

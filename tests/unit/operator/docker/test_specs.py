@@ -87,7 +87,7 @@ def test_an_unknown_address_is_not_given() -> None:
 
 
 def test_ports_are_published_on_each_address_asked_for() -> None:
-    settings = replace(SETTINGS, publish=("192.0.2.10", "::"))
+    settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
     assert [each["HostIp"] for each in bindings["11400/tcp"]] == ["192.0.2.10", "::"]
 
@@ -105,10 +105,10 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
 def test_what_makes_a_sandbox_anew() -> None:
     now = sandbox_fingerprint(SANDBOX, SETTINGS)
     renamed = structs.replace(SANDBOX, name="other", fingerprint="")
-    assert now == sandbox_fingerprint(renamed, replace(SETTINGS, image="other", grace=1.0))
+    assert now == sandbox_fingerprint(renamed, replace(SETTINGS, proxy_image="other", grace=1.0))
     assert now != sandbox_fingerprint(structs.replace(SANDBOX, range=RANGE), SETTINGS)
     assert now != sandbox_fingerprint(structs.replace(SANDBOX, forwards=True), SETTINGS)
-    assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, publish=("::",)))
+    assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, publish_address=("::",)))
     assert now != sandbox_fingerprint(SANDBOX, replace(SETTINGS, uplink="0-other"))
 
 
@@ -117,7 +117,7 @@ def test_what_makes_a_proxy_anew() -> None:
     renamed = structs.replace(
         PROXY, name="other", sandbox="another", fingerprint="", replaces="old"
     )
-    other = replace(SETTINGS, image="other", publish=("::",))
+    other = replace(SETTINGS, proxy_image="other", publish_address=("::",))
     assert now == proxy_fingerprint(renamed, other, IMAGE)
     assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2")
     assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE)
