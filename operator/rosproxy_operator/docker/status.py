@@ -5,7 +5,6 @@ import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import TypeVar
 
 from rosproxy import __version__
 from rosproxy.admin.status_document import ProxyStatus
@@ -20,12 +19,11 @@ from rosproxy_operator.docker.planner.model import (
     Container,
     HostState,
     Key,
+    OwnContainer,
     PlanSettings,
-    Proxy,
-    Sandbox,
 )
 from rosproxy_operator.docker.planner.plan import plan
-from rosproxy_operator.docker.planner.report import plan_text, render
+from rosproxy_operator.docker.planner.report import render
 from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
@@ -33,7 +31,6 @@ from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 Said = Mapping[str, ProxyStatus]
 """What the proxies that answer say, by the names of their containers."""
-Own = TypeVar("Own", Proxy, Sandbox)
 PATIENCE = 3.0
 """Seconds that are waited for inspections: nobody looks a second time."""
 
@@ -41,7 +38,7 @@ PATIENCE = 3.0
 def show_plan(settings: PlanSettings) -> None:
     """Print what would be done now, and what is wrong. Raises EngineError."""
     status = asyncio.run(survey(settings))
-    write(plan_text(status["actions"]))
+    write("\n".join(status["actions"]) or "Nothing to do.")
     for problem in status["problems"]:
         write(f"{problem['subject']}: {problem['text']}")
 
@@ -70,12 +67,9 @@ async def survey(settings: PlanSettings) -> Json:
     Containers are those that have a proxy or whose labels are wrong. Actions are all but those for
     what the engine is busy with and tells nothing of.
     """
-
-    def nothing() -> None:
-        """Nobody has to be woken."""
-
     proxies = ProxyClient()
-    observer = DockerObserver(DockerClient(), settings, MasterResolver(nothing), nothing)
+    # Nobody has to be woken: there is no second look.
+    observer = DockerObserver(DockerClient(), settings, MasterResolver(lambda: None), lambda: None)
     try:
         look = await observer.look(PATIENCE)
         planned = plan(look.state, look.labels, settings, DockerMemory(), time.monotonic())
@@ -147,7 +141,7 @@ def _proxy(key: Key, observed: HostState, said: Said, settings: PlanSettings) ->
     }
 
 
-def _best(found: Iterable[Own], name: str) -> Own | None:
+def _best(found: Iterable[OwnContainer], name: str) -> OwnContainer | None:
     """The one that is called so, if it runs; else any that runs; else any."""
     return min(
         found,

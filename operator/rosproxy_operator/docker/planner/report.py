@@ -48,11 +48,6 @@ def render(status: Status, columns: int, lines: int | None = None) -> str:
     return "\n".join(short)
 
 
-def plan_text(actions: Iterable[object]) -> str:
-    """One line for each action."""
-    return "\n".join(map(str, actions)) or "Nothing to do."
-
-
 def _proxies(status: Status, columns: int) -> Iterator[str]:
     proxies = status["proxies"]
     if not proxies:

@@ -1,10 +1,13 @@
 """What people read."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.telemetry.text import width
+from rosproxy_operator.docker import status
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
@@ -18,7 +21,8 @@ from rosproxy_operator.docker.planner.actions import (
     Start,
     Unpause,
 )
-from rosproxy_operator.docker.planner.report import plan_text, render
+from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.planner.report import render
 from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {
@@ -94,9 +98,30 @@ def test_each_action_is_one_line(action: Action, text: str) -> None:
     assert str(action) == text
 
 
-def test_a_plan_is_its_lines() -> None:
-    assert plan_text([Start("a"), Start("b")]) == "start container a\nstart container b"
-    assert plan_text([]) == "Nothing to do."
+@pytest.mark.parametrize(
+    ("actions", "problems", "lines"),
+    [
+        (
+            ["start container a", "start container b"],
+            [],
+            ["start container a", "start container b"],
+        ),
+        ([], [{"subject": "uplink", "text": "odd"}], ["Nothing to do.", "uplink: odd"]),
+    ],
+)
+def test_a_plan_is_its_lines(
+    actions: list[str],
+    problems: list[dict[str, str]],
+    lines: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    async def survey(settings: PlanSettings) -> dict[str, Any]:
+        return {"actions": actions, "problems": problems}
+
+    monkeypatch.setattr(status, "survey", survey)
+    status.show_plan(PlanSettings())
+    assert capsys.readouterr().out.splitlines() == lines
 
 
 def test_the_whole_status() -> None:
