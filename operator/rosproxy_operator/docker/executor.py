@@ -38,6 +38,7 @@ from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     container_config,
+    master,
     proxy_name,
     read_own,
     sandbox_config,
@@ -248,7 +249,7 @@ class DockerApplier:
                 self._create(name, sandbox_config(action, self._settings))
             case Create(name, key):
                 token = look.tokens.get(key) or secrets.token_hex(16)
-                address = look.master_address(key)
+                address = look.state.masters.get(master(key).host.lower(), "")
                 self._create(name, container_config(action, self._settings, token, address))
             case Start(name):
                 do("start", name)

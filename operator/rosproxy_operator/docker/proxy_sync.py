@@ -114,8 +114,7 @@ class DockerProxySync:
             if name not in self._running:
                 updater = ProxyUpdater(name, look.access[name], self._proxies, self._answered)
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
-            address = look.master_address(proxy.key)
-            self._running[name][0].update(facts(look.state, proxy, members, address))
+            self._running[name][0].update(facts(look.state, proxy, members))
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""

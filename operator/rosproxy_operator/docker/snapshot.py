@@ -32,7 +32,6 @@ from rosproxy_operator.docker.planner.specs import (
     ROLE_SANDBOX,
     TOKEN_VARIABLE,
     admin_port,
-    master,
     read_own,
 )
 
@@ -60,21 +59,15 @@ class ProxyAccess:
 class DockerSnapshot:
     """A Docker host at one moment.
 
-    ``access`` to those proxies that run is by name. ``masters`` are the addresses of masters'
-    hosts, empty where unknown. ``at_host`` tells whether the operator is in the host's network
-    namespace.
+    ``access`` to those proxies that run is by name. ``at_host``: the operator is in the host's
+    network namespace.
     """
 
     state: HostState
     labels: LabelReading
     access: Mapping[str, ProxyAccess]
     tokens: Mapping[Key, str]
-    masters: Mapping[str, str]
     at_host: bool
-
-    def master_address(self, key: Key) -> str:
-        """The address of a key's master; empty if it is unknown."""
-        return self.masters.get(master(key).host.lower(), "")
 
 
 class Inspector:
@@ -193,13 +186,11 @@ class DockerObserver:
             for name, address in masters.items()
             if at_host and address and (own := host.own_address_towards(address, gateways))
         }
-        unresolved = frozenset(name for name, address in masters.items() if not address)
         return DockerSnapshot(
-            state=replace(state, image_id=image, unresolved=unresolved, advertise=advertise),
+            state=replace(state, image_id=image, masters=masters, advertise=advertise),
             labels=labels,
             access={p.container.name: way for p in state.proxies if (way := self._way(p, state))},
             tokens={p.key: token for p in state.proxies if (token := self._token(p))},
-            masters=masters,
             at_host=at_host,
         )
 

@@ -142,10 +142,10 @@ class HostState:
     is the range from which the kernel takes ports for connections, ``listening`` are TCP ports on
     which something listens in the operator's own network namespace. ``image_id`` is the id of the
     proxy's image, empty if the host does not have it. ``advertise`` gives, for a master's host
-    name, this host's address towards it; without an entry it is not known. ``unresolved`` are the
-    masters' hosts without a known address, ``busy`` the names of own containers of which not
-    everything is known yet, so that nothing can be done to them, and ``addresses`` those of all
-    containers.
+    name, this host's address towards it; without an entry it is not known. ``masters`` are the
+    addresses of the masters' hosts, by name, empty where unknown. ``busy`` are the names of own
+    containers of which not everything is known yet, so that nothing can be done to them, and
+    ``addresses`` those of all containers.
     """
 
     containers: tuple[Container, ...]
@@ -156,7 +156,7 @@ class HostState:
     image_id: str = ""
     advertise: Mapping[str, str] = field(default_factory=dict)
     sandboxes: tuple[Sandbox, ...] = ()
-    unresolved: frozenset[str] = frozenset()
+    masters: Mapping[str, str] = field(default_factory=dict)
     busy: frozenset[str] = frozenset()
     addresses: frozenset[str] = frozenset()
 

@@ -148,7 +148,7 @@ def _groups(
 def _waits(group: Group, observed: HostState) -> bool:
     """Whether a group makes a proxy whose master has no known address."""
     return any(
-        isinstance(action, Create) and master(action.key).host in observed.unresolved
+        isinstance(action, Create) and observed.masters.get(master(action.key).host) == ""
         for action in group.actions
     )
 
@@ -159,7 +159,7 @@ def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
         name = one.container.name
         if one.key in live and one.container.state == "restarting":
             yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
-    for host in sorted(observed.unresolved):
+    for host in sorted(host for host, address in observed.masters.items() if not address):
         yield Problem(
             f"master {host}",
             f"the name {host} can't be resolved where the operator runs: give the master's "

@@ -185,16 +185,14 @@ class ProxyNews:
         return max(min(times) - now, 0.0) if times else None
 
 
-def facts(
-    observed: HostState, proxy: Proxy, members: Iterable[Member], master_address: str
-) -> NetworkFacts:
+def facts(observed: HostState, proxy: Proxy, members: Iterable[Member]) -> NetworkFacts:
     """What a look says to a proxy. ``members`` are those of all proxies."""
-    box = observed.sandbox_of(proxy)
+    host, box = master(proxy.key).host.lower(), observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
     by_id = {container.id: container for container in observed.containers}
     running = [container for container in observed.containers if container.state in STARTED]
     return NetworkFacts(
-        master_address="" if is_address(master(proxy.key).host) else master_address,
+        master_address="" if is_address(host) else observed.masters.get(host, ""),
         addresses={
             (container.id, place.network): place.address
             for container in running

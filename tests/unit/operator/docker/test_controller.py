@@ -56,8 +56,7 @@ async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     assert [box.container.name for box in state.sandboxes] == [sandbox_name(KEY)]
     assert [(proxy.key, proxy.range) for proxy in state.proxies] == [(KEY, RANGE)]
     assert [request.key.master_uri for request in look.labels.requests] == [KEY.master_uri]
-    assert look.masters == {"robot": "172.29.0.2"}  # no name server has it, but a container
-    assert not state.unresolved
+    assert state.masters == {"robot": "172.29.0.2"}  # no name server has it, but a container
     assert not state.busy
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
     access = look.access[name]
@@ -71,7 +70,7 @@ async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine)
     look = await observer().look(5.0)
     assert not look.state.containers
     assert look.state.busy == {proxy_name(KEY), sandbox_name(KEY)}
-    assert look.state.unresolved == {"robot"}
+    assert look.state.masters == {"robot": ""}
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,8 @@ from tests.unit.operator.docker.conftest import FakeEngine
 
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
 BOX = CreateSandbox("box", KEY, RANGE)
-LOOK = DockerSnapshot(observed(), LabelReading(), {}, {KEY: "secret"}, {"robot": "192.0.2.7"}, True)
+SEEN = observed(masters={"robot": "192.0.2.7"})
+LOOK = DockerSnapshot(SEEN, LabelReading(), {}, {KEY: "secret"}, at_host=True)
 ACTIONS: list[Action] = [
     CreateNetwork("0-rosproxy"),
     BOX,

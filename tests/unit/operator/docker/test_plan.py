@@ -621,11 +621,11 @@ def test_nothing_is_done_for_a_key_while_one_of_its_containers_is_busy() -> None
 
 
 def test_a_proxy_is_not_made_before_the_address_of_its_master_is_known() -> None:
-    found = look(observed(container(), unresolved=frozenset({"robot"})))
+    found = look(observed(container(), masters={"robot": ""}))
     assert not any(isinstance(action, Create) for action in found.actions)
     assert any(isinstance(action, Create) for group in found.deferred for action in group.actions)
     (problem,) = [each for each in found.problems if each.subject == "master robot"]
     assert "--add-host robot:ADDRESS" in problem.text
     assert problem.fatal
-    other = look(observed(container(), unresolved=frozenset({"arm"})))
+    other = look(observed(container(), masters={"robot": "192.0.2.7", "arm": ""}))
     assert any(isinstance(action, Create) for action in other.actions)

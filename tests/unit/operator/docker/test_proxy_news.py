@@ -49,8 +49,8 @@ def look(*containers: Container) -> HostState:
     )
 
 
-def told(seen: HostState, *members: Member, master: str = "198.51.100.7") -> NetworkFacts:
-    return facts(seen, seen.proxies[0], members, master)
+def told(seen: HostState, *members: Member) -> NetworkFacts:
+    return facts(replace(seen, masters={"robot": "198.51.100.7"}), seen.proxies[0], members)
 
 
 def member(container: Container) -> Member:
@@ -89,10 +89,10 @@ def test_a_container_in_anothers_network_arrives_at_its_address() -> None:
 
 def test_the_masters_address_is_only_told_for_a_name() -> None:
     assert told(look()).master_address == "198.51.100.7"
-    seen = look()
+    seen = replace(look(), masters={"198.51.100.8": "198.51.100.8"})
     key = Key("http://198.51.100.8:11311", "192.0.2.10")
     process = replace(seen.proxies[0], key=key)
-    assert facts(seen, process, (), "198.51.100.8").master_address == ""
+    assert facts(seen, process, ()).master_address == ""
 
 
 def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
