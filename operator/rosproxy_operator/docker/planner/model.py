@@ -84,6 +84,12 @@ class Container:
         return self.state in ALIVE
 
     @property
+    def shares(self) -> str | None:
+        """The container whose network namespace it is in, by id or name; None if in its own."""
+        _, shared, other = self.network_mode.partition("container:")
+        return other if shared else None
+
+    @property
     def networks(self) -> frozenset[str]:
         """The names of its networks."""
         return frozenset(attachment.network for attachment in self.attachments)
@@ -131,7 +137,7 @@ class Sandbox(OwnContainer):
 
 
 class Proxy(OwnContainer):
-    """A proxy runs in it, in the namespace of the sandbox that its ``network_mode`` names by id."""
+    """A proxy runs in it, in the namespace of the sandbox that it `shares`, by id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +186,7 @@ class HostState:
 
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""
-        home = proxy.container.network_mode.removeprefix("container:")
+        home = proxy.container.shares
         return next((box for box in self.sandboxes if box.container.id == home), None)
 
 

@@ -223,7 +223,7 @@ def _arrivals(
     container: Container, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
-    host = by_id.get(container.network_mode.removeprefix("container:"), container)
+    host = by_id.get(container.shares or container.id, container)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}

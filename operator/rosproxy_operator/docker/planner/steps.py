@@ -237,7 +237,7 @@ def _connect(context: PlanContext, name: str) -> Iterator[Action]:
 def _emptied(context: PlanContext, old: Container) -> Iterator[Action]:
     """End the proxies properly that are in a sandbox, before it goes."""
     for one in context.observed.proxies_of(context.desired.key):
-        if _lives_in(one.container, old.id) and one.container.state != "removing":
+        if one.container.shares == old.id and one.container.state != "removing":
             yield Remove(one.container.name, "its sandbox is made anew", stop=True)
 
 
@@ -256,11 +256,11 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
     right = {
         one.container.id
         for one in there
-        if _lives_in(one.container, home.id) and context.as_made_now(one, expected)
+        if one.container.shares == home.id and context.as_made_now(one, expected)
     }
     found = select(there, wanted, right, context.creatable)
     kept = found.kept
-    misplaced = kept and not _lives_in(kept, home.id)
+    misplaced = kept and kept.shares != home.id
     if found.waiting and (misplaced or not kept):
         return []
     if found.stuck or misplaced:
@@ -327,8 +327,3 @@ def _created(
         yield from ended
         yield Remove(former, "made anew")
     yield Start(made.name)
-
-
-def _lives_in(container: Container, sandbox_id: str) -> bool:
-    """Whether a container shares the network namespace of the one with this id."""
-    return container.network_mode == f"container:{sandbox_id}"

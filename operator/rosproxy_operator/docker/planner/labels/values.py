@@ -33,7 +33,6 @@ ALIAS = "rosproxy"
 """The name under which every proxy is found on the networks of its containers."""
 BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""
-_SHARED = "container:"
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
@@ -149,8 +148,7 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
 def _owner(container: Container, observed: HostState) -> Container:
     """The container whose networks it has: itself, or the one that it shares them with."""
     met = {container.id}
-    while container.network_mode.startswith(_SHARED):
-        wanted = container.network_mode.removeprefix(_SHARED)
+    while (wanted := container.shares) is not None:
         found = next((one for one in observed.containers if wanted in (one.id, one.name)), None)
         if found is None or found.id in met:
             raise UnusableLabel(
