@@ -7,6 +7,7 @@ up to date (`proxy_sync`). Work goes on beside later looks; nothing here decides
 """
 
 import asyncio
+import contextlib
 import logging
 import signal
 import time
@@ -58,21 +59,17 @@ def run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
 
 
 async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics)
     health = HealthServer(metrics.registry, controller.dead, controller.unready)
     await health.start(admin)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
     running = asyncio.create_task(controller.run())
-    stopping = asyncio.create_task(stopped.wait())
-    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
-    if running.done():
-        running.result()  # raises what it died of
-    running.cancel()
-    await asyncio.gather(running, stopping, health.stop(), return_exceptions=True)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, running.cancel)
+    with contextlib.suppress(asyncio.CancelledError):
+        await running  # raises what it died of
+    await health.stop()
 
 
 class DockerController:
