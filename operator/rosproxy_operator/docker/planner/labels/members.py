@@ -53,7 +53,7 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
             continue
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
-            if _wants_proxy(container, settings):
+            if values.enabled(container.labels, _exposed(container, settings)):
                 requests.append(_request(container, observed, settings, proxies))
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
@@ -112,11 +112,9 @@ def _unusable(container: Container, text: str) -> Problem:
     return _problem(container, text, fatal=bool(_own(container)))
 
 
-def _wants_proxy(container: Container, settings: PlanSettings) -> bool:
-    enabled = values.enabled(container.labels)
-    if enabled is None:
-        return settings.expose_by_default and bool(_own(container) or container.master_uri)
-    return enabled
+def _exposed(container: Container, settings: PlanSettings) -> bool:
+    """Whether a container that does not say gets a proxy."""
+    return settings.expose_by_default and bool(_own(container) or container.master_uri)
 
 
 def _own(container: Container) -> list[str]:

@@ -53,10 +53,10 @@ def named(label: str, labels: Labels) -> str:
     return f"label {label}={quoted(labels[label])}"
 
 
-def enabled(labels: Labels) -> bool | None:
-    """Whether a container wants a proxy; None if it does not say."""
+def enabled(labels: Labels, otherwise: bool) -> bool:
+    """Whether a container wants a proxy; ``otherwise`` if it does not say."""
     if ENABLE not in labels:
-        return None
+        return otherwise
     word = labels[ENABLE].strip().lower()
     if word not in ("true", "false"):
         text = f"{named(ENABLE, labels)} is neither true nor false: write {ENABLE}=true"
