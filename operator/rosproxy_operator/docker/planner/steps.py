@@ -8,7 +8,7 @@ Networks are joined after the start: an engine that starts a container with seve
 them in any order, and may lay the published ports over one and then move them to the uplink.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from msgspec.structs import replace
@@ -69,10 +69,17 @@ class PlanContext:
         every = [*self.observed.containers, *(one.container for one in self.observed.own)]
         return frozenset(one.name for one in every) - {one.container.name for one in own}
 
-    def as_made_now(self, one: OwnContainer, fingerprint: str) -> bool:
-        """Whether a container is as it would be created now; if none can be, its ports suffice."""
-        right = not self.creatable or one.fingerprint == fingerprint
-        return right and one.range == self.ports
+    def select(
+        self, own: Collection[OwnContainer], name: str, made: str, fits: Callable[[Container], bool]
+    ) -> Selection:
+        """Decide which of these stays and which goes.
+
+        Right is one that ``fits``, has the ports, and the fingerprint ``made`` of one that would be
+        created now; if none can be, any will do.
+        """
+        as_made = [one for one in own if one.fingerprint == made or not self.creatable]
+        here = [one.container for one in as_made if one.range == self.ports]
+        return select(own, name, {one.id for one in here if fits(one)}, self.creatable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,12 +153,9 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     forwards = context.desired.data_plane == "kernel"
     made = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards)
     expected = sandbox_fingerprint(made, context.settings)
-    right = {
-        one.container.id
-        for one in sandboxes
-        if context.as_made_now(one, expected) and _usable(one.container, context.observed)
-    }
-    found = select(sandboxes, made.name, right, context.creatable)
+    found = context.select(
+        sandboxes, made.name, expected, lambda box: _usable(box, context.observed)
+    )
     kept = found.kept
     if found.stuck:
         return None, None
@@ -253,12 +257,7 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
     made = Create(name, key, context.ports, home.name, context.desired.data_plane)
     expected = proxy_fingerprint(made, context.settings, context.observed.image_id)
     there = [one for one in proxies if one.container.name not in gone]
-    right = {
-        one.container.id
-        for one in there
-        if one.container.shares == home.id and context.as_made_now(one, expected)
-    }
-    found = select(there, wanted, right, context.creatable)
+    found = context.select(there, wanted, expected, lambda one: one.shares == home.id)
     kept = found.kept
     misplaced = kept and kept.shares != home.id
     if found.waiting and (misplaced or not kept):
