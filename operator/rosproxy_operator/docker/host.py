@@ -1,6 +1,5 @@
 """What the operating system knows of this host's ports and addresses."""
 
-import socket
 from collections.abc import Collection
 from pathlib import Path
 
@@ -35,13 +34,11 @@ def parse_listening(text: str) -> frozenset[int]:
 
 
 def has(address: str) -> bool:
-    """Whether an IPv4 address is one of this machine's, as seen in this network namespace."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind((address, 0))
-        except OSError:
-            return False
-    return True
+    """Whether an IPv4 address is one of this machine's, as seen in this network namespace.
+
+    Connections to an own address, and to no other, come from that address.
+    """
+    return address_towards(address) == address
 
 
 def own_address_towards(master: str, gateways: Collection[str]) -> str:
