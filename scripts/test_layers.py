@@ -4,14 +4,16 @@
     python scripts/test_layers.py                  what `make test-all` runs
     python scripts/test_layers.py unit ros         these layers only
 
-How it works. A layer is a directory under tests/. There are two halves, each in lanes: what is in
-a lane runs one after another, the lanes run side by side.
+How it works. A layer is a directory under tests/. Layers run in lanes: what is in a lane runs one
+after another, the lanes run side by side, and on two processors they end at about the same time.
 
   1. The integration tests, which mind a busy machine, have a processor for themselves. Beside them
      what other layers need is prepared: packages, programs and images, by scripts that do nothing
-     where their work is done already. After that the layers of plain computing run: unit, chart.
-  2. The layers with real nodes, engines and clusters, a lane for each: these mostly wait. They
-     don't start earlier because they mind a machine that is busy with compiling.
+     where their work is done already. After that the lane of unit, chart and docker begins.
+  2. After the integration tests real ROS nodes and the Kubernetes cluster have a lane each.
+
+No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
+machine that is busy with compiling.
 
 With --smoke, only tests marked `smoke` run of the layers that have such, and layers without are
 left to `make test-all`. So all that `make test` runs is part of `make test-all`.
@@ -58,14 +60,13 @@ COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
 class Layer:
     """A directory of tests, and how it is run.
 
-    ``real``: it belongs to the second half. ``setup``: what prepares this machine for it;
-    ``smoke_setup``: those of them that its smoke needs. ``smoke``: ALL of its tests are in the
-    smoke, those that are MARKED, or NONE. ``workers``: how many processes of pytest share the
-    tests, one file each at a time. ``obstacle`` says why it can't run here, if so.
+    ``setup``: what prepares this machine for it; ``smoke_setup``: those of them that its smoke
+    needs. ``smoke``: ALL of its tests are in the smoke, those that are MARKED, or NONE.
+    ``workers``: how many processes of pytest share the tests, one file each at a time.
+    ``obstacle`` says why it can't run here, if so.
     """
 
     name: str
-    real: bool = False
     smoke: str = NONE
     setup: tuple[str, ...] = ()
     smoke_setup: tuple[str, ...] = ()
@@ -121,13 +122,11 @@ def effective_capabilities() -> int:
 UNIT = Layer("unit", smoke=ALL)
 INTEGRATION = Layer("integration", smoke=ALL)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
-ROS_NODES = Layer("ros", True, MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
+ROS_NODES = Layer("ros", MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
 DOCKER_ENGINE = Layer(
-    "docker", True, MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
+    "docker", MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
 )
-CLUSTER = Layer(
-    "kubernetes", True, setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle
-)
+CLUSTER = Layer("kubernetes", setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle)
 LAYERS = (UNIT, INTEGRATION, CHART, ROS_NODES, DOCKER_ENGINE, CLUSTER)
 
 
@@ -147,10 +146,10 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._lane, [INTEGRATION])
             self._prepare()
-            outcomes = self._lane([UNIT, CHART]) + integration.result()
-            real = [[layer] for layer in LAYERS if layer.real]
-            for more in pool.map(self._lane, real):
-                outcomes += more
+            lanes = [integration, pool.submit(self._lane, [UNIT, CHART, DOCKER_ENGINE])]
+            integration.result()
+            lanes += [pool.submit(self._lane, [layer]) for layer in (ROS_NODES, CLUSTER)]
+        outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
     def _prepare(self) -> None:
