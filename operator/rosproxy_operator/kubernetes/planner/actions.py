@@ -31,9 +31,8 @@ class DeleteService(ObjectAction, frozen=True):
 
 
 class CreateProxy(ClusterAction, frozen=True):
-    """Create a proxy's pod on a node. ``body`` is the whole object."""
+    """Create a proxy's pod. ``body`` is the whole object."""
 
-    node: str
     body: Json
 
 

@@ -182,7 +182,7 @@ def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[
         if current is not None:  # else it is about to go
             yield from _tended(context, current, site)
     elif context.retries.ask(_creation(place)):
-        yield CreateProxy(place.of, place.node, manifests.proxy_pod(site, context.settings))
+        yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
 def _tended(context: ClusterContext, one: ProxyPod, site: Site) -> Iterator[Action]:

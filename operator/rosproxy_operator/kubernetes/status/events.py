@@ -13,8 +13,8 @@ from rosproxy_operator.kubernetes.planner.actions import (
     SetImage,
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
-from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, PORT_RANGE
-from rosproxy_operator.kubernetes.resources.values import number, part, word
+from rosproxy_operator.kubernetes.resources.names import API_VERSION, KIND, NODE, PORT_RANGE
+from rosproxy_operator.kubernetes.resources.values import number, word
 
 QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
@@ -128,10 +128,9 @@ def _warning(finding: ClusterFinding) -> Emit:
 
 def _result_of(action: Action) -> Iterator[tuple[str, str]]:
     match action:
-        case CreateProxy(node=node, body=body):
-            meta = part(body, "metadata")
-            ports = word(part(meta, "annotations"), PORT_RANGE)
-            text = f"created pod {word(meta, 'name')} on node {node} with ports {ports}"
+        case CreateProxy(body=body):
+            name, notes = body["metadata"]["name"], body["metadata"]["annotations"]
+            text = f"created pod {name} on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
             yield "ProxyCreated", text
         case SetImage(id=id, image=image):
             yield "ImageSet", f"gave pod {id.name} the image {image}"

@@ -172,6 +172,11 @@ def told(found: ClusterPlan, reason: str) -> list[str]:
     return [f"{one.subject}: {one.text}" for one in found.problems if one.reason == reason]
 
 
+def node_of(action: Any) -> str:
+    """The node on which a proxy is created; empty for anything else."""
+    return str(action.body["metadata"]["annotations"].get(names.NODE, ""))
+
+
 def ports_of(action: Any) -> str:
     """The range with which a proxy is created."""
     return str(action.body["metadata"]["annotations"][names.PORT_RANGE])

@@ -25,6 +25,7 @@ from tests.unit.operator.kubernetes.objects import (
     kinds,
     look,
     node,
+    node_of,
     observed,
     pod,
     ports_of,
@@ -96,7 +97,7 @@ def test_never_ports_of_the_api_server_or_of_the_kernel() -> None:
 
 def test_two_rosproxies_get_different_ports_on_a_node_and_the_same_on_two() -> None:
     found = look(two(node("one"), node("two"), A, B, pod("c", "two", labels=OURS)))
-    given = {(one.of.name, one.node): ports_of(one) for one in done(found)}  # type: ignore[union-attr]
+    given = {(one.of.name, node_of(one)): ports_of(one) for one in done(found)}
     assert given == {
         ("arm", "one"): "11400-11403",
         ("robot", "one"): "11404-11407",

@@ -80,7 +80,7 @@ def body(kind: str, name: str, **spec: Any) -> dict[str, Any]:
 
 def create_pod(name: str = "proxy") -> CreateProxy:
     env = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": ""}]
-    return CreateProxy(OF, "node1", body("Pod", name, containers=[{"name": "proxy", "env": env}]))
+    return CreateProxy(OF, body("Pod", name, containers=[{"name": "proxy", "env": env}]))
 
 
 async def test_a_proxy_gets_a_secret_token(server: ApiServer, carry: Carried) -> None:
@@ -227,7 +227,7 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
 
 
 async def test_a_mistake_of_ours_is_a_failure_like_any(server: ApiServer, carry: Carried) -> None:
-    await carry.out(CreateProxy(OF, "node1", body("Pod", "broken")), create_pod())
+    await carry.out(CreateProxy(OF, body("Pod", "broken")), create_pod())
     assert "the operator failed: KeyError('containers')" in carry.applier.failures[OF][0].text
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["proxy"]
 

@@ -108,7 +108,7 @@ def test_a_message_is_not_longer_than_the_api_server_takes():
 def test_what_is_done_is_told():
     body, pod = proxy_obj(), Name("robots", "rosproxy-arm-node1-1")
     actions: list[Action] = [
-        CreateProxy(ARM, "node1", body),
+        CreateProxy(ARM, body),
         SetImage(ARM, pod, "u", "rosproxy:2"),
         DeleteProxy(ARM, pod, "u", "no selected pod is left on node1"),
         PatchStatus(ARM, "uid-arm", {}),

@@ -32,6 +32,7 @@ from tests.unit.operator.kubernetes.objects import (
     kinds,
     look,
     node,
+    node_of,
     observed,
     pod,
     proxy,
@@ -61,7 +62,7 @@ def test_a_rosproxy_gets_a_service_and_a_proxy_on_each_node_with_selected_pods()
     nodes = [node("one"), node("two"), node("three")]
     pods = [pod("a", "one"), pod("b", "two"), pod("c", "two")]
     found = look(observed(rosproxy(), *nodes, *pods))
-    assert [(type(one), getattr(one, "node", "")) for one in done(found)] == [
+    assert [(type(one), node_of(one)) for one in done(found)] == [
         (CreateService, ""),
         (CreateProxy, "one"),
         (CreateProxy, "two"),

@@ -90,7 +90,7 @@ class World:
         for action in found.actions:
             if isinstance(action, CreateProxy):
                 self.check_new_range(action)
-                assert self.seen_ready(action.node)
+                assert self.seen_ready(self.place_of(action).node)
             elif isinstance(action, DeleteProxy):
                 on = {one.pod.uid: one.on for _, one in self.proxies()}.get(action.uid, "")
                 gone = action.why == "its RosProxy is gone"
@@ -104,8 +104,11 @@ class World:
 
     # what must hold
 
+    def place_of(self, action: CreateProxy) -> ProxyPlace:
+        return ProxyPlace(action.of, action.body["metadata"]["annotations"][names.NODE])
+
     def check_new_range(self, action: CreateProxy) -> None:
-        place = ProxyPlace(action.of, action.node)
+        place = self.place_of(action)
         text = action.body["metadata"]["annotations"][names.PORT_RANGE]
         first, last = map(int, text.split("-"))
         assert self.is_lawful(action.of, PortRange(first, last))
