@@ -27,12 +27,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
 from rosproxy_operator.kubernetes.proxy_sync import address_of
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterSnapshot,
-    Failure,
-    Json,
-    Name,
-)
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
@@ -59,7 +54,7 @@ class ClusterApplier:
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
-        self.failures: Mapping[Name, tuple[Failure, ...]] = {}
+        self.failures: Mapping[Name, Mapping[Name, str]] = {}
         self.problems: dict[Name, Problem] = {}
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
@@ -76,15 +71,16 @@ class ClusterApplier:
     async def _group(self, of: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
         async with self._room:
             doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
-            failures = [failure for a in doing if (failure := await self._one(a, observed))]
+            tried = [(_subject(action), await self._one(action, observed)) for action in doing]
+            failures = {id: text for id, text in tried if text is not None}
             if doing:
-                self.failures = {**self.failures, of: tuple(failures)}
+                self.failures = {**self.failures, of: failures}
             for action in actions:
                 if isinstance(action, PatchStatus):
-                    failure = await self._one(action, observed)
+                    said = await self._one(action, observed)
                     self.problems.pop(of, None)
-                    if failure:
-                        text = f"its status can't be written: {failure.text}"
+                    if said is not None:
+                        text = f"its status can't be written: {said}"
                         self.problems[of] = Problem(f"rosproxy {of}", text)
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [each for each in emits if not (failures and each.type == "Normal")]
@@ -94,7 +90,7 @@ class ClusterApplier:
         async with self._room:
             await self._one(event, observed)
 
-    async def _one(self, action: Action, observed: ClusterSnapshot) -> Failure | None:
+    async def _one(self, action: Action, observed: ClusterSnapshot) -> str | None:
         """Carry out one action; what went wrong."""
         if isinstance(action, DeleteProxy) and action.retire and action.uid not in self._retired:
             if action.uid not in self._retiring:
@@ -116,11 +112,11 @@ class ClusterApplier:
             log.log(logging.DEBUG if quiet else logging.INFO, "%s", line(action))
             self._counted(action, "ok")
             return None
-        failure = Failure(str(_subject(action)), text)
-        told = failure in self.failures.get(action.of, ()) or isinstance(action, PatchStatus)
+        before = self.failures.get(action.of, {}).get(_subject(action))
+        told = text == before or isinstance(action, PatchStatus)
         log.log(logging.DEBUG if told else logging.WARNING, "%s: %s", line(action), text)
         self._counted(action, "failed")
-        return failure
+        return text
 
     def _do(self, action: Action) -> None:
         api = self._api

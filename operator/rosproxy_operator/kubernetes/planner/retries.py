@@ -5,10 +5,10 @@ is noted, with the time and with the error if the API server refused it, and goe
 state; what nobody asks for any more has had its effect and is forgotten.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from rosproxy_operator.kubernetes.resources.model import Failure, Name
+from rosproxy_operator.kubernetes.resources.model import Name
 
 LAG = 3.0
 """Seconds after which something that was done must be seen in the API server's lists."""
@@ -62,12 +62,11 @@ class Retries:
     def __init__(
         self,
         known: Mapping[Task, RetryRecord],
-        failures: Mapping[Name, Iterable[Failure]],
+        failures: Mapping[Name, Mapping[Name, str]],
         now: float,
     ) -> None:
-        said = {(of, one.subject): one.text for of, some in failures.items() for one in some}
         self._known = {
-            task: replace(tried, error=said.get((task.of, str(task.id)), tried.error))
+            task: replace(tried, error=failures.get(task.of, {}).get(task.id, tried.error))
             for task, tried in known.items()
         }
         self._now = now
@@ -88,11 +87,10 @@ class Retries:
         if task in self._known:
             self.noted[task] = replace(self._known[task], effect=True, error="")
 
-    def failures(self, of: Name) -> Iterator[Failure]:
-        """What can't be done for a RosProxy."""
-        for task, tried in self.noted.items():
-            if task.of == of and tried.error:
-                yield Failure(str(task.id), tried.error)
+    def failures(self, of: Name) -> Mapping[Name, str]:
+        """What can't be done for a RosProxy: what was said, by the object."""
+        noted = self.noted.items()
+        return {task.id: tried.error for task, tried in noted if task.of == of and tried.error}
 
     def waits(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""

@@ -291,14 +291,6 @@ class InvalidRosProxy:
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """An action on an object that the API server refused; ``text`` is what it said."""
-
-    subject: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class ClusterSnapshot:
     """A cluster at one moment, as far as it matters.
 
@@ -306,8 +298,9 @@ class ClusterSnapshot:
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
     wrong; one of them is empty. ``selected`` are the uids of the pods that a RosProxy selects.
     ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
-    ``reports`` are what the proxies say of themselves, by the uid of the pod, ``failures`` those of
-    the last try to carry something out: neither is listed, the operator puts them here.
+    ``reports`` are what the proxies say of themselves, by the uid of the pod; ``failures`` are, by
+    RosProxy and object, what the API server said of the actions that failed at the last try:
+    neither is listed, the operator puts them here.
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
@@ -319,4 +312,4 @@ class ClusterSnapshot:
     selected: frozenset[str] = frozenset()
     reports: Mapping[str, ProxyReport] = field(default_factory=dict)
     unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
-    failures: Mapping[Name, tuple[Failure, ...]] = field(default_factory=dict)
+    failures: Mapping[Name, Mapping[Name, str]] = field(default_factory=dict)

@@ -3,14 +3,14 @@
 The texts stay the same as long as the trouble does: an Event is made of each new one.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
-    Failure,
     InvalidRosProxy,
+    Name,
     NodeState,
     ProxyPod,
     Reference,
@@ -31,13 +31,14 @@ _ENFORCE = "pod-security.kubernetes.io/enforce"
 
 
 def findings(
-    rosproxy: RosProxy, states: Iterable[NodeState], failures: Iterable[Failure] = ()
+    rosproxy: RosProxy, states: Iterable[NodeState], failures: Mapping[Name, str]
 ) -> tuple[ClusterFinding, ...]:
     """What is wrong with a RosProxy's nodes and proxies, and with what was to be carried out.
 
-    Each has a reason; those that users are to be told by an Event have ``about``.
+    Each has a reason; those that users are to be told by an Event have ``about``. ``failures`` is
+    what the API server said of actions that it refused, by the object.
     """
-    found = [_refused(rosproxy, one) for one in failures]
+    found = [_refused(rosproxy, id, text) for id, text in failures.items()]
     for state in sorted(states, key=lambda one: one.name):
         found.extend(of_node(rosproxy, state))
     return tuple(dict.fromkeys(found))
@@ -119,12 +120,12 @@ def _master_remedy(rosproxy: RosProxy) -> str:
     return f"start roscore there, let pods connect to {master.uri}, or mend spec.master"
 
 
-def _refused(rosproxy: RosProxy, failure: Failure) -> ClusterFinding:
-    said = clean(" ".join(failure.text.split()))
+def _refused(rosproxy: RosProxy, id: Name, text: str) -> ClusterFinding:
+    said = clean(" ".join(text.split()))
     remedy = _remedy(said, rosproxy)
     said = said[: _LONGEST - len(f"the API server refused it (): {remedy}")]
     text = f"the API server refused it ({said}): {remedy}"
-    return _finding(rosproxy, failure.subject, text, NOT_ADMITTED)
+    return _finding(rosproxy, str(id), text, NOT_ADMITTED)
 
 
 def _remedy(said: str, rosproxy: RosProxy) -> str:

@@ -171,7 +171,7 @@ def status(
 ) -> Json:
     """The status that follows from some nodes; ``more`` problems besides those that they have."""
     one = of or rosproxy()
-    problems = (*findings(one, states, given.get("failures", ())), *more)
+    problems = (*findings(one, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)
     return status_of(one, states, problems, given.get("service", SERVICE), ROBOT, stamp)
 

@@ -25,7 +25,7 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources import objects as parse
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Failure, Name, ProxyReport
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name, ProxyReport
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 NAMESPACE = "ros"
@@ -255,9 +255,7 @@ class Cluster:
 
     # what the operator sees
 
-    def observe(
-        self, old: State | None, failures: dict[Name, tuple[Failure, ...]]
-    ) -> ClusterSnapshot:
+    def observe(self, old: State | None, failures: dict[Name, dict[Name, str]]) -> ClusterSnapshot:
         """What is there; pods, nodes and Services as they were before, if ``old`` is given."""
         seen = old or self.state
         pods = [parse.pod(one) for one in seen.pods.values()]
@@ -328,7 +326,7 @@ class Controller:
     def __init__(self, cluster: Cluster, settings: ClusterSettings) -> None:
         self.cluster, self.settings = cluster, settings
         self.state = ClusterState()
-        self.failures: dict[Name, tuple[Failure, ...]] = {}
+        self.failures: dict[Name, dict[Name, str]] = {}
         self.now = 1000.0
         self.old: State | None = None
 
@@ -348,13 +346,12 @@ class Controller:
     def carry_out(self, found: ClusterPlan, most: int | None = None) -> None:
         """Carry out a plan's actions, or the first few."""
         actions = found.actions[:most]
-        failed: dict[Name, list[Failure]] = {action.of: [] for action in actions}
+        failed: dict[Name, dict[Name, str]] = {action.of: {} for action in actions}
         for action in actions:
-            if error := self._try(action):
-                failed[action.of].append(error)
-        self.failures |= {of: tuple(some) for of, some in failed.items()}
+            failed[action.of] |= self._try(action)
+        self.failures |= failed
 
-    def _try(self, action: Action) -> Failure | None:
+    def _try(self, action: Action) -> dict[Name, str]:
         try:
             self.cluster.apply(action)
         except Refused as error:
@@ -364,9 +361,9 @@ class Controller:
             there = (self.cluster.state.services if kind is None else kind).get(name)
             if str(error) == "AlreadyExists" and there is not None:
                 text = "a Pod of this name that is not the operator's is there"
-                return None if is_own(there) else Failure(str(name), text)
-            return Failure(str(name), str(error))
-        return None
+                return {} if is_own(there) else {name: text}
+            return {name: str(error)}
+        return {}
 
     def lose_memory(self) -> None:
         self.state, self.failures, self.old = ClusterState(), {}, None

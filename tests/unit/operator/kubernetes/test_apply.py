@@ -88,7 +88,7 @@ async def test_a_proxy_gets_a_secret_token(server: ApiServer, carry: Carried) ->
     tokens = {pod["spec"]["containers"][0]["env"][0]["value"] for pod in server.all("pods")}
     assert len(tokens) == 2
     assert all(len(token) == 32 for token in tokens)
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
     assert carry.counted == [("CreateProxy", "ok")] * 2
 
 
@@ -96,15 +96,15 @@ async def test_one_that_is_there_already_is_no_failure(server: ApiServer, carry:
     """The list that was planned from lacked what had just been created."""
     server.put("pods", body("Pod", "proxy"), NAMESPACE)
     await carry.out(create_pod())
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carried) -> None:
     server.put("pods", {"metadata": {"name": "proxy"}}, NAMESPACE)
     await carry.out(create_pod())
-    (failure,) = carry.applier.failures[OF]
-    assert failure.subject == f"{NAMESPACE}/proxy"
-    assert "not the operator's is there: rename it" in failure.text
+    ((id, text),) = carry.applier.failures[OF].items()
+    assert id == Name(NAMESPACE, "proxy")
+    assert "not the operator's is there: rename it" in text
     assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
 
 
@@ -116,7 +116,7 @@ async def test_a_lost_service_gets_its_address_or_another(
     await carry.out(CreateService(OF, service), CreateService(OF, taken))
     assert server.get("services", "rosproxy-arm", NAMESPACE)["spec"]["clusterIP"] == "10.96.0.5"
     assert server.get("services", "rosproxy-leg", NAMESPACE)["spec"]["clusterIP"] == "10.96.0.7"
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Carried) -> None:
@@ -131,7 +131,7 @@ async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Ca
     )
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["new"]
     assert server.all("services")
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_another_image(server: ApiServer, carry: Carried) -> None:
@@ -140,7 +140,7 @@ async def test_another_image(server: ApiServer, carry: Carried) -> None:
     id = Name(NAMESPACE, "proxy")
     await carry.out(SetImage(OF, id, uid, "b"), SetImage(OF, id, "another", "c"))
     assert server.get("pods", "proxy", NAMESPACE)["spec"]["containers"][0]["image"] == "b"
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_a_status_is_replaced_whole(server: ApiServer, carry: Carried) -> None:
@@ -191,15 +191,14 @@ async def test_a_failure_stops_no_other_action_but_what_tells_of_success(
         Emit(OF, ABOUT, "Warning", "Invalid", "warned"),
         PatchStatus(OF, seen().uid, {"nodes": 1}),
     )
-    assert [failure.text for failure in carry.applier.failures[OF]] == [
-        'violates PodSecurity "baseline:latest": hostPort'
-    ]
+    refused = 'violates PodSecurity "baseline:latest": hostPort'
+    assert carry.applier.failures[OF] == {Name(NAMESPACE, "proxy"): refused}
     assert server.all("services")
     assert [event["reason"] for event in server.all("events")] == ["Invalid"]
     assert server.get("rosproxies", "arm", NAMESPACE)["status"] == {"nodes": 1}
     server.refusals.clear()
     await carry.out(create_pod())
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_a_namespace_that_is_being_deleted_is_no_failure(
@@ -210,7 +209,7 @@ async def test_a_namespace_that_is_being_deleted_is_no_failure(
         server.refuse("POST", kind, 403, text)
     service = CreateService(OF, body("Service", "rosproxy-arm", clusterIP="10.96.0.5"))
     await carry.out(create_pod(), service, Emit(OF, ABOUT, "Warning", "Invalid", "warned"))
-    assert carry.applier.failures == {OF: ()}
+    assert carry.applier.failures == {OF: {}}
     assert len(server.asked("POST", "services")) == 1
 
 
@@ -228,7 +227,8 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
 
 async def test_a_mistake_of_ours_is_a_failure_like_any(server: ApiServer, carry: Carried) -> None:
     await carry.out(CreateProxy(OF, body("Pod", "broken")), create_pod())
-    assert "the operator failed: KeyError('containers')" in carry.applier.failures[OF][0].text
+    (text,) = carry.applier.failures[OF].values()
+    assert "the operator failed: KeyError('containers')" in text
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["proxy"]
 
 

@@ -7,7 +7,6 @@ import pytest
 from rosproxy_operator.kubernetes.proxy_sync import no_answer
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
-    Failure,
     MasterSpec,
     Name,
     Obstacle,
@@ -28,6 +27,7 @@ from tests.unit.operator.kubernetes.builders_api import (
 )
 
 NAME = "rosproxy-arm-node1-"
+REFUSED = Name("robots", "rosproxy-arm-node1-1")
 
 
 @pytest.mark.parametrize(
@@ -168,9 +168,7 @@ def test_a_problem_without_a_reason():
     ],
 )
 def test_what_the_api_server_refuses(text, fix):
-    failure = Failure("robots/rosproxy-arm-node1-1", text)
-
-    found = status(state(proxy=None, answer=None), failures=(failure,))
+    found = status(state(proxy=None, answer=None), failures={REFUSED: text})
 
     assert judged(found, "Ready") == ("False", "ProxyNotAdmitted")
     assert message(found).startswith("robots/rosproxy-arm-node1-1: the API server refused it")
@@ -201,14 +199,14 @@ def test_what_the_api_server_refuses(text, fix):
 def test_who_refuses_the_kernel_plane_is_told_of_it(text, fix):
     of = replace(rosproxy(), spec=replace(rosproxy().spec, data_plane="kernel"))
 
-    (found,) = findings(of, (), (Failure("robots/rosproxy-arm-node1-1", text),))
+    (found,) = findings(of, (), {REFUSED: text})
 
     assert found.text.endswith(fix)
     assert len(found.text) <= 600
 
 
 def test_findings_are_told_at_the_rosproxy():
-    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(Stuck.PORTS), answer=None)])
+    (found,) = findings(rosproxy(), [state(proxy=stuck_proxy(Stuck.PORTS), answer=None)], {})
 
     assert (found.reason, found.of) == ("PortConflict", rosproxy().id)
     assert found.about == Reference("RosProxy", rosproxy().id, "uid-arm")

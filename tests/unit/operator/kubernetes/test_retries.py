@@ -5,7 +5,7 @@ from dataclasses import replace
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, CreateService, PatchStatus
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.model import Failure, Name
+from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     complete,
@@ -26,7 +26,7 @@ PROXY = names.proxy_id(ROBOT, "one")
 
 
 def refusing(name: Name = PROXY, text: str = "violates PodSecurity baseline") -> dict:
-    return {ROBOT: (Failure(str(name), text),)}
+    return {ROBOT: {name: text}}
 
 
 def test_what_is_refused_is_told_and_tried_again_ever_later() -> None:
