@@ -5,7 +5,6 @@ or gone, or if what a look would read of it has changed. What the last look has 
 pods and Services are of interest at all.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 from rosproxy_operator.kubernetes.planner.selection import chosen
@@ -32,42 +31,38 @@ class EventFilter:
 
     def rosproxy(self, type: str | None, body: Json) -> bool:
         """Whether an event of a RosProxy matters: not if only its status has changed."""
-        return self._new(type, body, _resource)
+        meta = part(body, "metadata")
+        return self._new(type, body, [meta.get(key) for key in _RESOURCE])
 
     def node(self, type: str | None, body: Json) -> bool:
         """Whether an event of a node matters."""
-        return self._new(type, body, objects.node)
+        return self._new(type, body, objects.node(body))
 
     def pod(self, type: str | None, body: Json) -> bool:
         """Whether an event of a pod matters: of a proxy, or one that a RosProxy selects or has."""
-        if is_own(words(body, "metadata", "labels")):
-            return self._new(type, body, lambda body: (objects.proxy_pod(body), objects.pod(body)))
         last, pod = self.last, objects.pod(body)
+        if is_own(pod.labels):
+            return self._new(type, body, (objects.proxy_pod(body), pod))
         if last is not None and pod.uid not in last.selected and not chosen(pod, last.rosproxies):
             return False
-        return self._new(type, body, objects.pod)
+        return self._new(type, body, pod)
 
     def service(self, type: str | None, body: Json) -> bool:
         """Whether an event of a Service matters: of the operator's own, or a master's."""
         masters = self.last.masters if self.last else {}
         meta = part(body, "metadata")
         matters = is_own(words(meta, "labels")) or objects.name_of(meta) in masters
-        return matters and self._new(type, body, lambda body: body.get("spec"))
+        return matters and self._new(type, body, body.get("spec"))
 
-    def _new(self, type: str | None, body: Json, read: Callable[[Json], Any]) -> bool:
+    def _new(self, type: str | None, body: Json, found: object) -> bool:
+        """Whether what a look would read of an object is another than when it was told last."""
         uid = word(part(body, "metadata"), "uid")
         if type == "DELETED":
             self._seen.pop(uid, None)
             return True
-        found = read(body)
         if uid in self._seen and self._seen[uid] == found:
             return False
         if len(self._seen) >= MOST:
             self._seen.clear()  # deletions that nobody told of
         self._seen[uid] = found
         return True
-
-
-def _resource(body: Json) -> list[Any]:
-    meta = part(body, "metadata")
-    return [meta.get(key) for key in _RESOURCE]
