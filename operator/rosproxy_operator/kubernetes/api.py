@@ -25,6 +25,7 @@ from enum import Enum
 from typing import Any
 from urllib.parse import quote
 
+import msgspec
 from kubernetes.client import ApiClient, Configuration
 from kubernetes.client.exceptions import ApiException
 from kubernetes.config import ConfigException, load_incluster_config, load_kube_config
@@ -218,12 +219,10 @@ class Api:
         if not 200 <= status <= 299:
             raise refusal(status, str(reason or ""), data)
         try:
-            found = json.loads(data)
-        except ValueError:
-            found = None
-        if not isinstance(found, dict):
-            raise ApiError(ErrorKind.AWAY, f"what answers at {self.server}{path} is no API server")
-        return found
+            return msgspec.json.decode(data, type=Found)
+        except msgspec.MsgspecError:
+            text = f"what answers at {self.server}{path} is no API server"
+            raise ApiError(ErrorKind.AWAY, text) from None
 
 
 def _configuration() -> Any:
