@@ -95,7 +95,7 @@ class _Allocation:
             self._fill(place)
 
     def _rank(self, place: ProxyPlace) -> tuple[int, ProxyPlace]:
-        proxy = self.view.current(place)
+        proxy = self.view.current.get(place)
         ranks = (
             proxy is not None and serves(proxy),
             proxy is not None and has_ports(proxy),
@@ -107,7 +107,7 @@ class _Allocation:
 
     def _keep(self, place: ProxyPlace) -> None:
         """Give a proxy the range that it has or had, if it can have it."""
-        proxy, spec = self.view.current(place), self.of[place].spec
+        proxy, spec = self.view.current.get(place), self.of[place].spec
         reserved, kernel = self._reserved(place), [*self.kernel.values()]
         for ports in self._candidates(place):
             cut = PortRange(ports.first, min(ports.last, ports.first + spec.ports - 1))
@@ -118,7 +118,7 @@ class _Allocation:
                 return
 
     def _candidates(self, place: ProxyPlace) -> Iterator[PortRange]:
-        current = self.view.current(place)
+        current = self.view.current.get(place)
         there = [one for one in self.proxies if place_of(one) == place]
         yield from (one.range for one in sorted(there, key=lambda one: one is not current))
         known = (
@@ -136,7 +136,7 @@ class _Allocation:
         have their ports, or if their place is not given another range.
         """
         served = place in self.state.served
-        waits = served or self.view.current(place) is not None
+        waits = served or self.view.current.get(place) is not None
         pods = [pod for pod in self.strangers if not (served and pod.deleting)]
         for one in self.proxies:
             heeded = has_ports(one) or place_of(one) not in self.view.wanted
@@ -146,7 +146,7 @@ class _Allocation:
 
     def _publish(self, place: ProxyPlace) -> None:
         """Give a proxy its port for a master in the cluster, if it is to have one and can."""
-        proxy, port = self.view.current(place), self.of[place].spec.master.publish
+        proxy, port = self.view.current.get(place), self.of[place].spec.master.publish
         if not port:
             return
         if proxy is None or not has_ports(proxy) or port not in proxy.pod.host_ports:

@@ -113,7 +113,7 @@ def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
     named = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
     for node in sorted(named & context.observed.nodes.keys()):
         place = ProxyPlace(of.id, node)
-        current, wanted = context.view.current(place), place in context.view.wanted
+        current, wanted = context.view.current.get(place), place in context.view.wanted
         site = site_of(context, place) if wanted else None
         former = context.state.given.get(place) or of.former.get(node)
         kept = current.range if current else former

@@ -119,8 +119,7 @@ def site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
     if place in context.ranges.exhausted:
         return Obstacle("PortsExhausted", context.ranges.exhausted[place])
     name = proxy_id(place.of, place.node)
-    own = {one.pod.uid for one in context.observed.proxies}
-    if any(pod.id == name and pod.uid not in own for pod in context.observed.pods):
+    if name in context.view.others:
         text = "is there already, and is not the operator's: delete or rename it"
         return Obstacle("NameTaken", f"a pod called {name} {text}")
     publish = master.publish if place in context.ranges.published else 0
@@ -172,7 +171,7 @@ def reconcile_proxy(context: ClusterContext, place: ProxyPlace) -> Iterator[Acti
 
 def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[Action]:
     """The next action for a proxy that is wanted, and can be had as the site says."""
-    name, current = proxy_id(place.of, place.node), context.view.current(place)
+    name, current = proxy_id(place.of, place.node), context.view.current.get(place)
     misplaced = [one for one in context.view.proxies.get(place, ()) if one.pod.id != name]
     if misplaced:
         for one in misplaced:
@@ -218,7 +217,7 @@ def _delete_proxy(
 
 def _note(context: ClusterContext, place: ProxyPlace) -> None:
     """Keep count of how often a proxy was made, as long as it is not well."""
-    current = context.view.current(place)
+    current = context.view.current.get(place)
     if current is None or not serves(current):
         context.retries.effect(_creation(place))
 

@@ -166,7 +166,7 @@ def _refused(
 
 def _waits(view: View, place: ProxyPlace) -> bool:
     """Whether the proxy of a place is wanted, but has not got its ports yet."""
-    proxy = view.current(place)
+    proxy = view.current.get(place)
     return place in view.wanted and (proxy is None or not has_ports(proxy))
 
 

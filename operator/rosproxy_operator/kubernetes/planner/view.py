@@ -32,29 +32,27 @@ class View:
     """A `ClusterSnapshot` by RosProxy and by node.
 
     ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of
-    them, ``orphans`` those of RosProxies that are gone. ``on`` are, by the node that they are meant
-    for, all proxies that hold ports, whosever they are. ``wanted`` are the places where pods want a
-    proxy, and those pods; ``places`` those where a proxy is wanted or there, in order; ``taken``
-    all pods that a RosProxy has taken, wherever they are. ``strangers`` are, by node, the other
-    pods on it that hold ports. ``findings`` are those about pods.
+    them, ``orphans`` those of RosProxies that are gone. ``current`` is the proxy of a place, under
+    the name that it is to have, unless it is being deleted. ``on`` are, by the node that they are
+    meant for, all proxies that hold ports, whosever they are. ``wanted`` are the places where pods
+    want a proxy, and those pods; ``places`` those where a proxy is wanted or there, in order;
+    ``taken`` all pods that a RosProxy has taken, wherever they are. ``strangers`` are, by node, the
+    other pods on it that hold ports, ``others`` the names of all that are no proxies. ``findings``
+    are those about pods.
     """
 
     observed: ClusterSnapshot
     rosproxies: Mapping[Name, RosProxy]
     proxies: Mapping[ProxyPlace, tuple[ProxyPod, ...]]
+    current: Mapping[ProxyPlace, ProxyPod]
     orphans: tuple[ProxyPod, ...]
     on: Mapping[str, tuple[ProxyPod, ...]]
     wanted: Mapping[ProxyPlace, tuple[Pod, ...]]
     places: Mapping[Name, tuple[ProxyPlace, ...]]
     taken: Mapping[Name, tuple[Pod, ...]]
     strangers: Mapping[str, tuple[Pod, ...]]
+    others: frozenset[Name]
     findings: tuple[ClusterFinding, ...]
-
-    def current(self, place: ProxyPlace) -> ProxyPod | None:
-        """The proxy of a place, under the name that it is to have; None if it is being deleted."""
-        name = proxy_id(place.of, place.node)
-        there = (one for one in self.proxies.get(place, ()) if one.pod.id == name)
-        return next((one for one in there if not one.pod.deleting), None)
 
 
 def place_of(proxy: ProxyPod) -> ProxyPlace:
@@ -87,6 +85,12 @@ def view(observed: ClusterSnapshot) -> View:
         observed=observed,
         rosproxies=rosproxies,
         proxies=proxies,
+        current={
+            place: one
+            for place, there in proxies.items()
+            for one in there
+            if one.pod.id == proxy_id(place.of, place.node) and not one.pod.deleting
+        },
         orphans=tuple(one for one in orphans if one.owner not in unusable),
         on=grouped((one.on, one) for one in observed.proxies if not one.pod.ended),
         wanted=wanted,
@@ -95,6 +99,7 @@ def view(observed: ClusterSnapshot) -> View:
         strangers=grouped(
             (pod.node, pod) for pod in others if pod.node and pod.host_ports and not pod.ended
         ),
+        others=frozenset(pod.id for pod in others),
         findings=(*findings, *left_out),
     )
 
