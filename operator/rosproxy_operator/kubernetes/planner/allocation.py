@@ -20,14 +20,7 @@ from rosproxy_operator.common.allocation import (
     within,
 )
 from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
-from rosproxy_operator.kubernetes.planner.view import (
-    View,
-    finding,
-    has_ports,
-    place_of,
-    serves,
-    short,
-)
+from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves, short
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,
@@ -36,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, MASTER_PORT
 from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.status.findings import finding
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,6 @@ from typing import Any
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
-from rosproxy_operator.kubernetes.planner.selection import pod_finding
 from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterFinding,
@@ -29,6 +28,7 @@ from rosproxy_operator.kubernetes.resources.names import (
 )
 from rosproxy_operator.kubernetes.resources.objects import VARIABLE
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
+from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 MIRROR = "kubernetes.io/config.mirror"
 """Annotation of the API server's picture of a static pod: a change of it changes no container."""

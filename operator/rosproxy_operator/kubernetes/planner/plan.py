@@ -39,7 +39,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status import events
-from rosproxy_operator.kubernetes.status.findings import findings, invalid_finding
+from rosproxy_operator.kubernetes.status.findings import finding, findings
 from rosproxy_operator.kubernetes.status.status import status_of, status_of_invalid
 
 
@@ -93,7 +93,7 @@ def plan(
         problems += found
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
-        problems.append(invalid_finding(bad))
+        problems.append(finding(bad, "Invalid", bad.text, fatal=True))
         actions += _patch(context, bad, status_of_invalid(bad, stamp))
     every = tuple(dict.fromkeys(problems))
     new = events.warnings(every, decided.reported, now)

@@ -6,12 +6,12 @@ from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     ClusterNode,
     Pod,
-    Reference,
     RosProxy,
     RosProxySpec,
     Selector,
 )
 from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
+from rosproxy_operator.kubernetes.status.findings import pod_finding
 
 OFF = ("", "false")
 """Values of the label with which a pod is left alone, whatever a podSelector says."""
@@ -66,14 +66,6 @@ def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFindin
         )
         return pod_finding(pod, of, "HostNetwork", text)
     return of
-
-
-def pod_finding(
-    pod: Pod, of: RosProxy, reason: str, text: str, fatal: bool = True
-) -> ClusterFinding:
-    """Something about a pod that a RosProxy selects."""
-    subject, about = f"pod {pod.id}", Reference("Pod", pod.id, pod.uid)
-    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
 
 
 def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:

@@ -19,8 +19,9 @@ from rosproxy_operator.common.allocation import (
     within,
 )
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
-from rosproxy_operator.kubernetes.planner.view import View, finding, has_ports, place_of, serves
+from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Pod, ProxyPlace, Stuck
+from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_FOR = 60.0
 """Seconds for which it is told that a proxy got other ports than were tried first."""

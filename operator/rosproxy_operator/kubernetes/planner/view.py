@@ -17,11 +17,11 @@ from rosproxy_operator.kubernetes.resources.model import (
     Pod,
     ProxyPlace,
     ProxyPod,
-    Reference,
     RosProxy,
     Stuck,
 )
-from rosproxy_operator.kubernetes.resources.names import KIND, is_own, proxy_id
+from rosproxy_operator.kubernetes.resources.names import is_own, proxy_id
+from rosproxy_operator.kubernetes.status.findings import finding
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -146,12 +146,6 @@ def _wanted(
 def short(texts: Iterable[str]) -> str:
     """A few of them, and how many more there are."""
     return listed(sorted(set(texts)))
-
-
-def finding(of: RosProxy, reason: str, text: str) -> ClusterFinding:
-    """Something about a RosProxy that keeps nothing else from being done."""
-    subject, about = f"rosproxy {of.id}", Reference(KIND, of.id, of.uid)
-    return ClusterFinding(subject, text, fatal=False, reason=reason, of=of.id, about=about)
 
 
 def grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, tuple[V, ...]]:

@@ -24,10 +24,6 @@ class Name:
         return f"{self.namespace}/{self.name}"
 
 
-NOBODY = Name("", "")
-"""The name of no object."""
-
-
 @dataclass(frozen=True, slots=True, order=True)
 class ProxyPlace:
     """A node, as one RosProxy (``of``) sees it."""
@@ -266,7 +262,7 @@ class Reference:
     uid: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterFinding(Problem):
     """A problem as conditions and Kubernetes Events tell it.
 
@@ -274,8 +270,8 @@ class ClusterFinding(Problem):
     object that the Event is about; None means that the problem gets no Event.
     """
 
-    reason: str = "Problem"
-    of: Name = NOBODY
+    reason: str
+    of: Name
     about: Reference | None = None
 
 

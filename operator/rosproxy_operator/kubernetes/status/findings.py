@@ -12,6 +12,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     Name,
     NodeState,
+    Pod,
     ProxyPod,
     Reference,
     RosProxy,
@@ -57,16 +58,24 @@ def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
         yield from _answered(rosproxy, state, proxy)
 
 
-def invalid_finding(rosproxy: InvalidRosProxy) -> ClusterFinding:
-    """That a RosProxy can't be read, with an Event."""
-    about = Reference(KIND, rosproxy.id, rosproxy.uid)
-    subject = f"rosproxy {rosproxy.id}"
-    return ClusterFinding(subject, rosproxy.text, reason="Invalid", of=rosproxy.id, about=about)
+def finding(
+    of: RosProxy | InvalidRosProxy, reason: str, text: str, fatal: bool = False, subject: str = ""
+) -> ClusterFinding:
+    """Something about a RosProxy, or about a ``subject`` that it has, with an Event."""
+    subject, about = subject or f"rosproxy {of.id}", Reference(KIND, of.id, of.uid)
+    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
+
+
+def pod_finding(
+    pod: Pod, of: RosProxy, reason: str, text: str, fatal: bool = True
+) -> ClusterFinding:
+    """Something about a pod that a RosProxy selects, with an Event on the pod."""
+    subject, about = f"pod {pod.id}", Reference("Pod", pod.id, pod.uid)
+    return ClusterFinding(subject, text, fatal=fatal, reason=reason, of=of.id, about=about)
 
 
 def _finding(rosproxy: RosProxy, subject: str, text: str, reason: str) -> ClusterFinding:
-    about, text = Reference(KIND, rosproxy.id, rosproxy.uid), bounded(text, _LONGEST)
-    return ClusterFinding(subject, text, reason=reason, of=rosproxy.id, about=about)
+    return finding(rosproxy, reason, bounded(text, _LONGEST), fatal=True, subject=subject)
 
 
 def _subject(proxy: ProxyPod) -> str:

@@ -142,9 +142,8 @@ def test_a_pod_that_is_left_out_keeps_the_others_ready():
 
 
 def test_a_problem_without_a_reason():
-    found = status(
-        state(proxy=None, answer=None), more=(ClusterFinding("service x", "is not there"),)
-    )
+    one = ClusterFinding("service x", "is not there", reason="", of=rosproxy().id)
+    found = status(state(proxy=None, answer=None), more=(one,))
 
     assert judged(found, "Ready") == ("False", "Problem")
     assert message(found) == "service x: is not there"

@@ -22,6 +22,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     MasterSpec,
     Name,
+    Reference,
 )
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
@@ -235,6 +236,9 @@ def test_what_an_unreadable_rosproxy_has_stays_as_it_is() -> None:
     found = look(complete(rosproxies=(), unusable={ROBOT: bad}))
     assert done(found) == []
     assert told(found, "Invalid") == ["rosproxy ros/robot: spec.ports: is no number: write one"]
+    (event,) = (one for one in found.actions if isinstance(one, Emit))
+    assert (event.type, event.reason, event.message) == ("Warning", "Invalid", bad.text)
+    assert event.about == Reference("RosProxy", ROBOT, "uid-robot")
     assert status(found)["conditions"][0]["reason"] == "Invalid"
 
 

@@ -12,11 +12,9 @@ from rosproxy_operator.kubernetes.resources.model import (
     NodeState,
     Obstacle,
     ProxyReport,
-    Reference,
     Selector,
     Stuck,
 )
-from rosproxy_operator.kubernetes.status.findings import invalid_finding
 from rosproxy_operator.kubernetes.status.status import (
     LONGEST,
     MOST_NAMES,
@@ -184,13 +182,10 @@ def test_one_that_can_not_be_read_keeps_what_it_has():
     assert again == found
 
 
-def test_one_that_could_never_be_read_and_its_event():
+def test_one_that_could_never_be_read():
     bad = InvalidRosProxy(rosproxy().id, "uid-arm", 1, "spec.ports: 0")
 
     assert len(status_of_invalid(bad, STAMP)["conditions"]) == 2
-    finding = invalid_finding(bad)
-    assert (finding.reason, finding.text) == ("Invalid", "spec.ports: 0")
-    assert finding.about == Reference("RosProxy", bad.id, "uid-arm")
 
 
 def test_a_large_cluster_is_told_in_bounds():
