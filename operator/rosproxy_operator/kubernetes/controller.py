@@ -10,7 +10,8 @@ decided from an event alone, and nothing here decides.
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace

@@ -4,8 +4,9 @@
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
+
+import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
@@ -22,8 +23,7 @@ EPHEMERAL = PortRange(32768, 60999)
 """Linux's own default of net.ipv4.ip_local_port_range."""
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterSettings:
+class ClusterSettings(msgspec.Struct, frozen=True):
     """The operator's options that decide what is planned.
 
     ``image`` and ``image_pull_policy`` are those of proxies whose RosProxy names none; an empty
@@ -38,8 +38,7 @@ class ClusterSettings:
     ephemeral: PortRange = EPHEMERAL
 
 
-@dataclass(frozen=True, slots=True)
-class WebhookSettings:
+class WebhookSettings(msgspec.Struct, frozen=True):
     """How the admission webhook is served, and with which certificate.
 
     Either the operator makes the certificate, for the names of ``service``, keeps it in
@@ -54,8 +53,7 @@ class WebhookSettings:
     directory: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class KubernetesSettings:
+class KubernetesSettings(msgspec.Struct, frozen=True):
     """Everything that ``rosproxy-operator kubernetes`` can be told.
 
     ``namespaces`` are those that are looked after, all if there are none. ``resync`` is in seconds:
@@ -63,7 +61,7 @@ class KubernetesSettings:
     metrics, ``liveness`` where it tells that it is alive. Without ``webhook`` pods are not wired.
     """
 
-    plan: ClusterSettings = field(default_factory=ClusterSettings)
+    plan: ClusterSettings = ClusterSettings()
     namespaces: tuple[str, ...] = ()
     resync: float = 30.0
     admin: HostPort = DEFAULT_ADMIN

@@ -7,8 +7,9 @@ Services and selected pods, then all pods on the nodes that matter. All of it or
 import asyncio
 import re
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import replace
 from typing import TypeVar
+
+from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import clean

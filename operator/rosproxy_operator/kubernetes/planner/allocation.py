@@ -8,7 +8,8 @@ were refused of late, and who had to leave his.
 """
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+
+import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
@@ -32,18 +33,17 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 from rosproxy_operator.kubernetes.status.findings import finding
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterRanges:
+class ClusterRanges(msgspec.Struct, frozen=True):
     """The range of each wanted proxy that can have one.
 
     ``published`` are the places whose port for the master in the cluster is free. ``exhausted``
     says of the others why there is none, ``findings`` what is not as asked for.
     """
 
-    given: dict[ProxyPlace, PortRange] = field(default_factory=dict)
-    published: set[ProxyPlace] = field(default_factory=set)
-    exhausted: dict[ProxyPlace, str] = field(default_factory=dict)
-    findings: list[ClusterFinding] = field(default_factory=list)
+    given: dict[ProxyPlace, PortRange] = {}
+    published: set[ProxyPlace] = set()
+    exhausted: dict[ProxyPlace, str] = {}
+    findings: list[ClusterFinding] = []
 
 
 def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> ClusterRanges:

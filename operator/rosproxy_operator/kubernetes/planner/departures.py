@@ -6,8 +6,10 @@ of the pods that are there, and is careful: what is unregistered by mistake is n
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 from ipaddress import ip_address, ip_network
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import grouped
@@ -29,8 +31,7 @@ AGAIN = 3.0
 """Seconds until proxies are looked at again whose pods have just gone."""
 
 
-@dataclass(frozen=True, slots=True)
-class Departures:
+class Departures(msgspec.Struct, frozen=True):
     """The addresses that are gone, by the uid of the proxy's pod, and what is remembered."""
 
     gone: Mapping[str, tuple[str, ...]]

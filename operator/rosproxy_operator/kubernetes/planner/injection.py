@@ -6,8 +6,9 @@ finds pods that no webhook has seen.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
+
+import msgspec
 
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.text import clean
@@ -35,12 +36,11 @@ MIRROR = "kubernetes.io/config.mirror"
 _KINDS = ("initContainers", "containers")
 
 
-@dataclass(frozen=True, slots=True)
-class Wiring:
+class Wiring(msgspec.Struct, frozen=True):
     """What the webhook makes of a pod: its new ``spec``, None if it stays as it is."""
 
     spec: Json | None = None
-    annotations: Mapping[str, str] = field(default_factory=dict)
+    annotations: Mapping[str, str] = {}
     warnings: tuple[str, ...] = ()
 
 

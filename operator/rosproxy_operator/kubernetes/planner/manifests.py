@@ -4,8 +4,9 @@ import copy
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
@@ -56,8 +57,7 @@ _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000
 """Where a proxy's outgoing connections may start: never on a port that it is to listen on."""
 
 
-@dataclass(frozen=True, slots=True)
-class Site:
+class Site(msgspec.Struct, frozen=True):
     """A proxy on a node.
 
     ``master`` is the real master as a proxy is told it: ``uri`` also of a Service, ``address``

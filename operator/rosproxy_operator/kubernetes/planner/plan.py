@@ -8,7 +8,9 @@ wanted proxy its ports, `reconcile` says what is to be done to Services and prox
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
@@ -43,8 +45,7 @@ from rosproxy_operator.kubernetes.status.findings import finding, findings
 from rosproxy_operator.kubernetes.status.status import status_of, status_of_invalid
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterPlan:
+class ClusterPlan(msgspec.Struct, frozen=True):
     """What to do, in this order, and what to remember.
 
     One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
@@ -54,8 +55,8 @@ class ClusterPlan:
 
     actions: tuple[Action, ...] = ()
     problems: tuple[ClusterFinding, ...] = ()
-    state: ClusterState = field(default_factory=ClusterState)
-    gone: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    state: ClusterState = ClusterState()
+    gone: Mapping[str, tuple[str, ...]] = {}
     again_in: float | None = None
 
 

@@ -8,7 +8,9 @@ which can be exchanged. `retries` keeps actions without effect from being repeat
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -45,8 +47,7 @@ LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterContext:
+class ClusterContext(msgspec.Struct, frozen=True):
     """Everything that the steps of all RosProxies are made from."""
 
     view: View

@@ -6,7 +6,9 @@ state; what nobody asks for any more has had its effect and is forgotten.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.resources.model import Name
 
@@ -20,8 +22,7 @@ AT_ONCE = 3
 """How often a pod is made anew without delay that never got well."""
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
+class Task(msgspec.Struct, frozen=True):
     """Something to be done for a RosProxy to the object ``id``.
 
     ``detail`` tells tasks apart that concern objects of one name, or one object in several ways.
@@ -33,8 +34,7 @@ class Task:
     detail: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class RetryRecord:
+class RetryRecord(msgspec.Struct, frozen=True):
     """How often a task was asked for, and when the last time.
 
     ``effect``: it was seen to be done, yet it may have to be done again. ``error`` is what the API

@@ -7,7 +7,9 @@ before anything is decided; `decide` adds the ranges that were given. The other 
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
@@ -27,8 +29,7 @@ TRIED_FOR = 60.0
 """Seconds for which it is told that a proxy got other ports than were tried first."""
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterState:
+class ClusterState(msgspec.Struct, frozen=True):
     """Times are in seconds of the operator's monotonic clock.
 
     ``begun`` is False until the first look. ``absent`` are proxies since when no pod wants them,
@@ -43,18 +44,18 @@ class ClusterState:
     """
 
     begun: bool = False
-    absent: Mapping[ProxyPlace, float] = field(default_factory=dict)
-    lost: Mapping[str, float] = field(default_factory=dict)
-    served: Mapping[ProxyPlace, PortRange] = field(default_factory=dict)
-    given: Mapping[ProxyPlace, PortRange] = field(default_factory=dict)
-    refused: Mapping[ProxyPlace, float] = field(default_factory=dict)
-    taken: Mapping[tuple[str, int], float] = field(default_factory=dict)
-    moved: Mapping[ProxyPlace, Move] = field(default_factory=dict)
-    tried: Mapping[ProxyPlace, Move] = field(default_factory=dict)
-    attempts: Mapping[Task, RetryRecord] = field(default_factory=dict)
-    reported: Mapping[ClusterFinding, float] = field(default_factory=dict)
-    addresses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    strange: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    absent: Mapping[ProxyPlace, float] = {}
+    lost: Mapping[str, float] = {}
+    served: Mapping[ProxyPlace, PortRange] = {}
+    given: Mapping[ProxyPlace, PortRange] = {}
+    refused: Mapping[ProxyPlace, float] = {}
+    taken: Mapping[tuple[str, int], float] = {}
+    moved: Mapping[ProxyPlace, Move] = {}
+    tried: Mapping[ProxyPlace, Move] = {}
+    attempts: Mapping[Task, RetryRecord] = {}
+    reported: Mapping[ClusterFinding, float] = {}
+    addresses: Mapping[str, Mapping[str, float]] = {}
+    strange: Mapping[tuple[str, str], float] = {}
 
 
 def learn(view: View, state: ClusterState, now: float) -> ClusterState:

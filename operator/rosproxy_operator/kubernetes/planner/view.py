@@ -5,8 +5,9 @@ Everything after this works by place, that is a RosProxy on a node, and not by p
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import TypeVar
+
+import msgspec
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
@@ -27,8 +28,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 
-@dataclass(frozen=True, slots=True)
-class View:
+class View(msgspec.Struct, frozen=True):
     """A `ClusterSnapshot` by RosProxy and by node.
 
     ``rosproxies`` are those that are not being deleted; ``proxies`` those that belong to one of

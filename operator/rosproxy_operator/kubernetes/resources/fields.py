@@ -5,8 +5,9 @@ as Kubernetes names it nor tells what to do.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, TypeVar
+
+import msgspec
 
 from rosproxy_operator.kubernetes.resources.values import quoted
 
@@ -19,8 +20,7 @@ class InvalidField(Exception):
     """Why an object can't be used: which field, what is wrong, and what to do."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(msgspec.Struct, frozen=True):
     """A part of an object, None if it is not given; ``path`` names it as Kubernetes does.
 
     All methods but `refused` raise InvalidField if it is not what they are to give.

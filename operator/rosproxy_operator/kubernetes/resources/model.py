@@ -1,9 +1,11 @@
 """What the operator sees in a Kubernetes cluster, in Kubernetes' words."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
+
+import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
@@ -13,8 +15,7 @@ Json = Mapping[str, Any]
 """An object as the API server gives it, or a part of one."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Name:
+class Name(msgspec.Struct, frozen=True, order=True):
     """What tells namespaced objects of one kind apart."""
 
     namespace: str
@@ -24,27 +25,24 @@ class Name:
         return f"{self.namespace}/{self.name}"
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class ProxyPlace:
+class ProxyPlace(msgspec.Struct, frozen=True, order=True):
     """A node, as one RosProxy (``of``) sees it."""
 
     of: Name
     node: str
 
 
-@dataclass(frozen=True, slots=True)
-class Selector:
+class Selector(msgspec.Struct, frozen=True):
     """A label selector (``metav1.LabelSelector``): all parts must fit.
 
     ``expressions`` are (key, operator, values) with the operators In, NotIn, Exists, DoesNotExist.
     """
 
-    labels: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, str] = {}
     expressions: tuple[tuple[str, str, frozenset[str]], ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class MasterSpec:
+class MasterSpec(msgspec.Struct, frozen=True):
     """Where the real ROS master is: outside at ``uri``, or a Service of the cluster.
 
     ``address`` is the IP address of the host in ``uri``, for names that the cluster's DNS does not
@@ -67,8 +65,7 @@ class Advertise(Enum):
     HOSTNAME = "Hostname"
 
 
-@dataclass(frozen=True, slots=True)
-class RosProxySpec:
+class RosProxySpec(msgspec.Struct, frozen=True):
     """What a RosProxy asks for; the fields are those of the CRD.
 
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
@@ -81,7 +78,7 @@ class RosProxySpec:
     ports: int
     window: PortRange
     pod_selector: Selector | None = None
-    node_selector: Mapping[str, str] = field(default_factory=dict)
+    node_selector: Mapping[str, str] = {}
     tolerations: tuple[Json, ...] = ()
     advertise: Advertise = Advertise.INTERNAL_IP
     cleanup_after: float = 30.0
@@ -91,12 +88,11 @@ class RosProxySpec:
     image: str = ""
     image_pull_policy: str = ""
     image_pull_secrets: tuple[Json, ...] = ()
-    resources: Json = field(default_factory=dict)
+    resources: Json = {}
     host_aliases: tuple[Json, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class RosProxy:
+class RosProxy(msgspec.Struct, frozen=True):
     """A RosProxy, the custom resource.
 
     ``former`` are the ranges by node name that its status holds; ``cluster_ip`` is the address
@@ -107,14 +103,13 @@ class RosProxy:
     uid: str
     generation: int
     spec: RosProxySpec
-    former: Mapping[str, PortRange] = field(default_factory=dict)
+    former: Mapping[str, PortRange] = {}
     cluster_ip: str = ""
-    status: Json = field(default_factory=dict)
+    status: Json = {}
     deleting: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterNode:
+class ClusterNode(msgspec.Struct, frozen=True):
     """A node of the cluster. ``addresses`` are by their type, the first of each.
 
     ``advertise_host`` is its annotation rosproxy.io/advertise-host. ``pod_networks`` are its
@@ -122,8 +117,8 @@ class ClusterNode:
     """
 
     name: str
-    labels: Mapping[str, str] = field(default_factory=dict)
-    addresses: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, str] = {}
+    addresses: Mapping[str, str] = {}
     advertise_host: str = ""
     pod_networks: tuple[str, ...] = ()
     ready: bool = True
@@ -134,8 +129,7 @@ ELSEWHERE = "$()"
 """Stands for a value that is only known once the container runs."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pod:
+class Pod(msgspec.Struct, frozen=True):
     """A pod. ``node`` and ``ip`` are empty until it has them.
 
     ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
@@ -146,7 +140,7 @@ class Pod:
 
     id: Name
     uid: str
-    labels: Mapping[str, str] = field(default_factory=dict)
+    labels: Mapping[str, str] = {}
     node: str = ""
     phase: str = "Pending"
     ip: str = ""
@@ -172,8 +166,7 @@ class Stuck(Enum):
     SANDBOX = "sandbox"  # the kubelet can't set it up
 
 
-@dataclass(frozen=True, slots=True)
-class ProxyPod:
+class ProxyPod(msgspec.Struct, frozen=True):
     """A pod of the operator in which a proxy runs, or is to run.
 
     ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
@@ -196,8 +189,7 @@ class ProxyPod:
     restarts: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class ProxyService:
+class ProxyService(msgspec.Struct, frozen=True):
     """A Service of the operator: under its address pods find the proxy on their node."""
 
     of: Name
@@ -208,8 +200,7 @@ class ProxyService:
     deleting: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class ProxyReport:
+class ProxyReport(msgspec.Struct, frozen=True):
     """What a proxy says of itself (``/status``), as far as it matters here.
 
     ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
@@ -219,13 +210,12 @@ class ProxyReport:
     answered: bool
     master_up: bool = False
     error: str = ""
-    nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    nodes: Mapping[str, tuple[str, ...]] = {}
     topics: frozenset[str] = frozenset()
     problems: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Obstacle:
+class Obstacle(msgspec.Struct, frozen=True):
     """What keeps a proxy from being made or changed, told with the node's name before it.
 
     ``reason`` is the same in one CamelCase word.
@@ -235,8 +225,7 @@ class Obstacle:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class NodeState:
+class NodeState(msgspec.Struct, frozen=True):
     """What one RosProxy has on one node, and what it gets there: a line of its status.
 
     ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
@@ -253,8 +242,7 @@ class NodeState:
     obstacle: Obstacle | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Reference:
+class Reference(msgspec.Struct, frozen=True):
     """What a Kubernetes Event is about (``involvedObject``)."""
 
     kind: str
@@ -275,19 +263,17 @@ class ClusterFinding(Problem):
     about: Reference | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class InvalidRosProxy:
+class InvalidRosProxy(msgspec.Struct, frozen=True):
     """A RosProxy that can't be read: ``text`` says why, the rest is as it is there."""
 
     id: Name
     uid: str
     generation: int
     text: str
-    status: Json = field(default_factory=dict)
+    status: Json = {}
 
 
-@dataclass(frozen=True, slots=True)
-class ClusterSnapshot:
+class ClusterSnapshot(msgspec.Struct, frozen=True):
     """A cluster at one moment, as far as it matters.
 
     ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
@@ -300,12 +286,12 @@ class ClusterSnapshot:
     """
 
     rosproxies: tuple[RosProxy, ...] = ()
-    nodes: Mapping[str, ClusterNode] = field(default_factory=dict)
+    nodes: Mapping[str, ClusterNode] = {}
     pods: tuple[Pod, ...] = ()
     proxies: tuple[ProxyPod, ...] = ()
-    services: Mapping[Name, ProxyService] = field(default_factory=dict)
-    masters: Mapping[Name, tuple[str, str]] = field(default_factory=dict)
+    services: Mapping[Name, ProxyService] = {}
+    masters: Mapping[Name, tuple[str, str]] = {}
     selected: frozenset[str] = frozenset()
-    reports: Mapping[str, ProxyReport] = field(default_factory=dict)
-    unusable: Mapping[Name, InvalidRosProxy] = field(default_factory=dict)
-    failures: Mapping[Name, Mapping[Name, str]] = field(default_factory=dict)
+    reports: Mapping[str, ProxyReport] = {}
+    unusable: Mapping[Name, InvalidRosProxy] = {}
+    failures: Mapping[Name, Mapping[Name, str]] = {}

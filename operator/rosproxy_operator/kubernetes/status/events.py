@@ -2,8 +2,9 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
+
+import msgspec
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -28,12 +29,11 @@ _COMPONENT = "rosproxy-operator"
 _LONGEST_NAME = 200
 
 
-@dataclass(frozen=True, slots=True)
-class NewEvents:
+class NewEvents(msgspec.Struct, frozen=True):
     """Events to make, and when which problem was seen last, on a monotonic clock in seconds."""
 
     emits: tuple[Emit, ...] = ()
-    reported: Mapping[ClusterFinding, float] = field(default_factory=dict)
+    reported: Mapping[ClusterFinding, float] = {}
 
 
 def warnings(

@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import TypeGuard
+
+import msgspec
 
 from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
@@ -41,8 +42,7 @@ _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
 _NO_PODS, _INVALID = "NoPods", "Invalid"
 
 
-@dataclass(frozen=True, slots=True)
-class Condition:
+class Condition(msgspec.Struct, frozen=True):
     """A condition without its times. ``status`` is True, False or Unknown."""
 
     type: str

@@ -8,9 +8,9 @@ import os
 import secrets
 import ssl
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
+import msgspec
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -29,8 +29,7 @@ class InvalidCertificate(Exception):
     """What was found is no certificate with its key; the message says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeyPair:
+class KeyPair(msgspec.Struct, frozen=True):
     """A certificate with its key, and the CAs by which it is trusted, all as PEM.
 
     ``ca`` is empty where that is somebody else's affair.

@@ -2,8 +2,9 @@
 
 import copy
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests

@@ -6,8 +6,10 @@ Objects are as the API server has them, and are read by the same code as there.
 import copy
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,

@@ -1,9 +1,9 @@
 """Which ports a proxy gets on its node, and when it leaves them."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy

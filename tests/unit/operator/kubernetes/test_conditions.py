@@ -1,8 +1,7 @@
 """The conditions of a RosProxy: what is wrong, and what to do."""
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.proxy_sync import no_answer
 from rosproxy_operator.kubernetes.resources.model import (

@@ -1,7 +1,8 @@
 """Which addresses a proxy is told to be gone: never one at which something runs."""
 
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.departures import AGAIN, REMEMBERED, UNSEEN, gone, waits
 from rosproxy_operator.kubernetes.planner.state import ClusterState

@@ -1,9 +1,9 @@
 """What is created: hardened, bound to its node, and recognized when it is seen again."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner import manifests

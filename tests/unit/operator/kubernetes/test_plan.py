@@ -1,9 +1,9 @@
 """What is done for RosProxies: their Services, and a proxy on each node that needs one."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner.actions import (

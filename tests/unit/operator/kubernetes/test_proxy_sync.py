@@ -2,10 +2,10 @@
 
 import asyncio
 from collections.abc import AsyncIterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort

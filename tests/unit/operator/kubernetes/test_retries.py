@@ -1,6 +1,6 @@
 """What is refused, or does not last, is tried again: soon, then ever later, never in a loop."""
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, CreateService, PatchStatus
 from rosproxy_operator.kubernetes.planner.state import ClusterState

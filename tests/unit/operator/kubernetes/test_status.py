@@ -1,10 +1,10 @@
 """The status of a RosProxy: what kubectl shows of it."""
 
 import json
-from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.model import (
