@@ -21,7 +21,6 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from enum import Enum
 from typing import Any
 from urllib.parse import quote
 
@@ -65,32 +64,37 @@ _TEST_FAILED = "the server rejected our request due to an error in our request"
 _LONGEST = 500
 
 
-class ErrorKind(Enum):
-    """Why the API server did not do what it was asked, as far as that makes a difference."""
-
-    AWAY = "away"  # it can't be reached, or is not ready to answer
-    GONE = "gone"
-    CONFLICT = "conflict"  # the name is taken, or the object is another one by now
-    INVALID = "invalid"  # the object is not one that the API server takes
-    OTHER = "other"
-
-
-_KINDS = {
-    400: ErrorKind.INVALID,
-    401: ErrorKind.AWAY,  # the token has just been replaced, or the server does not know it yet
-    404: ErrorKind.GONE,
-    409: ErrorKind.CONFLICT,
-    422: ErrorKind.INVALID,
-    429: ErrorKind.AWAY,
-}
-
-
 class ApiError(Exception):
-    """The API server did not do what it was asked; the message is one line."""
+    """The API server did not do what it was asked; the message is one line.
 
-    def __init__(self, kind: ErrorKind, text: str) -> None:
-        super().__init__(text)
-        self.kind = kind
+    Its subclasses say why, as far as that makes a difference.
+    """
+
+
+class ApiAway(ApiError):
+    """It can't be reached, or is not ready to answer."""
+
+
+class ApiGone(ApiError):
+    """The object is not there, or the namespace is about to go that it is to be in."""
+
+
+class ApiConflict(ApiError):
+    """The name is taken, or the object is another one by now."""
+
+
+class ApiInvalid(ApiError):
+    """The object is not one that the API server takes."""
+
+
+_KINDS: Mapping[int, type[ApiError]] = {
+    400: ApiInvalid,
+    401: ApiAway,  # the token has just been replaced, or the server does not know it yet
+    404: ApiGone,
+    409: ApiConflict,
+    422: ApiInvalid,
+    429: ApiAway,
+}
 
 
 class Api:
@@ -185,7 +189,7 @@ class Api:
     def _items(self, found: Found) -> list[Found]:
         items = found.get("items")
         if not isinstance(items, list):
-            raise ApiError(ErrorKind.AWAY, f"what answers at {self.server} is no API server")
+            raise ApiAway(f"what answers at {self.server} is no API server")
         return [item for item in items if isinstance(item, dict)]
 
     def _ask(
@@ -215,14 +219,13 @@ class Api:
         except (HTTPError, ApiException, ConfigException, OSError) as error:
             text = " ".join(str(error).split())[:200] or type(error).__name__
             text = f"the API server at {self.server} can't be reached: {text}"
-            raise ApiError(ErrorKind.AWAY, text) from error
+            raise ApiAway(text) from error
         if not 200 <= status <= 299:
             raise refusal(status, str(reason or ""), data)
         try:
             return msgspec.json.decode(data, type=Found)
         except msgspec.MsgspecError:
-            text = f"what answers at {self.server}{path} is no API server"
-            raise ApiError(ErrorKind.AWAY, text) from None
+            raise ApiAway(f"what answers at {self.server}{path} is no API server") from None
 
 
 def _configuration() -> Any:
@@ -234,10 +237,9 @@ def _configuration() -> Any:
         else:
             load_kube_config(client_configuration=configuration)  # type: ignore[no-untyped-call]
     except (ConfigException, OSError) as error:
-        raise ApiError(
-            ErrorKind.AWAY,
+        raise ApiAway(
             f"no cluster is known here ({error}): run it in a pod with a service account, or name "
-            "a kubeconfig (KUBECONFIG)",
+            "a kubeconfig (KUBECONFIG)"
         ) from error
     # Whoever asks tries again, and is to know at once.
     configuration.retries = False
@@ -255,19 +257,18 @@ def _path(kind: str, namespace: str, name: str = "") -> str:
 def refusal(status: int, reason: str, body: bytes) -> ApiError:
     """The error for what the API server answered: HTTP status, reason phrase, body."""
     message = _message(body) or reason
-    kind = _KINDS.get(status, ErrorKind.AWAY if status >= 500 else ErrorKind.OTHER)
+    kind = _KINDS.get(status, ApiAway if status >= 500 else ApiError)
     if status == 403:  # by a role, or by an admission plug-in that has looked at the object
-        rule, gone = missing_rule(message), _TERMINATING in message
-        if rule:
-            return ApiError(ErrorKind.OTHER, f"{rule} ({message})")
-        return ApiError(ErrorKind.GONE if gone else ErrorKind.INVALID, message)
+        if rule := missing_rule(message):
+            return ApiError(f"{rule} ({message})")
+        return ApiGone(message) if _TERMINATING in message else ApiInvalid(message)
     if status == 422 and message == _TEST_FAILED:
-        return ApiError(ErrorKind.CONFLICT, "the object has changed meanwhile")
+        return ApiConflict("the object has changed meanwhile")
     if status == 401:
         message = f"the API server does not know the operator's token or certificate ({message})"
-    elif kind is ErrorKind.AWAY:
+    elif kind is ApiAway:
         message = f"the API server answers HTTP {status}: {message}"
-    return ApiError(kind, message)
+    return kind(message)
 
 
 def missing_rule(message: str) -> str:

@@ -14,7 +14,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiConflict, ApiError, ApiGone, ApiInvalid
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreateProxy,
@@ -100,10 +100,10 @@ class ClusterApplier:
         quiet = isinstance(action, PatchStatus | Emit)
         try:
             await in_thread(self._do, action)
+        except _nothing_left(action) as error:
+            log.debug("%s: nothing to do: %s", line(action), error)
+            return None
         except ApiError as error:
-            if error.kind in _nothing_left(action):
-                log.debug("%s: nothing to do: %s", line(action), error)
-                return None
             text = str(error)
         except Exception as error:  # a mistake of ours must not stop the others
             log.exception("%s failed", line(action))
@@ -193,14 +193,14 @@ def _subject(action: Action) -> Name:
             return action.of
 
 
-def _nothing_left(action: Action) -> tuple[ErrorKind, ...]:
+def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
     """The errors that mean that there is nothing left to do.
 
     The object is gone, or its whole namespace is about to be; or it is another one by now.
     """
     if isinstance(action, DeleteService | DeleteProxy | SetImage | PatchStatus):
-        return ErrorKind.GONE, ErrorKind.CONFLICT
-    return (ErrorKind.GONE,)
+        return ApiGone, ApiConflict
+    return (ApiGone,)
 
 
 def _create(api: Api, kind: str, body: Json) -> None:
@@ -210,14 +210,13 @@ def _create(api: Api, kind: str, body: Json) -> None:
     """
     try:
         api.create(kind, body)
-    except ApiError as error:
-        if error.kind is ErrorKind.CONFLICT:
-            _check_ours(api, kind, body)
-        elif error.kind is ErrorKind.INVALID and "clusterIP" in body["spec"]:
-            log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
-            _create(api, kind, without_cluster_ip(body))
-        else:
+    except ApiConflict:
+        _check_ours(api, kind, body)
+    except ApiInvalid as error:
+        if "clusterIP" not in body["spec"]:
             raise
+        log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
+        _create(api, kind, without_cluster_ip(body))
 
 
 def _check_ours(api: Api, kind: str, body: Json) -> None:
@@ -228,16 +227,13 @@ def _check_ours(api: Api, kind: str, body: Json) -> None:
     """
     try:
         there = part(api.get(kind, name_of(body["metadata"])), "metadata")
-    except ApiError as error:
-        if error.kind is ErrorKind.GONE:
-            return
-        raise
+    except ApiGone:
+        return
     owners = {word(one, "kind") for one in parts(there, "ownerReferences")}
     if not is_own(words(there, "labels")) or KIND not in owners:
-        raise ApiError(
-            ErrorKind.CONFLICT,
+        raise ApiConflict(
             f"a {body.get('kind')} of this name that is not the operator's is there: rename it, "
-            "or rename the RosProxy",
+            "or rename the RosProxy"
         )
 
 
@@ -247,9 +243,7 @@ def _emit(api: Api, event: Emit) -> None:
     body = event_body(event, now)
     try:
         api.create("events", body)
-    except ApiError as error:
-        if error.kind is not ErrorKind.CONFLICT:
-            raise
+    except ApiConflict:
         id = name_of(body["metadata"])
         operations = counted(api.get("events", id), now)
         if operations:

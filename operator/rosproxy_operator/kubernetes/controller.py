@@ -18,7 +18,7 @@ from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiAway, ApiError, ApiGone
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.event_filter import EventFilter
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
@@ -74,8 +74,8 @@ class KubernetesController:
         try:
             return await self._look()
         except ApiError as error:
-            self._missing = self._missing or error.kind is ErrorKind.GONE
-            raise LookFailed(str(error), away=error.kind is ErrorKind.AWAY) from error
+            self._missing = self._missing or isinstance(error, ApiGone)
+            raise LookFailed(str(error), away=isinstance(error, ApiAway)) from error
 
     async def _look(self) -> float | None:
         started = time.monotonic()

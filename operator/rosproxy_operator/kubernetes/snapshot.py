@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from rosproxy.net.addresses import is_address
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiGone, ApiInvalid
 from rosproxy_operator.kubernetes.planner.selection import label_selector
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import (
@@ -93,22 +93,17 @@ class SnapshotReader:
     def _rosproxies(self) -> tuple[dict[Name, RosProxy], dict[Name, InvalidRosProxy]]:
         try:
             return rosproxies(self._api.rosproxies())
-        except ApiError as error:
-            if error.kind is not ErrorKind.GONE:
-                raise
-            raise ApiError(
-                ErrorKind.GONE,
+        except ApiGone:
+            raise ApiGone(
                 "the cluster has no RosProxies: install the CustomResourceDefinition "
-                "rosproxies.rosproxy.io (it comes with the chart and with manifests/)",
+                "rosproxies.rosproxy.io (it comes with the chart and with manifests/)"
             ) from None
 
     def _selected(self, of: RosProxy) -> list[Pod] | InvalidRosProxy:
         """The pods that a RosProxy's selector fits, or why the API server refuses that."""
         try:
             found = self._api.pods(of.id.namespace, label_selector(of.spec, of.id.name))
-        except ApiError as error:
-            if error.kind is not ErrorKind.INVALID:
-                raise
+        except ApiInvalid as error:
             text = f"spec.podSelector: {error}"
             return InvalidRosProxy(of.id, of.uid, of.generation, text, of.status)
         return [objects.pod(each) for each in found]
@@ -149,9 +144,7 @@ def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str
     """
     try:
         return read_master(api.get("services", id), id, ports)
-    except ApiError as error:
-        if error.kind is not ErrorKind.GONE:
-            raise
+    except ApiGone:
         return "", f"there is no Service {id.name} in the namespace {id.namespace}: create it"
 
 

@@ -16,7 +16,7 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import SOON, Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import SOON, Api, ApiAway, ApiError, ApiGone
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
 from rosproxy_operator.kubernetes.resources import objects
@@ -82,9 +82,7 @@ class Injector:
             try:
                 async with asyncio.timeout(until - time.monotonic()):
                     return await in_thread(self._wiring, body, dry_run)
-            except ApiError as error:
-                if error.kind is not ErrorKind.AWAY:
-                    raise
+            except ApiAway as error:
                 log.debug("a pod at admission: %s; trying again", error)
             except NoService as error:
                 if dry_run:
@@ -121,9 +119,7 @@ class Injector:
         )
         try:
             there = self._api.get("services", id, SOON)
-        except ApiError as error:
-            if error.kind is not ErrorKind.GONE:
-                raise
+        except ApiGone:
             if dry_run and of.cluster_ip:
                 return of.cluster_ip, 0.0
             raise missing from None

@@ -10,7 +10,15 @@ from pathlib import Path
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import WEBHOOKS, Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import (
+    WEBHOOKS,
+    Api,
+    ApiAway,
+    ApiConflict,
+    ApiError,
+    ApiGone,
+    ApiInvalid,
+)
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
 from rosproxy_operator.kubernetes.settings import WebhookSettings
@@ -95,7 +103,7 @@ class SelfSigned:
         try:
             there = self._api.get("secrets", self._secret)
         except ApiError as error:
-            if self._pair is None and error.kind is ErrorKind.AWAY:
+            if self._pair is None and isinstance(error, ApiAway):
                 raise
             self._complain(error)
             return self._usable(self._pair) or self._new(self._pair)
@@ -106,9 +114,9 @@ class SelfSigned:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
             self._api.patch("secrets", secret, _secret_patch(pair, there))
+        except (ApiInvalid, ApiConflict) as error:
+            raise ApiAway(f"somebody else writes {secret}: {error}") from None
         except ApiError as error:
-            if error.kind in (ErrorKind.INVALID, ErrorKind.CONFLICT):
-                raise ApiError(ErrorKind.AWAY, f"somebody else writes {secret}: {error}") from None
             self._complain(error)
         log.info("webhook: made a certificate that is valid until %s", pair.expires)
         return pair
@@ -118,10 +126,10 @@ class SelfSigned:
 
         That the API server is away the operator's looks tell.
         """
-        if error.kind is ErrorKind.AWAY:
+        if isinstance(error, ApiAway):
             return
         text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
-        if error.kind is ErrorKind.GONE:
+        if isinstance(error, ApiGone):
             text += "; create an empty Secret of this name (the chart does)"
         self.problems.append(Problem(_SUBJECT, text))
 
@@ -156,9 +164,9 @@ class SelfSigned:
                 log.info("webhook: its CA is now in %s", self._configuration)
         except ApiError as error:
             text = f"MutatingWebhookConfiguration {self._configuration}: {error}"
-            if error.kind is ErrorKind.GONE:
+            if isinstance(error, ApiGone):
                 text += "; without it no pod is wired: install it anew (the chart has it)"
-            if error.kind is not ErrorKind.AWAY:
+            if not isinstance(error, ApiAway):
                 self.problems.append(Problem(_SUBJECT, text))
             return False
         return True

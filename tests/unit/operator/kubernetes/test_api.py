@@ -6,7 +6,16 @@ from pathlib import Path
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind, missing_rule, refusal
+from rosproxy_operator.kubernetes.api import (
+    Api,
+    ApiAway,
+    ApiConflict,
+    ApiError,
+    ApiGone,
+    ApiInvalid,
+    missing_rule,
+    refusal,
+)
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
@@ -81,7 +90,7 @@ async def test_deletes_only_what_has_the_uid(server: ApiServer, api: Api) -> Non
     server.put("pods", pod("a"))
     with pytest.raises(ApiError) as caught:
         await in_thread(api.delete, "pods", Name("ns", "a"), "another")
-    assert caught.value.kind is ErrorKind.CONFLICT
+    assert type(caught.value) is ApiConflict
     uid = server.get("pods", "a")["metadata"]["uid"]
     await in_thread(api.delete, "pods", Name("ns", "a"), uid)
     assert not server.all("pods")
@@ -100,7 +109,7 @@ async def test_a_patch_with_a_failed_test_is_a_conflict(server: ApiServer, api: 
     operations = [{"op": "test", "path": "/metadata/uid", "value": "another"}]
     with pytest.raises(ApiError) as caught:
         await in_thread(api.patch, "pods", Name("ns", "a"), operations)
-    assert caught.value.kind is ErrorKind.CONFLICT
+    assert type(caught.value) is ApiConflict
 
 
 async def test_the_token_is_sent(server: ApiServer, api: Api) -> None:
@@ -119,7 +128,7 @@ async def test_an_api_server_that_is_away_and_back(
     late = Api()
     with pytest.raises(ApiError, match=f"API server at {other.url} can't be reached") as caught:
         await in_thread(late.nodes)
-    assert caught.value.kind is ErrorKind.AWAY
+    assert type(caught.value) is ApiAway
     async with listening(other, port):
         assert await in_thread(late.nodes) == []
         late.close()
@@ -129,7 +138,7 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
     server.refuse("GET", "nodes", 200, "hello")
     with pytest.raises(ApiError, match="is no API server") as caught:
         await in_thread(api.nodes)
-    assert caught.value.kind is ErrorKind.AWAY
+    assert type(caught.value) is ApiAway
 
 
 def test_no_cluster_is_one_line_that_says_what_to_do(
@@ -146,32 +155,32 @@ def test_no_cluster_is_one_line_that_says_what_to_do(
 @pytest.mark.parametrize(
     ("status", "message", "kind", "told"),
     [
-        (403, FORBIDDEN, ErrorKind.OTHER, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
+        (403, FORBIDDEN, ApiError, 'apiGroups [""], resources ["pods"], verbs ["list"]'),
         (
             403,
             'pods "p" is forbidden: violates PodSecurity "baseline"',
-            ErrorKind.INVALID,
+            ApiInvalid,
             "violates",
         ),
         (
             403,
             "unable to create new content in namespace x because it is being terminated",
-            ErrorKind.GONE,
+            ApiGone,
             "terminated",
         ),
-        (401, "Unauthorized", ErrorKind.AWAY, "does not know the operator's token"),
-        (404, 'pods "p" not found', ErrorKind.GONE, 'pods "p" not found'),
-        (409, "exists", ErrorKind.CONFLICT, "exists"),
-        (422, "spec.clusterIP: Invalid value", ErrorKind.INVALID, "spec.clusterIP"),
-        (429, "storage is (re)initializing", ErrorKind.AWAY, "HTTP 429"),
-        (503, "etcd", ErrorKind.AWAY, "HTTP 503: etcd"),
-        (418, "tea", ErrorKind.OTHER, "tea"),
+        (401, "Unauthorized", ApiAway, "does not know the operator's token"),
+        (404, 'pods "p" not found', ApiGone, 'pods "p" not found'),
+        (409, "exists", ApiConflict, "exists"),
+        (422, "spec.clusterIP: Invalid value", ApiInvalid, "spec.clusterIP"),
+        (429, "storage is (re)initializing", ApiAway, "HTTP 429"),
+        (503, "etcd", ApiAway, "HTTP 503: etcd"),
+        (418, "tea", ApiError, "tea"),
     ],
 )
-def test_refusals(status: int, message: str, kind: ErrorKind, told: str) -> None:
+def test_refusals(status: int, message: str, kind: type[ApiError], told: str) -> None:
     body = json.dumps({"kind": "Status", "message": message})
     error = refusal(status, "reason", body.encode())
-    assert error.kind is kind
+    assert type(error) is kind
     assert told in str(error)
     assert "\n" not in str(error)
 

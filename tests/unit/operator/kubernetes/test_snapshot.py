@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.api import Api, ApiError, ErrorKind
+from rosproxy_operator.kubernetes.api import Api, ApiError, ApiGone, ApiInvalid
 from rosproxy_operator.kubernetes.resources.model import Name, Stuck
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader, read_master
 from tests.unit.operator.kubernetes.api_server import ApiServer
@@ -86,7 +86,7 @@ async def test_a_selector_that_the_api_server_refuses_is_that_rosproxys_problem(
 
     def pods(namespace: str, selector: str) -> list[dict[str, Any]]:
         if namespace == "other":
-            raise ApiError(ErrorKind.INVALID, "unable to parse requirement")
+            raise ApiInvalid("unable to parse requirement")
         return real(namespace, selector)
 
     api.pods = pods  # type: ignore[method-assign]
@@ -100,7 +100,7 @@ async def test_a_missing_crd_is_told(server: ApiServer, api: Api) -> None:
     server.refuse("GET", "rosproxies", 404, "the server could not find the requested resource")
     with pytest.raises(ApiError, match="install the CustomResourceDefinition") as caught:
         await SnapshotReader(api).read()
-    assert caught.value.kind is ErrorKind.GONE
+    assert type(caught.value) is ApiGone
 
 
 async def test_what_only_an_event_tells(server: ApiServer, api: Api) -> None:
