@@ -36,7 +36,7 @@ from rosproxy_operator.kubernetes.status.events import counted, event_body
 log = logging.getLogger(__name__)
 
 AT_ONCE = 8
-"""RosProxies that are acted for, or Events that are made, at the same time."""
+"""Calls to the API server at the same time."""
 RETIRING = 10.0
 """Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
 
@@ -69,26 +69,21 @@ class ClusterApplier:
         self._retired &= {proxy.pod.uid for proxy in observed.proxies}
 
     async def _group(self, of: Name, actions: list[Action], observed: ClusterSnapshot) -> None:
-        async with self._room:
-            doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
-            tried = [(_subject(action), await self._one(action, observed)) for action in doing]
-            failures = {id: text for id, text in tried if text is not None}
-            if doing:
-                self.failures = {**self.failures, of: failures}
-            for action in actions:
-                if isinstance(action, PatchStatus):
-                    said = await self._one(action, observed)
-                    self.problems.pop(of, None)
-                    if said is not None:
-                        text = f"its status can't be written: {said}"
-                        self.problems[of] = Problem(f"rosproxy {of}", text)
+        doing = [a for a in actions if not isinstance(a, PatchStatus | Emit)]
+        tried = [(_subject(action), await self._one(action, observed)) for action in doing]
+        failures = {id: text for id, text in tried if text is not None}
+        if doing:
+            self.failures = {**self.failures, of: failures}
+        for action in actions:
+            if isinstance(action, PatchStatus):
+                said = await self._one(action, observed)
+                self.problems.pop(of, None)
+                if said is not None:
+                    text = f"its status can't be written: {said}"
+                    self.problems[of] = Problem(f"rosproxy {of}", text)
         emits = [action for action in actions if isinstance(action, Emit)]
         wanted = [each for each in emits if not (failures and each.type == "Normal")]
-        await asyncio.gather(*(self._event(each, observed) for each in wanted))
-
-    async def _event(self, event: Emit, observed: ClusterSnapshot) -> None:
-        async with self._room:
-            await self._one(event, observed)
+        await asyncio.gather(*(self._one(each, observed) for each in wanted))
 
     async def _one(self, action: Action, observed: ClusterSnapshot) -> str | None:
         """Carry out one action; what went wrong."""
@@ -99,7 +94,8 @@ class ClusterApplier:
             return None
         quiet = isinstance(action, PatchStatus | Emit)
         try:
-            await in_thread(self._do, action)
+            async with self._room:
+                await in_thread(self._do, action)
         except _nothing_left(action) as error:
             log.debug("%s: nothing to do: %s", line(action), error)
             return None
