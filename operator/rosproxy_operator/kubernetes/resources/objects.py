@@ -6,8 +6,6 @@ is missing is as if it were empty.
 
 from collections.abc import Iterator
 
-from rosproxy.leases.ports import PortRange
-from rosproxy.settings import SettingError, parse_range
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
@@ -19,7 +17,14 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck
-from rosproxy_operator.kubernetes.resources.values import number, part, parts, word, words
+from rosproxy_operator.kubernetes.resources.values import (
+    number,
+    part,
+    parts,
+    port_range,
+    word,
+    words,
+)
 
 VARIABLE = "ROS_MASTER_URI"
 
@@ -65,7 +70,7 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     labels, notes = words(meta, "labels"), words(meta, "annotations")
     containers = parts(part(obj, "spec"), "containers")
     container = next((one for one in containers if one.get("name") == names.CONTAINER), None)
-    ports = _range(notes.get(names.PORT_RANGE, ""))
+    ports = port_range(notes, names.PORT_RANGE)
     on, owner = notes.get(names.NODE, ""), _owner(meta)
     if not names.is_own(labels) or ports is None or not (on and owner and container):
         return None
@@ -128,8 +133,8 @@ def _host_ports(spec: Json) -> Iterator[int]:
     lasting = (one for one in inits if one.get("restartPolicy") == "Always")
     for container in (*parts(spec, "containers"), *lasting):
         for port in parts(container, "ports"):
-            if port.get("protocol", "TCP") == "TCP" and number(port, "hostPort"):
-                yield number(port, "hostPort")
+            if port.get("protocol", "TCP") == "TCP" and (taken := number(port, "hostPort")):
+                yield taken
 
 
 def _masters(spec: Json) -> Iterator[str]:
@@ -148,10 +153,3 @@ def _owner(meta: Json) -> str:
         if group == names.GROUP and owner.get("kind") == names.KIND and owner.get("controller"):
             return word(owner, "uid")
     return ""
-
-
-def _range(text: str) -> PortRange | None:
-    try:
-        return parse_range(names.PORT_RANGE, text)
-    except SettingError:
-        return None

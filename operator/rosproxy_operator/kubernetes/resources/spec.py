@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import DataPlane, SettingError, parse_range
+from rosproxy.settings import DataPlane
 from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, bare
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
@@ -34,6 +34,7 @@ from rosproxy_operator.kubernetes.resources.values import (
     number,
     part,
     parts,
+    port_range,
     word,
 )
 
@@ -266,10 +267,5 @@ def _address(given: Field) -> str:
 
 def _former(status: Json) -> dict[str, PortRange]:
     """The ranges in a status. What can't be read there is no range that was ever given."""
-    found = {}
-    for line in parts(status, "perNode"):
-        try:
-            found[word(line, "name")] = parse_range("ports", word(line, "ports"))
-        except SettingError:
-            continue
-    return found
+    found = {word(line, "name"): port_range(line, "ports") for line in parts(status, "perNode")}
+    return {name: ports for name, ports in found.items() if ports is not None}

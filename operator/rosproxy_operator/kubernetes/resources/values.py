@@ -2,8 +2,9 @@
 
 import re
 
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import is_loopback
-from rosproxy.settings import SettingError, parse_host
+from rosproxy.settings import SettingError, parse_host, parse_range
 from rosproxy.telemetry.text import shorten
 from rosproxy_operator.kubernetes.resources.model import Json
 
@@ -56,11 +57,10 @@ def part(obj: Json, *keys: str) -> Json:
     return obj
 
 
-def parts(obj: Json, key: str) -> tuple[Json, ...]:
+def parts(obj: Json, key: str) -> list[Json]:
     """The maps in the list under a key, none if there is no list."""
     found = obj.get(key)
-    listed = found if isinstance(found, list | tuple) else ()
-    return tuple(one for one in listed if isinstance(one, dict))
+    return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
 
 
 def word(obj: Json, key: str) -> str:
@@ -72,7 +72,15 @@ def word(obj: Json, key: str) -> str:
 def number(obj: Json, key: str) -> int:
     """The integer under a key, 0 if there is none."""
     found = obj.get(key)
-    return found if isinstance(found, int) and not isinstance(found, bool) else 0
+    return found if type(found) is int else 0
+
+
+def port_range(obj: Json, key: str) -> PortRange | None:
+    """The range of ports that is written under a key, None if there is none."""
+    try:
+        return parse_range(key, word(obj, key))
+    except SettingError:
+        return None
 
 
 def words(obj: Json, *keys: str) -> dict[str, str]:
