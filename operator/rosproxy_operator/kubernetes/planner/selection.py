@@ -116,14 +116,13 @@ def _is_ours(labels: Mapping[str, str]) -> bool:
 def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, str]) -> bool:
     match operator:
         case "In":
-            return key in labels and labels[key] in values
+            return labels.get(key) in values
         case "NotIn":
             return labels.get(key) not in values
         case "Exists":
             return key in labels
-        case "DoesNotExist":
+        case _:  # DoesNotExist
             return key not in labels
-    return False
 
 
 def _listed(values: Iterable[str]) -> str:
