@@ -55,15 +55,21 @@ def warnings(
     return NewEvents(tuple(_warning(one) for one in new[:MOST]), {**recent, **current})
 
 
-def results(rosproxy: RosProxy, actions: Iterable[Action]) -> tuple[Emit, ...]:
+def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
     of = Reference(KIND, rosproxy.id, rosproxy.uid)
-    return tuple(
-        Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
-        for action in actions
-        if action.of == rosproxy.id
-        for reason, text in _result_of(action)
-    )
+    for action in actions:
+        match action:
+            case CreateProxy(body={"metadata": {"name": name, "annotations": notes}}):
+                where = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
+                reason, text = "ProxyCreated", f"created pod {name} {where}"
+            case SetImage(id=id, image=image):
+                reason, text = "ImageSet", f"gave pod {id.name} the image {image}"
+            case DeleteProxy(id=id, why=why):
+                reason, text = "ProxyDeleted", f"deleted pod {id.name}: {why}"
+            case _:
+                continue
+        yield Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
 
 
 def event_body(event: Emit, now: float) -> Json:
@@ -124,18 +130,6 @@ def _warning(finding: ClusterFinding) -> Emit:
     itself = finding.subject == f"{reference.kind.lower()} {reference.id}"
     text = finding.text if itself else f"{finding.subject}: {finding.text}"
     return Emit(finding.of, reference, "Warning", finding.reason, _bounded(text))
-
-
-def _result_of(action: Action) -> Iterator[tuple[str, str]]:
-    match action:
-        case CreateProxy(body=body):
-            name, notes = body["metadata"]["name"], body["metadata"]["annotations"]
-            text = f"created pod {name} on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
-            yield "ProxyCreated", text
-        case SetImage(id=id, image=image):
-            yield "ImageSet", f"gave pod {id.name} the image {image}"
-        case DeleteProxy(id=id, why=why):
-            yield "ProxyDeleted", f"deleted pod {id.name}: {why}"
 
 
 def _bounded(text: str) -> str:
