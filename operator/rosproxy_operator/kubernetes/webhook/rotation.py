@@ -97,20 +97,27 @@ class SelfSigned:
         return self._serving
 
     def _kept(self) -> KeyPair:
-        """The pair in the Secret, or a new one that is put there."""
-        if self._secret is None:
-            return self._usable(self._pair) or self._new(self._pair)
+        """The pair in the Secret, else this process's own; a new one if it does not do (any more).
+
+        It does if it is for our names and has not lived too long.
+        """
+        there: Json | None = None
         try:
-            there = self._api.get("secrets", self._secret)
+            there = self._api.get("secrets", self._secret) if self._secret else None
         except ApiError as error:
             if self._pair is None and isinstance(error, ApiAway):
                 raise
             self._complain(error)
-            return self._usable(self._pair) or self._new(self._pair)
-        found = self._read(there)
-        return self._usable(found) or self._put(self._secret, self._new(found or self._pair), there)
+        found = self._pair if there is None else self._read(there)
+        if found and not found.due(self._now()) and found.names() >= set(self._names):
+            return found
+        before = found or self._pair
+        pair = certificates.make(self._names, self._now(), before.ca if before else b"")
+        if self._secret and there is not None:
+            self._put(self._secret, pair, there)
+        return pair
 
-    def _put(self, secret: Name, pair: KeyPair, there: Json) -> KeyPair:
+    def _put(self, secret: Name, pair: KeyPair, there: Json) -> None:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
             self._api.patch("secrets", secret, _secret_patch(pair, there))
@@ -119,7 +126,6 @@ class SelfSigned:
         except ApiError as error:
             self._complain(error)
         log.info("webhook: made a certificate that is valid until %s", pair.expires)
-        return pair
 
     def _complain(self, error: ApiError) -> None:
         """Tell that the Secret can't be used: the certificate is then this process's alone.
@@ -142,15 +148,6 @@ class SelfSigned:
         except InvalidCertificate as error:
             log.warning("webhook: Secret %s: %s; making another one", self._secret, error)
             return None
-
-    def _usable(self, pair: KeyPair | None) -> KeyPair | None:
-        """The pair, if it is for our names and has not lived too long."""
-        if pair is None or pair.due(self._now()) or not pair.names() >= set(self._names):
-            return None
-        return pair
-
-    def _new(self, before: KeyPair | None) -> KeyPair:
-        return certificates.make(self._names, self._now(), before.ca if before else b"")
 
     def _trust(self, authorities: bytes) -> bool:
         """Write the CAs where the API server looks for them; whether they are there."""
