@@ -15,7 +15,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     Pod,
     ProxyPod,
     ProxyReport,
-    ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, rosproxy
 from rosproxy_operator.kubernetes.status.status import status_of
@@ -136,8 +135,8 @@ def test_status_is_in_the_definition() -> None:
             "m", "192.0.2.2", None, None, (pod,), None, Obstacle("PortsExhausted", "no ports")
         ),
     )
-    service = ProxyService(own.id, "c", "w", "192.0.2.9", "f")
-    status = status_of(own, states, (), service, "http://robot:11311", "2026-01-01T00:00:00Z")
+    stamp = "2026-01-01T00:00:00Z"
+    status = status_of(own, states, (), "192.0.2.9", "http://robot:11311", stamp)
     written = set(paths(status, "status"))
     assert written <= set(STATUS)
     unused = {"status.perNode[].message", "status.conditions[].observedGeneration"}

@@ -87,10 +87,9 @@ def plan(
             own += reconcile_proxy(context, place)
         states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
-        service = context.own_service(rosproxy)
         master, _ = master_of(rosproxy, observed)
-        uri = master.uri if master else ""
-        status = status_of(rosproxy, states, found, service, uri, stamp)
+        uri, address = master.uri if master else "", context.cluster_ip(rosproxy)
+        status = status_of(rosproxy, states, found, address, uri, stamp)
         problems += found
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
@@ -136,8 +135,7 @@ def _problems(
     moved: Iterable[ClusterFinding],
 ) -> tuple[ClusterFinding, ...]:
     """All that is wrong with a RosProxy."""
-    service = context.own_service(of)
-    address = service.cluster_ip if service else ""
+    address = context.cluster_ip(of)
     pods = context.view.taken.get(of.id, ()) if address else ()
     others = (*context.view.findings, *moved, *context.ranges.findings)
     return (

@@ -62,10 +62,10 @@ class ClusterContext(msgspec.Struct, frozen=True):
         """What is seen."""
         return self.view.observed
 
-    def own_service(self, of: RosProxy) -> ProxyService | None:
-        """The Service of a RosProxy; None if it is not there, or was made for another one."""
+    def cluster_ip(self, of: RosProxy) -> str:
+        """The address of a RosProxy's Service; empty if it has none, or is that of another one."""
         there = self.observed.services.get(of.id)
-        return there if there and there.owner == of.uid else None
+        return there.cluster_ip if there and there.owner == of.uid else ""
 
     def left(self, place: ProxyPlace) -> float:
         """The seconds until the grace of a proxy ends that no pod wants any more."""

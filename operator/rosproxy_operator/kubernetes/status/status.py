@@ -14,7 +14,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     NodeState,
     ProxyReport,
-    ProxyService,
     RosProxy,
     Stuck,
 )
@@ -55,7 +54,7 @@ def status_of(
     rosproxy: RosProxy,
     states: tuple[NodeState, ...],
     problems: tuple[ClusterFinding, ...],
-    service: ProxyService | None,
+    cluster_ip: str,
     master: str,
     stamp: str,
 ) -> Json:
@@ -65,9 +64,9 @@ def status_of(
     is started changes nothing.
 
     ``problems`` are all that is wrong with it: `findings`, those of its pods, and others.
-    ``service`` is None if it is yet to be made. ``master`` is the URI of the real master as the
-    proxies use it, empty if it is not known; ``stamp`` the time for conditions that change, in
-    RFC 3339.
+    ``cluster_ip`` is its Service's, empty if that is yet to be made. ``master`` is the URI of the
+    real master as the proxies use it, empty if it is not known; ``stamp`` the time for conditions
+    that change, in RFC 3339.
     """
     former = rosproxy.status
     shown = _shown_nodes(states)
@@ -82,9 +81,7 @@ def status_of(
         _degraded(problems),
     )
     # The former one as long as there is no Service: it is to be had again.
-    uri = word(former, "masterURI")
-    if service is not None and service.cluster_ip:
-        uri = master_uri(service.cluster_ip)
+    uri = master_uri(cluster_ip) if cluster_ip else word(former, "masterURI")
     return {
         "observedGeneration": rosproxy.generation,
         "master": master,

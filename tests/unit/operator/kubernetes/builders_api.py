@@ -12,7 +12,6 @@ from rosproxy_operator.kubernetes.resources.model import (
     Pod,
     ProxyPod,
     ProxyReport,
-    ProxyService,
     RosProxy,
     RosProxySpec,
     Selector,
@@ -160,9 +159,6 @@ def state(node: str = "node1", **more: Any) -> NodeState:
     return NodeState(node, "192.0.2.11", found.pop("range", RANGE), **found)
 
 
-SERVICE = ProxyService(Name("robots", "arm"), "uid-arm", "uid-service", CLUSTER_IP, "f")
-
-
 def status(
     *states: NodeState,
     of: RosProxy | None = None,
@@ -173,7 +169,7 @@ def status(
     one = of or rosproxy()
     problems = (*findings(one, states, given.get("failures", {})), *more)
     stamp = given.get("stamp", STAMP)
-    return status_of(one, states, problems, given.get("service", SERVICE), ROBOT, stamp)
+    return status_of(one, states, problems, given.get("cluster_ip", CLUSTER_IP), ROBOT, stamp)
 
 
 def condition(found: Json, type: str) -> Any:

@@ -157,10 +157,10 @@ def test_what_was_known_of_the_master_holds_on_until_a_proxy_has_told():
 def test_the_address_of_a_service_that_is_gone_is_kept():
     first = status(state())
 
-    found = status(state(), of=rosproxy(status=first), service=None)
+    found = status(state(), of=rosproxy(status=first), cluster_ip="")
 
     assert found["masterURI"] == URI
-    assert status(service=None)["masterURI"] == ""
+    assert status(cluster_ip="")["masterURI"] == ""
 
 
 def test_one_that_can_not_be_read_keeps_what_it_has():
