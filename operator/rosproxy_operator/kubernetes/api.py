@@ -224,7 +224,7 @@ class Api:
             raise refusal(status, str(reason or ""), data)
         try:
             return msgspec.json.decode(data, type=Found)
-        except msgspec.MsgspecError:
+        except (msgspec.DecodeError, UnicodeDecodeError):
             raise ApiAway(f"what answers at {self.server}{path} is no API server") from None
 
 

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -139,6 +140,16 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
     with pytest.raises(ApiError, match="is no API server") as caught:
         await in_thread(api.nodes)
     assert type(caught.value) is ApiAway
+
+
+@pytest.mark.parametrize("text", [b"", b"<html>", b"[]", b"\xff", b'{"items": ["\xff"]}'])
+async def test_what_does_not_answer_in_json_is_away(
+    api: Api, monkeypatch: pytest.MonkeyPatch, text: bytes
+) -> None:
+    answer = SimpleNamespace(status=200, reason="OK", read=lambda: text)
+    monkeypatch.setattr(api._client, "call_api", lambda *_, **__: answer)
+    with pytest.raises(ApiAway, match="/api/v1/nodes is no API server"):
+        await in_thread(api.nodes)
 
 
 def test_no_cluster_is_one_line_that_says_what_to_do(
