@@ -19,7 +19,7 @@ from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.health import Change, ProbeResult
+from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.slave_api import Visit
 from rosproxy.ros1.servers.tcpros import TcprosServer
@@ -148,7 +148,7 @@ class SlaveApi:
         try:
             reply = await self._context.upstream.post_to_node(endpoint.slave, body)
         except Unreachable as error:
-            if error.refused and health.note(error.probe, self._context.now()) is Change.DOWN:
+            if error.refused and health.note(error.probe, self._context.now()):
                 # Refused twice, the node has ended: its port refuses as well at once.
                 log.info("%s is gone: %s", endpoint.label, error)
                 self._leases.close(endpoint)

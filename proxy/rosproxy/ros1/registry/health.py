@@ -22,14 +22,6 @@ class ProbeResult(Enum):
     SILENT = "silent"
 
 
-class Change(Enum):
-    """What a probe result means for the endpoint."""
-
-    NONE = "none"
-    DOWN = "down"
-    UP = "up"
-
-
 @dataclass(slots=True)
 class Health:
     """What is known of a node's health; times are seconds of a monotonic clock.
@@ -82,18 +74,18 @@ class Health:
         """Have the node probed at once, as if another process could be there by now."""
         self.checked, self.pid = None, -1
 
-    def note(self, probe: ProbeResult, now: float) -> Change:
-        """Take in a probe result and tell whether the node went down or came up by it."""
+    def note(self, probe: ProbeResult, now: float) -> bool:
+        """Take in a probe result; whether the node went down by it."""
         was_down = self.down
         self.checked = now
         if probe is ProbeResult.ANSWERED:
             self.answered, self.failing_since, self.failures = now, None, 0
             self.refused = self.over = False
-            return Change.UP if was_down else Change.NONE
+            return False
         self.failures += 1
         self.refused = probe is ProbeResult.REFUSED
         self.failing_since = now if self.failing_since is None else self.failing_since
-        return Change.DOWN if self.down and not was_down else Change.NONE
+        return self.down and not was_down
 
     def end(self, now: float) -> None:
         """Note that the node has ended, whatever it is that its address answers."""

@@ -16,7 +16,7 @@ from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.health import Change, ProbeResult
+from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.upkeep.policy import liveness
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -73,12 +73,12 @@ class Prober:
         if endpoint.slave != where:
             return  # it has moved meanwhile
         failing = health.failures > 0
-        change = health.note(answer.probe, self._context.now())
+        went_down = health.note(answer.probe, self._context.now())
         if answer.probe is ProbeResult.ANSWERED:
             await self._answered(endpoint, answer.pid)
             if failing:
                 self._context.problems.solved_at(endpoint.port)
-        elif change is Change.DOWN:
+        elif went_down:
             self._report_down(endpoint, answer.reason)
             self._leases.close(endpoint)
         after = self._context.settings.cleanup_after

@@ -2,38 +2,40 @@
 
 import pytest
 
-from rosproxy.ros1.registry.health import Change, Health, ProbeResult
+from rosproxy.ros1.registry.health import Health, ProbeResult
 
 A, R, S = ProbeResult.ANSWERED, ProbeResult.REFUSED, ProbeResult.SILENT
 
 
 @pytest.mark.parametrize(
-    ("probes", "changes", "state"),
+    ("probes", "went_down", "state"),
     [
         ([], [], "new"),
-        ([A], [Change.NONE], "ok"),
-        ([R], [Change.NONE], "failing"),
-        ([S], [Change.NONE], "failing"),
-        ([R, R], [Change.NONE, Change.DOWN], "refused"),
-        ([S, S], [Change.NONE, Change.DOWN], "silent"),
-        ([S, R], [Change.NONE, Change.DOWN], "refused"),
-        ([R, S], [Change.NONE, Change.DOWN], "silent"),
-        ([A, R, A], [Change.NONE] * 3, "ok"),
-        ([R, A, R], [Change.NONE] * 3, "failing"),
-        ([R, R, R], [Change.NONE, Change.DOWN, Change.NONE], "refused"),
-        ([R, R, S], [Change.NONE, Change.DOWN, Change.NONE], "silent"),
-        ([R, R, A], [Change.NONE, Change.DOWN, Change.UP], "ok"),
-        ([S, S, A, A], [Change.NONE, Change.DOWN, Change.UP, Change.NONE], "ok"),
+        ([A], [False], "ok"),
+        ([R], [False], "failing"),
+        ([S], [False], "failing"),
+        ([R, R], [False, True], "refused"),
+        ([S, S], [False, True], "silent"),
+        ([S, R], [False, True], "refused"),
+        ([R, S], [False, True], "silent"),
+        ([A, R, A], [False] * 3, "ok"),
+        ([R, A, R], [False] * 3, "failing"),
+        ([R, R, R], [False, True, False], "refused"),
+        ([R, R, S], [False, True, False], "silent"),
+        ([R, R, A], [False, True, False], "ok"),
+        ([S, S, A, A], [False, True, False, False], "ok"),
         (
             [S, S, A, S, S],
-            [Change.NONE, Change.DOWN, Change.UP, Change.NONE, Change.DOWN],
+            [False, True, False, False, True],
             "silent",
         ),
     ],
 )
-def test_changes_and_state(probes: list[ProbeResult], changes: list[Change], state: str) -> None:
+def test_when_it_goes_down_and_its_state(
+    probes: list[ProbeResult], went_down: list[bool], state: str
+) -> None:
     health = Health()
-    assert [health.note(probe, float(i)) for i, probe in enumerate(probes)] == changes
+    assert [health.note(probe, float(i)) for i, probe in enumerate(probes)] == went_down
     assert health.state == state
     assert health.down == (state in ("refused", "silent"))
 
@@ -41,7 +43,8 @@ def test_changes_and_state(probes: list[ProbeResult], changes: list[Change], sta
 def test_a_node_that_was_cleaned_up_says_so_until_it_is_registered_again() -> None:
     health = Health(failures=2, failing_since=0.0, cleaned=True)
     assert health.state == "cleaned"
-    assert health.note(A, 9.0) is Change.UP
+    assert not health.note(A, 9.0)
+    assert not health.down
     assert health.state == "cleaned"
     health.cleaned = False
     assert health.state == "ok"
@@ -121,6 +124,7 @@ def test_a_node_that_is_known_to_have_ended_is_down_at_once() -> None:
     assert not health.clean_up(2.0, after=0.0)
     health.note(S, 3.0)  # its address is silent, but it won't come back
     assert (health.down, health.over) == (True, True)
-    assert health.note(A, 4.0) is Change.UP
+    assert not health.note(A, 4.0)
+    assert not health.down
     assert (health.down, health.over) == (False, False)
     assert not health.clean_up(99.0, after=30.0)
