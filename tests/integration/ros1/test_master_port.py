@@ -91,7 +91,7 @@ async def test_every_unregistration_names_exactly_what_was_registered(
     name = method.replace("register", "unregister").replace("subscribeP", "unsubscribeP")
     assert (await node.call(proxy.master, name, *unregister))[2] == 1
     assert not any(master.tables.values())
-    assert proxy.endpoint(node).idle
+    assert proxy.endpoint(node).unused
 
 
 async def test_types_pass_unchanged_in_both_directions(proxy, master):

@@ -107,8 +107,8 @@ def test_the_least_used_fast_port_goes_first() -> None:
 def test_whoever_is_connected_through_the_kernel_is_not_idle() -> None:
     registry, endpoint = one_admitted(4)
     endpoint.idle_since = 1.0
-    assert [endpoint.idle, endpoint.connected] == [True, False]
+    assert [endpoint.unused, endpoint.connected] == [True, False]
     assert registry.reclaimable() is endpoint
     endpoint.fast_peers = {"192.0.2.1": 1}
-    assert [endpoint.idle, endpoint.connected] == [False, True]
+    assert [endpoint.unused, endpoint.connected] == [False, True]
     assert registry.reclaimable() is None

@@ -248,6 +248,7 @@ class Endpoint:
         return sum(self.fast_peers.values())
 
     @property
-    def idle(self) -> bool:
-        """Whether nothing is registered, nobody is connected and no call is under way."""
-        return not (self.registrations or self.connected or self.pending)
+    def unused(self) -> bool:
+        """Whether nobody needs the lease: nothing holds, nobody is connected or calls."""
+        held = self.registrations and not self.health.cleaned
+        return not (held or self.connected or self.pending)

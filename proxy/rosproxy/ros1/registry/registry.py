@@ -106,8 +106,7 @@ class Registry:
 
         One that has just been admitted is not idle: the master's reply is still on its way.
         """
-        unused = [e for e in self if not (e.connected or e.pending or e.idle_since is None)]
-        idle = [e for e in unused if e.idle or e.health.cleaned]
+        idle = [e for e in self if e.unused and e.idle_since is not None]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
 
     def exhausted(self) -> RangeExhausted:

@@ -110,7 +110,7 @@ class Prober:
     def _end_if_unused(self, endpoint: Endpoint) -> None:
         """End the lease of an endpoint that nobody has needed for long enough."""
         now = self._context.now()
-        if not liveness.is_unused(endpoint):
+        if not endpoint.unused:
             endpoint.note_used()
             return
         lasts = liveness.lease_lasts(endpoint, self._context.settings.linger)

@@ -183,7 +183,7 @@ def test_a_call_under_way_keeps_an_endpoint() -> None:
     registry = make_registry()
     endpoint = idle(registry, 5, 10.0)
     endpoint.pending = 1
-    assert not endpoint.idle
+    assert not endpoint.unused
     assert registry.reclaimable() is None
 
 

@@ -36,13 +36,6 @@ def is_to_be_unregistered(endpoint: Endpoint, now: float, after: float) -> bool:
     return endpoint.health.clean_up(now, after)
 
 
-def is_unused(endpoint: Endpoint) -> bool:
-    """Whether nobody needs an endpoint's port, so that the lease may end."""
-    if endpoint.connected or endpoint.pending:
-        return False
-    return endpoint.idle or endpoint.health.cleaned
-
-
 def lease_lasts(endpoint: Endpoint, linger: float) -> float:
     """Seconds for which an unused lease lasts; a node that was just silent may come back."""
     health = endpoint.health
