@@ -7,6 +7,7 @@ from typing import Any
 from examples.demo.fake_http import Where, free_ports, where
 from examples.demo.fake_node import FakeNode
 from rosproxy.app import App
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings
 from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until
@@ -90,8 +91,8 @@ class Proxy:
 
     def endpoint(self, node: FakeNode) -> Endpoint:
         """What the proxy knows of a node."""
-        key = node.address, node.slave.address[1]
-        return next(e for e in self.app.context.registry if e.key == key)
+        slave = HostPort(node.address, node.slave.address[1])
+        return next(e for e in self.app.context.registry if e.slave == slave)
 
     def lease(self, node: FakeNode) -> Where:
         """Where outside reaches a node."""

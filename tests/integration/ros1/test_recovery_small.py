@@ -13,6 +13,7 @@ from examples.demo.fake_http import where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from examples.demo.players import Adder, Listener, Talker
+from rosproxy.net.addresses import HostPort
 from tests.integration.net import (
     HOST,
     NODE,
@@ -264,8 +265,8 @@ async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_them(
     await looks(master)
     assert uri_of(master, "/a") == successor.uri
     assert "shutdown" not in dict(successor.calls)
-    key = nodes[0].address, nodes[0].slave.address[1]
-    assert not [e for e in proxy.app.context.registry if e.key == key and e.registrations]
+    slave = HostPort(nodes[0].address, nodes[0].slave.address[1])
+    assert not [e for e in proxy.app.context.registry if e.slave == slave and e.registrations]
 
 
 async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy, master, nodes):

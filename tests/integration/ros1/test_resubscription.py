@@ -13,6 +13,7 @@ from examples.demo.fake_http import value as answer
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy import app
+from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.upkeep import resubscriber
 from tests.integration.net import (
     OTHER_NODE,
@@ -72,8 +73,8 @@ async def served(proxy: Proxy, *nodes: FakeNode) -> None:
 
 
 def known(proxy: Proxy, node: FakeNode) -> bool:
-    keys = [e.key for e in proxy.app.context.registry if e.trusted]
-    return (node.address, node.slave.address[1]) in keys
+    slaves = [e.slave for e in proxy.app.context.registry if e.trusted]
+    return HostPort(node.address, node.slave.address[1]) in slaves
 
 
 async def told(node: FakeNode, *uris: str) -> None:

@@ -80,7 +80,7 @@ class SlaveApi:
         end it.
         """
         said = parse_inside_path(path)
-        return said is None or (said.address or said.node.host, said.node.port) == endpoint.key
+        return said is None or said.slave == endpoint.slave
 
     async def _result(
         self, endpoint: Endpoint, inner: xmlrpc.Call | None, call: IncomingCall

@@ -23,6 +23,11 @@ class InsidePath:
     node: HostPort
     address: str | None = None
 
+    @property
+    def slave(self) -> HostPort:
+        """Where the slave API is reached."""
+        return HostPort(self.address or self.node.host, self.node.port)
+
 
 def parse_slave_uri(uri: str) -> HostPort | None:
     """Host and port of an ``http://host:port/…`` URI, or None if it is no such URI."""

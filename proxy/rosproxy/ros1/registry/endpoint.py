@@ -200,14 +200,9 @@ class Endpoint:
         return self.uri in self.former_uris
 
     @property
-    def key(self) -> tuple[str, int]:
-        """The address and port of the slave API: what an endpoint is keyed by."""
-        return self.place.address, self.node.port
-
-    @property
     def slave(self) -> HostPort:
-        """Where the proxy reaches the slave API."""
-        return HostPort(*self.key)
+        """Where the proxy reaches the slave API: what an endpoint is known by."""
+        return HostPort(self.place.address, self.node.port)
 
     @property
     def caller_ids(self) -> list[str]:

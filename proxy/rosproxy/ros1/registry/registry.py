@@ -23,12 +23,12 @@ class Registry:
     def __init__(self, ports: PortRange) -> None:
         self.pool = PortPool(ports)
         self.by_port: dict[int, Endpoint] = {}
-        self._by_key: dict[tuple[str, int], Endpoint] = {}
+        self._by_slave: dict[HostPort, Endpoint] = {}
         self._by_uri: dict[str, dict[int, Endpoint]] = {}
         self._by_caller: dict[str, Endpoint] = {}
         self._services: dict[str, tuple[Endpoint, Registration]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
-        self._last_port: dict[tuple[str, int], int] = {}
+        self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
 
     def __iter__(self) -> Iterator[Endpoint]:
@@ -49,10 +49,10 @@ class Registry:
         One that is there already takes on what came from the node's own address: nobody can rename
         somebody else's. Raises RangeExhausted if it needs a port and none can be had.
         """
-        key = place.address, node.port
-        endpoint = self._by_key.get(key)
+        slave = HostPort(place.address, node.port)
+        endpoint = self._by_slave.get(slave)
         if endpoint is None:
-            port = self.pool.take(prefer=self._last_port.get(key))
+            port = self.pool.take(prefer=self._last_port.get(slave))
             if port is None:
                 raise self.exhausted()
             endpoint = self._add(uri, node, place, port)
@@ -65,7 +65,7 @@ class Registry:
 
     def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
         """Rebuild an endpoint on the port that it had; None if either is taken."""
-        if (place.address, node.port) in self._by_key or not self.pool.claim(port):
+        if self.at(place.address, node.port) or not self.pool.claim(port):
             return None
         endpoint = self._add(uri, node, place, port)
         endpoint.trusted = False
@@ -76,7 +76,7 @@ class Registry:
         """Forget an endpoint with all its registrations and give its port back."""
         for key in list(endpoint.registrations):
             self._drop(endpoint, key)
-        del self.by_port[endpoint.port], self._by_key[endpoint.key]
+        del self.by_port[endpoint.port], self._by_slave[endpoint.slave]
         for admission in endpoint.admissions:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
@@ -91,11 +91,11 @@ class Registry:
         """
         moved = self._movable(places)
         for endpoint in moved:
-            del self._by_key[endpoint.key], self._last_port[endpoint.key]
+            del self._by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
         for endpoint in moved:
             endpoint.place = places[endpoint]
-            self._by_key[endpoint.key] = endpoint
+            self._by_slave[endpoint.slave] = endpoint
             self._remember(endpoint)
         for endpoint, uri in admissions:
             self._admit(endpoint, uri, endpoint.place.address)
@@ -159,7 +159,7 @@ class Registry:
 
     def at(self, address: str, port: int) -> Endpoint | None:
         """The endpoint of the slave API at an address and port."""
-        return self._by_key.get((address, port))
+        return self._by_slave.get(HostPort(address, port))
 
     def by_caller(self, caller_id: str) -> Endpoint | None:
         """The endpoint of a node's name."""
@@ -182,15 +182,15 @@ class Registry:
         return [(e, held) for e in self for held in e.registrations.values()]
 
     def _movable(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
-        """Those whose new keys are free, or will be; of two for the same key the first."""
+        """Those whose new addresses are free, or will be; of two for the same one the first."""
         moved = list(places)
         while True:
-            taken = {k for k, e in self._by_key.items() if e not in moved}
+            taken = {slave for slave, e in self._by_slave.items() if e not in moved}
             kept = []
             for endpoint in moved:
-                key = places[endpoint].address, endpoint.node.port
-                if key not in taken:
-                    taken.add(key)
+                slave = HostPort(places[endpoint].address, endpoint.node.port)
+                if slave not in taken:
+                    taken.add(slave)
                     kept.append(endpoint)
             if len(kept) == len(moved):
                 return kept
@@ -207,7 +207,7 @@ class Registry:
 
     def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port)
-        self.by_port[port] = self._by_key[endpoint.key] = endpoint
+        self.by_port[port] = self._by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
         self._by_uri.setdefault(uri, {})[port] = endpoint
         return endpoint
@@ -224,9 +224,9 @@ class Registry:
         if former is not None:
             self._forget_uri(former)
         former = former or endpoint
-        if self._last_port.get(former.key) == endpoint.port:
-            del self._last_port[former.key]
-        self._last_port[endpoint.key] = endpoint.port
+        if self._last_port.get(former.slave) == endpoint.port:
+            del self._last_port[former.slave]
+        self._last_port[endpoint.slave] = endpoint.port
 
     def _forget_uri(self, endpoint: Endpoint) -> None:
         same = self._by_uri[endpoint.uri]

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
-from rosproxy.net.addresses import HostPort, is_inside
+from rosproxy.net.addresses import is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
@@ -114,8 +114,8 @@ class Recovery:
 
         async def ask(claim: Claim) -> None:
             log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
-            if is_inside(claim.address, self._context.addressing.networks):
-                info = await self._context.nodes.inspect(HostPort(*claim.key))
+            if is_inside(claim.slave.host, self._context.addressing.networks):
+                info = await self._context.nodes.inspect(claim.slave)
                 claim.said = info.topics if info else None
 
         await asyncio.gather(*map(ask, policy.contested(found)))
@@ -123,7 +123,7 @@ class Recovery:
 
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
-        address = claim.address
+        address = claim.slave.host
         if not is_inside(address, self._context.addressing.networks):
             text = "port %d: the master has %s for it, which is not in an inside network; refused"
             log.warning(text, claim.port, address)

@@ -48,7 +48,7 @@ def test_an_endpoint_is_keyed_by_address_and_port() -> None:
     assert node(registry, 5, port=40002) is not first
     assert node(registry, 6) is not first
     assert [endpoint.port for endpoint in registry] == [45000, 45001, 45002]
-    assert (first.key, str(first.slave)) == (("10.0.0.5", 40001), "10.0.0.5:40001")
+    assert str(first.slave) == "10.0.0.5:40001"
     assert registry.by_port[45000] is first
 
 
@@ -318,8 +318,8 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     endpoint, port = node(registry, 5), 45000
     held = register(registry, endpoint, PUB, "/a")
     assert registry.move({endpoint: Place("10.0.0.9", False)}) == [endpoint]
-    assert (endpoint.key, endpoint.port, endpoint.uri) == (
-        ("10.0.0.9", 40001),
+    assert (endpoint.slave, endpoint.port, endpoint.uri) == (
+        HostPort("10.0.0.9", 40001),
         port,
         own_uri("10.0.0.5"),
     )

@@ -47,20 +47,20 @@ class Registries(RuleBasedStateMachine):
     ) -> None:
         where = HostPort(name or address, port)
         place = Place(address, name is None, confirmed)
-        before = {endpoint.key for endpoint in self.registry}
+        before = {endpoint.slave for endpoint in self.registry}
         try:
             endpoint = self.registry.admit(slave_uri(where), where, place, source)
         except RangeExhausted:
             assert self.registry.pool.free == 0
-            assert (address, port) not in before
+            assert HostPort(address, port) not in before
         else:
-            assert endpoint.key == (address, port)
+            assert endpoint.slave == HostPort(address, port)
             assert self.registry.admitted(slave_uri(where), source) is endpoint
 
     @rule(address=ADDRESSES, slave=SLAVE_PORTS, port=st.integers(44999, 45006))
     def restore(self, address: str, slave: int, port: int) -> None:
         where = HostPort(address, slave)
-        known = any(endpoint.key == (address, slave) for endpoint in self.registry)
+        known = any(endpoint.slave == where for endpoint in self.registry)
         usable = port in PORTS and port not in self.registry.by_port and port not in self.blocked
         found = self.registry.restore(slave_uri(where), where, Place(address, True, False), port)
         assert (found is not None) == (usable and not known)
@@ -73,20 +73,21 @@ class Registries(RuleBasedStateMachine):
             endpoint = self.draw(data)
             if endpoint:
                 places[endpoint] = Place(address, False)
-        before = {endpoint: endpoint.key for endpoint in self.registry}
+        before = {endpoint: endpoint.slave for endpoint in self.registry}
         admitted = {endpoint: set(endpoint.admissions) for endpoint in self.registry}
         ports = {endpoint: endpoint.port for endpoint in self.registry}
         moved = self.registry.move(places)
         assert {endpoint: endpoint.port for endpoint in self.registry} == ports
-        for endpoint, (old, port) in before.items():
+        for endpoint, slave in before.items():
+            old, port = slave.host, slave.port
             if endpoint in moved:
                 new = places[endpoint].address
-                assert endpoint.key == (new, port)
+                assert endpoint.slave == HostPort(new, port)
                 for uri in [uri for uri, source in admitted[endpoint] if source == old]:
                     assert self.registry.admitted(uri, new)
                 assert self.registry.admitted(endpoint.uri, new) in moved
             else:
-                assert endpoint.key == (old, port)
+                assert endpoint.slave == slave
                 wanted = places.get(endpoint)
                 taken = wanted and self.registry.at(wanted.address, port)
                 assert wanted is None or taken
@@ -153,16 +154,16 @@ class Registries(RuleBasedStateMachine):
         for port, endpoint in self.registry.by_port.items():
             assert endpoint.port == port
             assert endpoint in self.registry.by_uri(endpoint.uri)
-            assert endpoint.node == HostPort(endpoint.node.host, endpoint.key[1])
+            assert endpoint.node == HostPort(endpoint.node.host, endpoint.slave.port)
             for uri, source in endpoint.admissions:
                 assert self.registry.admitted(uri, source) is endpoint
-        keys = [endpoint.key for endpoint in self.registry]
-        assert len(keys) == len(set(keys)) == len(self.registry)
+        slaves = {endpoint.slave for endpoint in self.registry}
+        assert len(slaves) == len(self.registry)
 
     @invariant()
     def nobody_else_is_found(self) -> None:
         live = set(self.registry)
-        assert set(self.registry._by_key.values()) == live
+        assert set(self.registry._by_slave.values()) == live
         former = set(self.registry._former.values())
         by_uri = self.registry._by_uri.values()
         assert all(by_uri)
@@ -177,7 +178,7 @@ class Registries(RuleBasedStateMachine):
             assert [e in former for e in found] == sorted(e in former for e in found)
             assert endpoint in found
         last = self.registry._last_port
-        assert all(last[endpoint.key] == endpoint.port for endpoint in live)
+        assert all(last[endpoint.slave] == endpoint.port for endpoint in live)
         assert len(last) <= len(PORTS)
 
     @invariant()

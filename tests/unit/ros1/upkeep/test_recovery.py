@@ -51,12 +51,12 @@ def test_claims_are_read_from_advertised_uris(
     uri: str, expected: tuple[int, str, str] | None
 ) -> None:
     found = policy.claims(graph({"/n": uri}), make_addressing())
-    claims = [(one.port, one.uri, one.key, one.topics) for one in found]
+    claims = [(one.port, one.uri, str(one.slave), one.topics) for one in found]
     if expected is None:
         assert claims == []
     else:
         port, node, address = expected
-        assert claims == [(port, f"http://{node}/", (address, 40001), {"/a"})]
+        assert claims == [(port, f"http://{node}/", str(HostPort(address, 40001)), {"/a"})]
 
 
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
@@ -90,7 +90,8 @@ def claim(
     slave: int = 40001,
 ) -> Claim:
     named = None if said is None else set(said)
-    return Claim(port, HostPort(address, slave), address, list(map(held, topics)), named)
+    where = HostPort(address, slave)
+    return Claim(port, where, where, list(map(held, topics)), named)
 
 
 A, B = "10.0.0.5", "10.0.0.6"
@@ -117,7 +118,7 @@ SETTLED = [
 def test_one_claim_is_kept_for_each_port_and_each_node(
     found: list[Claim], kept: list[tuple[int, str]]
 ) -> None:
-    assert sorted((one.port, one.address) for one in policy.settle(found)) == kept
+    assert sorted((one.port, one.slave.host) for one in policy.settle(found)) == kept
 
 
 @pytest.mark.parametrize(

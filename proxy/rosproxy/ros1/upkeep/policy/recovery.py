@@ -24,20 +24,15 @@ NO_MERIT = -(10**9)
 class Claim:
     """An endpoint that the master's data tell of: its port, its inside address, what it holds.
 
-    ``node`` is the host and port that the node calls itself, ``address`` where to look for it.
+    ``node`` is the host and port that the node calls itself, ``slave`` where to look for it.
     ``said`` are the topics that it names there; None if it was not asked or gave no answer.
     """
 
     port: int
     node: HostPort
-    address: str
+    slave: HostPort
     registrations: list[Registration] = field(default_factory=list)
     said: set[str] | None = None
-
-    @property
-    def key(self) -> tuple[str, int]:
-        """What the endpoint would be keyed by."""
-        return self.address, self.node.port
 
     @property
     def topics(self) -> set[str]:
@@ -56,15 +51,15 @@ def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     for node, uri in graph.uris.items():
         if ours := addressing.identify(uri):
             port, inside = ours
-            claim = Claim(port, inside.node, inside.address or inside.node.host)
+            claim = Claim(port, inside.node, inside.slave)
             found.setdefault(uri, claim).registrations += graph.held.get(node, [])
     return list(found.values())
 
 
 def contested(found: Sequence[Claim]) -> list[Claim]:
     """The claims that share their port or their inside address with another."""
-    ports, keys = Counter(c.port for c in found), Counter(c.key for c in found)
-    return [claim for claim in found if ports[claim.port] > 1 or keys[claim.key] > 1]
+    ports, slaves = Counter(c.port for c in found), Counter(c.slave for c in found)
+    return [claim for claim in found if ports[claim.port] > 1 or slaves[claim.slave] > 1]
 
 
 def settle(found: Sequence[Claim]) -> list[Claim]:
@@ -75,11 +70,11 @@ def settle(found: Sequence[Claim]) -> list[Claim]:
         return NO_MERIT if said is None else len(topics & said) - len(topics - said), count
 
     ports: dict[int, Claim] = {}
-    keys: set[tuple[str, int]] = set()
+    slaves: set[HostPort] = set()
     for claim in sorted(found, key=merit, reverse=True):
-        if claim.port not in ports and claim.key not in keys:
+        if claim.port not in ports and claim.slave not in slaves:
             ports[claim.port] = claim
-            keys.add(claim.key)
+            slaves.add(claim.slave)
     return list(ports.values())
 
 
