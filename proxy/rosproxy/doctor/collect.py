@@ -14,11 +14,11 @@ import asyncio
 import contextlib
 import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import replace
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
 import aiohttp
+from msgspec.structs import replace
 
 from rosproxy.admin.client import AdminClient, AdminError
 from rosproxy.doctor.facts import (

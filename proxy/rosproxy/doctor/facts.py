@@ -7,10 +7,11 @@ subscriber the names mean that the user asked for.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from typing import Any
+
+import msgspec
 
 from rosproxy.admin.requests import RangeProbe
 from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
@@ -30,8 +31,7 @@ class Reach(Enum):
     UNTRIED = "not tried"
 
 
-@dataclass(frozen=True, slots=True)
-class Attempt:
+class Attempt(msgspec.Struct, frozen=True):
     """An attempt to reach somebody: how it ended and, in the words of the caller, why."""
 
     reach: Reach = Reach.UNTRIED
@@ -43,8 +43,7 @@ class Attempt:
         return self.reach not in (Reach.ANSWERED, Reach.UNTRIED)
 
 
-@dataclass(frozen=True, slots=True)
-class MasterFacts:
+class MasterFacts(msgspec.Struct, frozen=True):
     """The master as the doctor found it.
 
     ``at_root``: it does answer at the path ``/``. ``looped``: what answers is this very proxy.
@@ -58,16 +57,15 @@ class MasterFacts:
     round_trip: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class SlaveReport:
+class SlaveReport(msgspec.Struct, frozen=True):
     """What a node says of itself: topics with types, and its connections.
 
     ``peers`` are (direction, topic, peer) of open connections, the direction ``i`` or ``o``; the
     peer of an outgoing one is a node's name, of an incoming one a slave URI.
     """
 
-    publishes: Mapping[str, str] = field(default_factory=dict)
-    subscribes: Mapping[str, str] = field(default_factory=dict)
+    publishes: Mapping[str, str] = {}
+    subscribes: Mapping[str, str] = {}
     peers: frozenset[tuple[str, str, str]] = frozenset()
 
 
@@ -96,8 +94,7 @@ def _items(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
 
 
-@dataclass(frozen=True, slots=True)
-class NodeFacts:
+class NodeFacts(msgspec.Struct, frozen=True):
     """A node that the master knows.
 
     ``uri`` is what the master says, empty if it says nothing. A ``report`` is only there for nodes
@@ -116,13 +113,12 @@ class NodeFacts:
         return parse_slave_uri(self.uri)
 
 
-@dataclass(frozen=True, slots=True)
-class SystemState:
+class SystemState(msgspec.Struct, frozen=True):
     """The master's state: who publishes, subscribes to and provides what."""
 
-    publishers: dict[str, list[str]] = field(default_factory=dict)
-    subscribers: dict[str, list[str]] = field(default_factory=dict)
-    services: dict[str, list[str]] = field(default_factory=dict)
+    publishers: dict[str, list[str]] = {}
+    subscribers: dict[str, list[str]] = {}
+    services: dict[str, list[str]] = {}
 
     @property
     def topics(self) -> set[str]:
@@ -151,8 +147,7 @@ def system_state(state: Any) -> SystemState:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Scope:
+class Scope(msgspec.Struct, frozen=True):
     """What the names that the user asked for lead to.
 
     ``named`` are the nodes among the names, ``nodes`` all that have to be looked at; ``pairs`` are
@@ -203,8 +198,7 @@ def _asked_for(pair: set[str], nodes: set[str]) -> bool:
     return pair <= nodes if len(nodes) > 1 else nodes <= pair
 
 
-@dataclass(frozen=True)
-class DoctorFacts:
+class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     """Everything gathered.
 
     ``admin`` is the admin endpoint's URL, ``admin_error`` why it could not be asked; ``status``
@@ -225,12 +219,12 @@ class DoctorFacts:
     advertised_addresses: tuple[str, ...] = ()
     published_master: Attempt = Attempt()
     graph: SystemState | None = None
-    nodes: Mapping[str, NodeFacts] = field(default_factory=dict)
-    service_uris: Mapping[str, str] = field(default_factory=dict)
-    services: Mapping[str, Attempt] = field(default_factory=dict)
+    nodes: Mapping[str, NodeFacts] = {}
+    service_uris: Mapping[str, str] = {}
+    services: Mapping[str, Attempt] = {}
     clock: bool = False
     names: tuple[str, ...] = ()
-    data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = field(default_factory=dict)
+    data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = {}
 
     @property
     def proxy(self) -> ProxyStatus:

@@ -1,10 +1,11 @@
 """Findings: what ``rosproxy doctor`` says, as text and as JSON."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from enum import IntEnum
 from functools import partial
 from typing import Any
+
+import msgspec
 
 from rosproxy.telemetry.text import clean, plural, wrap
 
@@ -22,8 +23,7 @@ class Severity(IntEnum):
     ERROR = 3
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorFinding:
+class DoctorFinding(msgspec.Struct, frozen=True):
     """One result: of which ``check``, about which ``subject``, what, and what mends it."""
 
     severity: Severity
@@ -53,7 +53,7 @@ def failed(findings: Sequence[DoctorFinding]) -> bool:
 
 def as_json(findings: Sequence[DoctorFinding]) -> dict[str, Any]:
     """The findings as plain data."""
-    rows = [{**asdict(f), "severity": f.severity.name.lower()} for f in findings]
+    rows = [{**msgspec.structs.asdict(f), "severity": f.severity.name.lower()} for f in findings]
     return {"ok": not failed(findings), "findings": rows}
 
 

@@ -1,13 +1,13 @@
 """What the user should know: the problems that `rosproxy status` shows."""
 
 import time
-from dataclasses import dataclass
+
+import msgspec
 
 MOST = 50
 
 
-@dataclass(frozen=True, slots=True)
-class NotedProblem:
+class NotedProblem(msgspec.Struct, frozen=True):
     """A problem: when (Unix time), with which node, port or option, and what.
 
     ``port`` is the lease of the node concerned, if it is about one.

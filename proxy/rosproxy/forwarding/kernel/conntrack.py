@@ -8,14 +8,14 @@ The first four addresses are of the connection as it came, the others of what an
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+
+import msgspec
 
 from rosproxy.forwarding.kernel.nft import Marks
 from rosproxy.net.addresses import HostPort
 
 
-@dataclass(frozen=True, slots=True)
-class Flow:
+class Flow(msgspec.Struct, frozen=True):
     """A TCP connection that the kernel forwards: from ``peer`` through ``port`` to ``node``.
 
     Its ``state`` is ESTABLISHED while both sides have said yes and none has ended it, and SYN_SENT

@@ -15,9 +15,10 @@ Documents are in nft's own language (nft(8)), output is JSON (libnftables-json(5
 
 import json
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
 from string import Template
 from typing import Any
+
+import msgspec
 
 from rosproxy.forwarding.kernel.policy import Changes, Forwards
 from rosproxy.net.addresses import HostPort, is_address, parse_address
@@ -68,16 +69,14 @@ class NftError(ValueError):
     """What nft printed is not what was expected."""
 
 
-@dataclass(frozen=True, slots=True)
-class TableState:
+class TableState(msgspec.Struct, frozen=True):
     """What the kernel has in a proxy's table."""
 
-    forwards: Forwards = field(default_factory=dict)
-    counters: Counters = field(default_factory=dict)
+    forwards: Forwards = {}
+    counters: Counters = {}
 
 
-@dataclass(frozen=True, slots=True)
-class Marks:
+class Marks(msgspec.Struct, frozen=True):
     """The connection marks of a proxy: its master port above, the fast port below."""
 
     master_port: int

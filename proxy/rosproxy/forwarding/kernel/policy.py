@@ -6,7 +6,8 @@ answer why such an endpoint stays in user space.
 """
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+
+import msgspec
 
 from rosproxy.leases.fast_ports import Holder
 from rosproxy.net.addresses import HostPort, is_loopback
@@ -20,8 +21,7 @@ LONGEST_PAUSE = 3600.0
 longest time, it doubles from one to the other."""
 
 
-@dataclass(frozen=True, slots=True)
-class HostForwarding:
+class HostForwarding(msgspec.Struct, frozen=True):
     """What the kernel can do here: forward IPv4, forward IPv6; ``own`` tells own addresses."""
 
     ipv4: bool = True
@@ -74,12 +74,11 @@ def unchanged(
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Changes:
+class Changes(msgspec.Struct, frozen=True):
     """What is to be taken out of the kernel's maps, and then put in."""
 
-    removed: Mapping[int, HostPort] = field(default_factory=dict)
-    added: Mapping[int, HostPort] = field(default_factory=dict)
+    removed: Mapping[int, HostPort] = {}
+    added: Mapping[int, HostPort] = {}
 
     def __bool__(self) -> bool:
         """Whether there is anything to do."""

@@ -16,7 +16,8 @@ import contextlib
 import itertools
 import logging
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from rosproxy.forwarding.kernel import policy
 from rosproxy.forwarding.kernel.accounting import KernelAccounts

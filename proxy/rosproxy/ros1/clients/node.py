@@ -8,7 +8,8 @@ first. Both only ask: what follows for the endpoint is decided in `upkeep`.
 
 import asyncio
 import logging
-from dataclasses import dataclass
+
+import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
@@ -21,8 +22,7 @@ TOPICS_ASKED = 3
 """How many of its topics a node is asked for at most before its TCPROS port counts as unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class ProbeAnswer:
+class ProbeAnswer(msgspec.Struct, frozen=True):
     """How a probe ended; ``pid`` if the node answered, ``reason`` if it didn't."""
 
     probe: ProbeResult

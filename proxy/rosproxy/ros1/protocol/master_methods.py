@@ -4,8 +4,9 @@ Sources: http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%2
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py. A method without a row is forwarded as it is.
 """
 
-from dataclasses import dataclass
 from enum import Enum
+
+import msgspec
 
 
 class Kind(Enum):
@@ -27,8 +28,7 @@ class Reply(Enum):
     MASTER_URI = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(msgspec.Struct, frozen=True):
     """One method: positions of the parameters that matter, what it registers and returns."""
 
     name: int | None = None

@@ -8,16 +8,16 @@ restarted proxy rebuild its table from what the master holds.
 """
 
 import re
-from dataclasses import dataclass
 from urllib.parse import quote, unquote, urlsplit
+
+import msgspec
 
 from rosproxy.net.addresses import HostPort, cached, is_address, parse_authority, parse_host_port
 
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
-@dataclass(frozen=True, slots=True)
-class InsidePath:
+class InsidePath(msgspec.Struct, frozen=True):
     """What the path of an advertised URI says: the node's own host and port, and its address."""
 
     node: HostPort

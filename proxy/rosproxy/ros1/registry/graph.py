@@ -5,7 +5,6 @@ The two may differ: anybody can write to the master, and it keeps what a dead no
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -17,8 +16,7 @@ _Table = list[tuple[str, list[str]]]
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
-@dataclass(frozen=True, slots=True)
-class Graph:
+class Graph(msgspec.Struct, frozen=True):
     """What each node has registered, and each node's slave URI as far as known."""
 
     held: Mapping[str, Sequence[Registration]]
@@ -34,8 +32,7 @@ class Graph:
         return topics
 
 
-@dataclass(frozen=True, slots=True)
-class NodeInfo:
+class NodeInfo(msgspec.Struct, frozen=True):
     """What a node says of itself: its pid, its topics with their types, its TCPROS port.
 
     ``pid`` and ``tcpros_port`` are None where it does not tell.

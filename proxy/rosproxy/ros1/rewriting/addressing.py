@@ -7,6 +7,8 @@ them back, as ``rosnode cleanup`` does when it unregisters somebody else's node.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import msgspec
+
 from rosproxy.leases.ports import PortMap
 from rosproxy.net.addresses import HostPort, Network, is_inside
 from rosproxy.ros1.protocol.uris import (
@@ -22,8 +24,7 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.registry import Registry
 
 
-@dataclass(frozen=True, slots=True)
-class Asker:
+class Asker(msgspec.Struct, frozen=True):
     """Who is going to use an address.
 
     ``address`` is the asker's own IP address, ``proxy`` the proxy's address that it can reach,

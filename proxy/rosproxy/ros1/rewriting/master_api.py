@@ -9,7 +9,9 @@ ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, row
 from rosproxy.ros1.protocol.uris import parse_service_uri
@@ -26,8 +28,7 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(msgspec.Struct, frozen=True):
     """A call that the proxy answers itself: with ROS status -1 and a reason."""
 
     reason: str
@@ -42,8 +43,7 @@ Admission = Endpoint | Refusal | None
 """What became of a call that registers or unregisters: its endpoint, or why it has none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
+class Request(msgspec.Struct, frozen=True):
     """A request of an inside node, read: one call, or the calls of a ``system.multicall``.
 
     ``calls`` holds None for an element of a multicall that is no call; ``items`` are those
@@ -69,8 +69,7 @@ class Request:
         return all(call is None or row(call.method) == NO_ROW for call in self.calls)
 
 
-@dataclass(frozen=True, slots=True)
-class Exported:
+class Exported(msgspec.Struct, frozen=True):
     """A request made ready for the master, and what became of each of its calls.
 
     ``body`` is what the master gets; None if it gets nothing, since all calls were refused.
@@ -88,8 +87,7 @@ class Exported:
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
 
-@dataclass(frozen=True, slots=True)
-class Result:
+class Result(msgspec.Struct, frozen=True):
     """A call that the master has answered, its ROS triple, and the endpoint it registers."""
 
     call: Call
@@ -102,8 +100,7 @@ class Result:
         return self.triple.items[0].integer() == 1
 
 
-@dataclass(frozen=True, slots=True)
-class Noted:
+class Noted(msgspec.Struct, frozen=True):
     """A fact from an accepted call, for the registry.
 
     ``endpoint`` is where the registration was made, None if it has ended.
@@ -113,8 +110,7 @@ class Noted:
     endpoint: Endpoint | None
 
 
-@dataclass(frozen=True, slots=True)
-class MasterReply:
+class MasterReply(msgspec.Struct, frozen=True):
     """The master's reply, matched with its request.
 
     ``results`` leaves out faults and malformed triples.

@@ -5,7 +5,8 @@ clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+
+import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
@@ -20,8 +21,7 @@ _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
-@dataclass(frozen=True, slots=True)
-class Visit:
+class Visit(msgspec.Struct, frozen=True):
     """A call at an endpoint.
 
     ``node`` is the endpoint's node as an asker of imported addresses, ``reached`` the address and

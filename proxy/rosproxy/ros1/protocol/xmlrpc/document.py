@@ -10,11 +10,12 @@ Specification: http://xmlrpc.com/spec.md.
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 from xmlrpc.client import Fault, dumps
+
+import msgspec
 
 from rosproxy.ros1.protocol.xmlrpc import fast, values
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
@@ -44,8 +45,7 @@ class XmlRpcError(ValueError):
         self.code = code
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(msgspec.Struct, frozen=True):
     """A method call: the method's name and its parameters."""
 
     method: str
@@ -63,8 +63,7 @@ class Call:
         return value.text if value else None
 
 
-@dataclass(frozen=True, slots=True)
-class Edit:
+class Edit(msgspec.Struct, frozen=True):
     """Replace the bytes ``start`` to ``end`` of a document by ``text``."""
 
     start: int

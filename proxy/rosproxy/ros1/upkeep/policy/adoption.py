@@ -12,7 +12,8 @@ calls ``shutdown`` at the node, through the proxy, as it does if another node ha
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+
+import msgspec
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -29,8 +30,7 @@ _NEW_URI = re.compile(r"\[(/[^\]\s]*)\] Reason: new node registered")
 """rosmaster/registrations.py, shutdown_node_task."""
 
 
-@dataclass(frozen=True, slots=True)
-class DirectNode:
+class DirectNode(msgspec.Struct, frozen=True):
     """A node that is registered with its own URI, and the places where it may be."""
 
     caller_id: str

@@ -11,9 +11,10 @@ UDPROS, by the kernel, or directly, without the proxy.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any
+
+import msgspec
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
@@ -27,8 +28,7 @@ Addresses = Mapping[str, Collection[str]]
 """Nodes' names with the addresses of their hosts."""
 
 
-@dataclass(frozen=True, slots=True)
-class TopicSubscription:
+class TopicSubscription(msgspec.Struct, frozen=True):
     """A node's subscription to a topic that an endpoint's node publishes."""
 
     endpoint: Endpoint
