@@ -80,7 +80,6 @@ class XmlRpcServer(web.Server):
         super().__init__(self._handle, access_log=None, keepalive_timeout=75)
         self._service, self._greeting = service, greeting
         self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
-        self._ports: dict[web.RequestHandler, int] = {}
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
 
@@ -120,15 +119,14 @@ class XmlRpcServer(web.Server):
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
         """Know a connection by the port that it came in on."""
         super().connection_made(handler, transport)
-        port = self._ports[handler] = transport.get_extra_info("sockname")[1]
-        self._by_port[port].add(handler)
+        self._by_port[_address(handler.sockname).port].add(handler)
 
     def connection_lost(
         self, handler: web.RequestHandler, exc: BaseException | None = None
     ) -> None:
         """Forget a connection."""
         super().connection_lost(handler, exc)
-        self._by_port[self._ports.pop(handler, 0)].discard(handler)
+        self._by_port[_address(handler.sockname).port].discard(handler)
 
     async def _serve(self, conn: socket.socket) -> None:
         loop = asyncio.get_running_loop()
