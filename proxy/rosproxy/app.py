@@ -129,8 +129,7 @@ class App:
     async def stop(self) -> None:
         """End everything; registrations stay at the master, for the next start to find."""
         for acceptor in self._acceptors:
-            acceptor.stop()
-            acceptor.sock.close()
+            acceptor.close()
         self.leases.close_all()
         self.alias.close()
         await self.context.tasks.cancel()

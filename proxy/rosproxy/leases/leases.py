@@ -226,9 +226,8 @@ class Leases(Generic[_H]):
         """Stop listening and keep the port reserved."""
         acceptor = self._acceptors.pop(port, None) if port is not None else None
         if acceptor is not None and port is not None:
-            acceptor.stop()
+            acceptor.close()
             self.server.end_calls(port)
-            acceptor.sock.close()
             self._reserve(port)
 
     def _give_fast_port_back(self) -> int | None:

@@ -55,31 +55,31 @@ def listen(address: str, port: int) -> socket.socket:
 
 
 class Acceptor:
-    """Accepts on a listening socket until it is stopped; each connection has a task of its own.
+    """Accepts on a listening socket until it is closed; each connection has a task of its own.
 
     The handler takes it over; an exception that ends the handler closes it.
     """
 
     def __init__(self, tasks: Tasks, sock: socket.socket, handler: Handler) -> None:
-        self.sock = sock
-        self._tasks, self._handler = tasks, handler
+        self._tasks, self._sock, self._handler = tasks, sock, handler
         self._loop = asyncio.get_running_loop()
         self._pause: asyncio.TimerHandle | None = None
         self._listen()
 
-    def stop(self) -> None:
-        """Stop accepting; the socket stays open."""
-        self._loop.remove_reader(self.sock)
+    def close(self) -> None:
+        """Stop accepting, and close the socket; connections stay."""
+        self._loop.remove_reader(self._sock)
         if self._pause is not None:
             self._pause.cancel()
+        self._sock.close()
 
     def _listen(self) -> None:
-        self._loop.add_reader(self.sock, self._accept)
+        self._loop.add_reader(self._sock, self._accept)
 
     def _accept(self) -> None:
         try:
             for _ in range(ACCEPTS_PER_TURN):
-                conn, peer = self.sock.accept()
+                conn, peer = self._sock.accept()
                 conn.setblocking(False)
                 source = plain_address(peer[0])
                 task = self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
@@ -90,7 +90,7 @@ class Acceptor:
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 log.error("out of file descriptors: raise the limit (ulimit -n) of the proxy")
             # The socket would stay readable: look again later.
-            self._loop.remove_reader(self.sock)
+            self._loop.remove_reader(self._sock)
             self._pause = self._loop.call_later(0.1, self._listen)
 
     async def _serve(self, conn: socket.socket, peer: str) -> None:

@@ -145,8 +145,7 @@ class Alias:
         """Let a port refuse; relays that are open stay."""
         acceptor = self._acceptors.pop(port, None)
         if acceptor is not None:
-            acceptor.stop()
-            acceptor.sock.close()
+            acceptor.close()
             self._server.close_port(port)
 
     def _note_used(self, port: int) -> None:
