@@ -25,7 +25,7 @@ from rosproxy.ros1.protocol.xmlrpc.multicall import (
 )
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.slave_api import ros_triple
+from rosproxy.ros1.rewriting.slave_api import replace_held, ros_triple
 
 
 class Refusal(msgspec.Struct, frozen=True):
@@ -218,7 +218,7 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
     for result in read_reply(Exported(request, (None,) * len(request.calls), None), reply).results:
         text = result.triple.items[2].string()
         if row(result.call.method).reply is Reply.MASTER_URI and text:
-            edits += _import_one(result.triple, text, f"http://{master}/")
+            edits += replace_held(result.triple, f"http://{master}/")
     return xmlrpc.apply(reply, edits)
 
 
@@ -285,22 +285,13 @@ def _import_result(result: Result, asker: Asker, addressing: Addressing) -> list
             if item.kind == "string"
         ]
     if text and kind is Reply.SLAVE_URI:
-        return _import_one(result.triple, text, addressing.import_slave(text, asker))
+        return replace_held(result.triple, addressing.import_slave(text, asker))
     if text and kind is Reply.SERVICE_URI:
         uri = addressing.import_service(text, _name(result.call), asker)
-        return _import_one(result.triple, text, uri)
+        return replace_held(result.triple, uri)
     if text and kind is Reply.MASTER_URI and asker.master:
-        return _import_one(result.triple, text, f"http://{asker.master}/")
+        return replace_held(result.triple, f"http://{asker.master}/")
     return []
-
-
-def _import_one(triple: Value, before: str, after: str) -> list[Edit]:
-    """Replace the value, and the same text where the status message quotes it (lookupService)."""
-    edits = [xmlrpc.replace(triple.items[2], after)]
-    message = triple.items[1].string()
-    if message and before in message:
-        edits.append(xmlrpc.replace(triple.items[1], message.replace(before, after)))
-    return edits
 
 
 def _registration(call: Call, now: float) -> Registration | None:

@@ -112,13 +112,21 @@ def tcpros_address(triple: Value) -> HostPort | None:
 
 def send_to(triple: Value, where: HostPort) -> list[Edit]:
     """Edits by which such a reply sends the subscriber elsewhere."""
-    _, message, protocol = triple.items
-    _, host, port = protocol.items
+    _, host, port = triple.items[2].items
     edits = [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
-    before = f"{host.text}:{port.text}"
-    if before in (message.string() or ""):
-        edits.append(xmlrpc.replace(message, message.text.replace(before, str(where))))
-    return edits
+    return edits + _in_message(triple, f"{host.text}:{port.text}", str(where))
+
+
+def replace_held(triple: Value, after: str) -> list[Edit]:
+    """Edits by which a reply gives another text, also where its status message quotes it."""
+    held = triple.items[2]
+    return [xmlrpc.replace(held, after), *_in_message(triple, held.text, after)]
+
+
+def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
+    """The edit of a status message that quotes a text; none if it does not."""
+    text = triple.items[1].string() or ""
+    return [xmlrpc.replace(triple.items[1], text.replace(before, after))] if before in text else []
 
 
 def _is_tcpros(triple: Value) -> bool:
@@ -136,13 +144,9 @@ def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> lis
 
 
 def _export_uri(method: str, triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
-    held, message = triple.items[2], triple.items[1]
-    if not held.string():
+    held = triple.items[2].string()
+    if not held:
         return []
-    after = visit.master_uri
-    if method == "getUri":
-        after = addressing.export_slave(held.text, visit.node)
-    edits = [xmlrpc.replace(held, after)]
-    if message.string() == held.text:
-        edits.append(xmlrpc.replace(message, after))
-    return edits
+    if method == "getMasterUri":
+        return replace_held(triple, visit.master_uri)
+    return replace_held(triple, addressing.export_slave(held, visit.node))
