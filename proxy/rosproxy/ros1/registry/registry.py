@@ -18,15 +18,18 @@ class RangeExhausted(Exception):
 
 
 class Registry:
-    """All endpoints, found by port, by address, by URI, by service and by node name."""
+    """All endpoints, found by port, by address, by URI, by service and by node name.
+
+    ``by_port``, ``by_slave``, ``by_caller`` and ``services`` are for others to read only.
+    """
 
     def __init__(self, ports: PortRange) -> None:
         self.pool = PortPool(ports)
         self.by_port: dict[int, Endpoint] = {}
-        self._by_slave: dict[HostPort, Endpoint] = {}
+        self.by_slave: dict[HostPort, Endpoint] = {}
+        self.by_caller: dict[str, Endpoint] = {}
+        self.services: dict[str, tuple[Endpoint, Registration]] = {}
         self._by_uri: dict[str, dict[int, Endpoint]] = {}
-        self._by_caller: dict[str, Endpoint] = {}
-        self._services: dict[str, tuple[Endpoint, Registration]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
@@ -50,7 +53,7 @@ class Registry:
         somebody else's. Raises RangeExhausted if it needs a port and none can be had.
         """
         slave = HostPort(place.address, node.port)
-        endpoint = self._by_slave.get(slave)
+        endpoint = self.by_slave.get(slave)
         if endpoint is None:
             port = self.pool.take(prefer=self._last_port.get(slave))
             if port is None:
@@ -65,7 +68,7 @@ class Registry:
 
     def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
         """Rebuild an endpoint on the port that it had; None if either is taken."""
-        if self.at(place.address, node.port) or not self.pool.claim(port):
+        if HostPort(place.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
         endpoint = self._add(uri, node, place, port)
         endpoint.trusted = False
@@ -76,7 +79,7 @@ class Registry:
         """Forget an endpoint with all its registrations and give its port back."""
         for key in list(endpoint.registrations):
             self._drop(endpoint, key)
-        del self.by_port[endpoint.port], self._by_slave[endpoint.slave]
+        del self.by_port[endpoint.port], self.by_slave[endpoint.slave]
         for admission in endpoint.admissions:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
@@ -91,11 +94,11 @@ class Registry:
         """
         moved = self._movable(places)
         for endpoint in moved:
-            del self._by_slave[endpoint.slave], self._last_port[endpoint.slave]
+            del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
         for endpoint in moved:
             endpoint.place = places[endpoint]
-            self._by_slave[endpoint.slave] = endpoint
+            self.by_slave[endpoint.slave] = endpoint
             self._remember(endpoint)
         for endpoint, uri in admissions:
             self._admit(endpoint, uri, endpoint.place.address)
@@ -123,23 +126,23 @@ class Registry:
         As the master does, a service has one provider, and a name that registers from another
         URI loses all that it had at the old one (rosmaster/registrations.py).
         """
-        other = self._by_caller.get(held.caller_id)
+        other = self.by_caller.get(held.caller_id)
         if other and other is not endpoint:
             self.drop_caller(other, held.caller_id)
         if held.kind is Kind.SERVICE:
-            before = self._services.get(held.name)
+            before = self.services.get(held.name)
             if before and before[1].key != held.key:
                 self._drop(before[0], before[1].key)
-            self._services[held.name] = (endpoint, held)
+            self.services[held.name] = (endpoint, held)
         if held.key not in endpoint.registrations:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.registrations[held.key] = held
-        self._by_caller[held.caller_id] = endpoint
+        self.by_caller[held.caller_id] = endpoint
         endpoint.note_used()
 
     def unregister(self, kind: Kind, name: str, caller_id: str) -> None:
         """Note that a registration has ended, whoever ended it."""
-        endpoint = self._by_caller.get(caller_id)
+        endpoint = self.by_caller.get(caller_id)
         if endpoint:
             self._drop(endpoint, (kind, name, caller_id))
 
@@ -157,21 +160,9 @@ class Registry:
         same = self._by_uri.get(uri, {}).values()
         return sorted(same, key=lambda endpoint: endpoint.port in self._former)
 
-    def at(self, address: str, port: int) -> Endpoint | None:
-        """The endpoint of the slave API at an address and port."""
-        return self._by_slave.get(HostPort(address, port))
-
-    def by_caller(self, caller_id: str) -> Endpoint | None:
-        """The endpoint of a node's name."""
-        return self._by_caller.get(caller_id)
-
-    def service(self, name: str) -> tuple[Endpoint, Registration] | None:
-        """Who provides a service."""
-        return self._services.get(name)
-
     def service_port(self, endpoint: Endpoint, name: str) -> int | None:
         """The TCPROS port that an endpoint's node gave for a service, if it may be believed."""
-        known = self._services.get(name)
+        known = self.services.get(name)
         if known is None or known[0] is not endpoint or not endpoint.place.confirmed:
             return None
         where = parse_service_uri(known[1].service_api or "")
@@ -185,7 +176,7 @@ class Registry:
         """Those whose new addresses are free, or will be; of two for the same one the first."""
         moved = list(places)
         while True:
-            taken = {slave for slave, e in self._by_slave.items() if e not in moved}
+            taken = {slave for slave, e in self.by_slave.items() if e not in moved}
             kept = []
             for endpoint in moved:
                 slave = HostPort(places[endpoint].address, endpoint.node.port)
@@ -207,7 +198,7 @@ class Registry:
 
     def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port)
-        self.by_port[port] = self._by_slave[endpoint.slave] = endpoint
+        self.by_port[port] = self.by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
         self._by_uri.setdefault(uri, {})[port] = endpoint
         return endpoint
@@ -239,7 +230,7 @@ class Registry:
             return
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
-            self._services.pop(name, None)
+            self.services.pop(name, None)
         endpoint.callers[caller_id] -= 1
         if not endpoint.callers[caller_id]:
-            del endpoint.callers[caller_id], self._by_caller[caller_id]
+            del endpoint.callers[caller_id], self.by_caller[caller_id]

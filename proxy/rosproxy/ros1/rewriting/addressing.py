@@ -86,7 +86,7 @@ class Addressing:
             return uri
         if self._is_relayed(where, asker):
             return service_uri(self.outside(where.port))
-        known = self.registry.service(service)
+        known = self.registry.services.get(service)
         if known and (where.host == known[0].node.host or uri == known[1].service_api):
             return self.advertised_service(known[0])
         return uri
@@ -167,7 +167,7 @@ class Addressing:
 
     def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
         """A service as its provider gave it, or as it must have done (rebuilt from the master)."""
-        known = self.registry.service(service)
+        known = self.registry.services.get(service)
         if known is None or known[0] is not endpoint:
             return None
         if known[1].service_api is None and endpoint.tcpros_port:

@@ -233,7 +233,7 @@ def _name(call: Call) -> str:
 
 def _holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
-    found, holder = row(call.method), addressing.registry.by_caller(_caller_id(call))
+    found, holder = row(call.method), addressing.registry.by_caller.get(_caller_id(call))
     if holder is None:
         return None
     if found.caller_api is None:

@@ -141,7 +141,8 @@ class ContainerEvents:
         await self.registrar.resettle(there)
         for endpoint in set(infos) - set(there):
             # The node has registered from its new address already, and holds another port there.
-            successor = registry.at(places[endpoint].address, endpoint.node.port)
+            there_now = HostPort(places[endpoint].address, endpoint.node.port)
+            successor = registry.by_slave.get(there_now)
             self._close(endpoint)
             await self.registrar.clean_up(endpoint)
             if successor is not None:

@@ -211,7 +211,7 @@ def test_what_is_registered_is_found_by_name_kind_and_endpoint() -> None:
     assert endpoint.topics == {"/a", "/b"}
     assert endpoint.caller_ids == ["/node"]
     assert endpoint.label == "/node (http://10.0.0.5:40001/)"
-    assert registry.by_caller("/node") is endpoint
+    assert registry.by_caller.get("/node") is endpoint
     assert len(list(registry.registrations())) == 5
     registry.unregister(PUB, "/a", "/node")
     registry.unregister(PUB, "/a", "/node")
@@ -233,8 +233,8 @@ def test_a_name_that_registers_from_another_uri_loses_what_it_had() -> None:
     register(registry, new, SUB, "/c")
     assert old.caller_ids == ["/other"]
     assert new.names(SUB) == ["/c"]
-    assert registry.by_caller("/node") is new
-    assert registry.service("/s") is None
+    assert registry.by_caller.get("/node") is new
+    assert registry.services.get("/s") is None
 
 
 def test_a_service_has_one_provider() -> None:
@@ -242,12 +242,12 @@ def test_a_service_has_one_provider() -> None:
     old, new = node(registry, 5), node(registry, 6)
     register(registry, old, SRV, "/s", "/old")
     held = register(registry, new, SRV, "/s", "/new")
-    assert registry.service("/s") == (new, held)
+    assert registry.services.get("/s") == (new, held)
     assert old.names(SRV) == []
     registry.unregister(SRV, "/s", "/old")  # too late: the service is somebody else's
-    assert registry.service("/s") == (new, held)
+    assert registry.services.get("/s") == (new, held)
     registry.unregister(SRV, "/s", "/new")
-    assert registry.service("/s") is None
+    assert registry.services.get("/s") is None
 
 
 def test_a_service_registered_anew_takes_its_new_uri() -> None:
@@ -256,7 +256,7 @@ def test_a_service_registered_anew_takes_its_new_uri() -> None:
     register(registry, endpoint, SRV, "/s")
     again = Registration(SRV, "/s", "/node", service_api="rosrpc://10.0.0.5:50002")
     registry.register(endpoint, again)
-    assert registry.service("/s") == (endpoint, again)
+    assert registry.services.get("/s") == (endpoint, again)
     assert registry.service_port(endpoint, "/s") == 50002
     assert len(endpoint.registrations) == 1
 
@@ -290,8 +290,8 @@ def test_removing_an_endpoint_removes_all_that_it_had() -> None:
     registry.remove(endpoint)
     assert len(registry) == 0
     assert registry.pool.free == 4
-    assert registry.by_caller("/node") is None
-    assert registry.service("/a") is None
+    assert registry.by_caller.get("/node") is None
+    assert registry.services.get("/a") is None
     assert not endpoint.registrations
 
 
@@ -323,8 +323,8 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
         port,
         own_uri("10.0.0.5"),
     )
-    assert registry.at("10.0.0.9", 40001) is endpoint
-    assert registry.at("10.0.0.5", 40001) is None
+    assert registry.by_slave.get(HostPort("10.0.0.9", 40001)) is endpoint
+    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is None
     assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
     assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is None
     assert endpoint.registrations == {held.key: held}
@@ -346,8 +346,8 @@ def test_two_nodes_may_swap_their_addresses() -> None:
     one, other = node(registry, 5), node(registry, 6)
     places = {one: Place("10.0.0.6", False), other: Place("10.0.0.5", False)}
     assert registry.move(places) == [one, other]
-    assert registry.at("10.0.0.6", 40001) is one
-    assert registry.at("10.0.0.5", 40001) is other
+    assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is one
+    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is other
     assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.6") is one
     assert registry.admitted(own_uri("10.0.0.6"), "10.0.0.5") is other
 
@@ -358,4 +358,4 @@ def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
     places = {third: Place("10.0.0.5", False), one: Place("10.0.0.6", False)}
     assert registry.move(places) == []
     assert [e.place.address for e in (one, holder, third)] == ["10.0.0.5", "10.0.0.6", "10.0.0.7"]
-    assert registry.at("10.0.0.5", 40001) is one
+    assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is one

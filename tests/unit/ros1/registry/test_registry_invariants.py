@@ -89,7 +89,7 @@ class Registries(RuleBasedStateMachine):
             else:
                 assert endpoint.slave == slave
                 wanted = places.get(endpoint)
-                taken = wanted and self.registry.at(wanted.address, port)
+                taken = wanted and self.registry.by_slave.get(HostPort(wanted.address, port))
                 assert wanted is None or taken
 
     @rule(data=st.data())
@@ -163,7 +163,7 @@ class Registries(RuleBasedStateMachine):
     @invariant()
     def nobody_else_is_found(self) -> None:
         live = set(self.registry)
-        assert set(self.registry._by_slave.values()) == live
+        assert set(self.registry.by_slave.values()) == live
         former = set(self.registry._former.values())
         by_uri = self.registry._by_uri.values()
         assert all(by_uri)
@@ -186,16 +186,16 @@ class Registries(RuleBasedStateMachine):
         found = {held.key: endpoint for endpoint, held in self.registry.registrations()}
         assert found == self.expected
         for (kind, name, caller_id), endpoint in self.expected.items():
-            assert self.registry.by_caller(caller_id) is endpoint
+            assert self.registry.by_caller.get(caller_id) is endpoint
             if kind is Kind.SERVICE:
-                known = self.registry.service(name)
+                known = self.registry.services.get(name)
                 assert known
                 assert known[0] is endpoint
-        assert set(self.registry._by_caller) == {key[2] for key in self.expected}
+        assert set(self.registry.by_caller) == {key[2] for key in self.expected}
         for endpoint in self.registry:
             assert endpoint.callers == Counter(key[2] for key in endpoint.registrations)
         services = {key[1] for key in self.expected if key[0] is Kind.SERVICE}
-        assert set(self.registry._services) == services
+        assert set(self.registry.services) == services
 
 
 TestRegistries: Any = Registries.TestCase

@@ -257,7 +257,7 @@ def test_registrations_are_noted_if_the_master_accepts_them(
 
 
 def held(addressing: Addressing, name: str) -> list[Kind]:
-    endpoint: Endpoint | None = addressing.registry.by_caller(name)
+    endpoint: Endpoint | None = addressing.registry.by_caller.get(name)
     return [one.kind for one in endpoint.registrations.values()] if endpoint else []
 
 

@@ -55,7 +55,7 @@ def subscriptions(
             publishers.setdefault(topic, {}).setdefault(joint, []).append(endpoint)
     found: list[TopicSubscription] = []
     for node, registrations in held.items():
-        itself = addressing.registry.by_caller(node)
+        itself = addressing.registry.by_caller.get(node)
         near = _networks_of(itself.place.address, addressing) if itself else frozenset()
         for one in registrations:
             groups = publishers.get(one.name, {}) if one.kind is Kind.SUBSCRIBER else {}
