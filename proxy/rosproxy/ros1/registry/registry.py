@@ -57,7 +57,11 @@ class Registry:
         if endpoint is None:
             port = self.pool.take(prefer=self._last_port.get(slave))
             if port is None:
-                raise self.exhausted()
+                raise RangeExhausted(
+                    f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} "
+                    f"leases held, {len(self.pool.blocked)} taken by other programs); give the "
+                    "proxy a larger --port-range (ROSPROXY_PORT_RANGE)"
+                )
             endpoint = self._add(uri, node, place, port)
         elif place.confirmed or not endpoint.place.confirmed:
             self._forget_uri(endpoint)
@@ -111,14 +115,6 @@ class Registry:
         """
         idle = [e for e in self if e.unused and e.idle_since is not None]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
-
-    def exhausted(self) -> RangeExhausted:
-        """The error for a node that can't get a port."""
-        return RangeExhausted(
-            f"rosproxy: all ports of the range {self.pool.range} are in use ({len(self)} leases "
-            f"held, {len(self.pool.blocked)} taken by other programs); give the proxy a larger "
-            "--port-range (ROSPROXY_PORT_RANGE)"
-        )
 
     def register(self, endpoint: Endpoint, held: Registration) -> None:
         """Note what the master has accepted.

@@ -4,8 +4,6 @@ Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
 clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
 """
 
-from collections.abc import Iterator
-
 import msgspec
 
 from rosproxy.net.addresses import HostPort
@@ -43,11 +41,8 @@ def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
-    named = call.params[2] if call.method == "publisherUpdate" and len(call.params) > 2 else None
-    if named is None or named.kind != "array":
-        return body
     edits, seen = [], set()
-    for item in (item for item in named.items if item.kind == "string"):
+    for item in _publishers(call):
         uri = addressing.import_slave(item.text, visit.node)
         edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
         seen.add(uri)
@@ -69,10 +64,9 @@ def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing)
     return xmlrpc.apply(reply, edits)
 
 
-def announced_publishers(call: Call) -> Iterator[str]:
+def announced_publishers(call: Call) -> list[str]:
     """The publishers that a ``publisherUpdate`` names; nothing for other calls."""
-    if call.method == "publisherUpdate" and len(call.params) > 2:
-        yield from (text for item in call.params[2].items if (text := item.string()))
+    return [item.text for item in _publishers(call)]
 
 
 def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
@@ -127,6 +121,12 @@ def _in_message(triple: Value, before: str, after: str) -> list[Edit]:
     """The edit of a status message that quotes a text; none if it does not."""
     text = triple.items[1].string() or ""
     return [xmlrpc.replace(triple.items[1], text.replace(before, after))] if before in text else []
+
+
+def _publishers(call: Call) -> list[Value]:
+    if call.method != "publisherUpdate" or len(call.params) < 3 or call.params[2].kind != "array":
+        return []
+    return [item for item in call.params[2].items if item.kind == "string"]
 
 
 def _is_tcpros(triple: Value) -> bool:
