@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Collection, Iterator
+from functools import cache
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
 
@@ -56,7 +57,7 @@ class Metrics:
 
         calls = "XML-RPC calls by API (master, slave), method and outcome."
         self.calls = counter("xmlrpc_calls", calls, "api", "method", "outcome")
-        self._counters: dict[tuple[str, str, str], Counter] = {}
+        self._of_calls = cache(self.calls.labels)
         errors = "TCPROS connections that could not be relayed."
         self.relay_errors = counter("relay_errors", errors, "reason")
         gone = "Nodes unregistered at the master because they were gone."
@@ -73,6 +74,4 @@ class Metrics:
     def count(self, api: str, method: str, outcome: str) -> None:
         """Count a call; method names that nobody defined share one label."""
         known = method if method in self._known_methods else "other"
-        key = api, known, outcome
-        counter = self._counters.get(key) or self._counters.setdefault(key, self.calls.labels(*key))
-        counter.inc()
+        self._of_calls(api, known, outcome).inc()
