@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -21,19 +22,15 @@ from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
 
+@dataclass(eq=False)
 class ProxyState(Collector):
     """What there is to tell of a proxy, read when somebody asks."""
 
-    def __init__(
-        self,
-        context: Context,
-        monitor: MasterMonitor,
-        tcpros: TcprosServer,
-        alias: Alias,
-        plane: KernelPlane,
-    ) -> None:
-        self._context, self._monitor, self._tcpros = context, monitor, tcpros
-        self._alias, self._plane = alias, plane
+    _context: Context
+    _monitor: MasterMonitor
+    _tcpros: TcprosServer
+    _alias: Alias
+    _plane: KernelPlane
 
     def status(self) -> document.ProxyStatus:
         """Everything that ``rosproxy status`` and ``rosproxy doctor`` show."""

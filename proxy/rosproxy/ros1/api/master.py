@@ -8,7 +8,7 @@ they are.
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
@@ -23,19 +23,15 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.recovery import Recovery
 
 
+@dataclass(slots=True, eq=False)
 class MasterApi:
     """Forwards master API calls, rewritten, and keeps the registry in step with the master."""
 
-    def __init__(
-        self,
-        context: Context,
-        admission: NodeAdmission,
-        alias: Alias,
-        recovery: Recovery,
-        adopter: Adopter,
-    ) -> None:
-        self._context, self._admission, self._alias = context, admission, alias
-        self._recovery, self._adopter = recovery, adopter
+    _context: Context
+    _admission: NodeAdmission
+    _alias: Alias
+    _recovery: Recovery
+    _adopter: Adopter
 
     async def __call__(self, call: IncomingCall) -> bytes:
         """The reply to a call. Raises XmlRpcError, Unreachable."""

@@ -9,7 +9,7 @@ node shut down that has registered around the proxy once more (`absorb_shutdown`
 import asyncio
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort, is_inside
@@ -33,19 +33,15 @@ SHUTDOWN_TIMEOUT = 2.0
 NO_PORT = "registered around the proxy and can't be adopted: no port of the range is left"
 
 
+@dataclass(slots=True, eq=False)
 class Adopter:
     """Finds nodes that registered around the proxy, and makes the master know them through it."""
 
-    def __init__(
-        self,
-        context: Context,
-        leases: Leases[Endpoint],
-        admission: NodeAdmission,
-        registrar: Registrar,
-    ) -> None:
-        self._context, self._leases = context, leases
-        self._admission, self._registrar = admission, registrar
-        self._one_at_a_time = asyncio.Lock()
+    _context: Context
+    _leases: Leases[Endpoint]
+    _admission: NodeAdmission
+    _registrar: Registrar
+    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     async def adopt(self, arrived: Sequence[Container]) -> int:
         """Adopt the nodes of containers that have arrived.

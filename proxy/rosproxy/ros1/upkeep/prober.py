@@ -11,6 +11,7 @@ What follows from a probe: `Health.note` says how the node is, `liveness` what i
 
 import asyncio
 import logging
+from dataclasses import dataclass, field
 
 from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master import MasterError, Unreachable
@@ -29,21 +30,17 @@ PROBE_TICK = 0.25
 PARALLEL_PROBES = 64
 
 
+@dataclass(slots=True, eq=False)
 class Prober:
     """Looks after all endpoints."""
 
-    def __init__(
-        self,
-        context: Context,
-        leases: Leases[Endpoint],
-        registrar: Registrar,
-        resubscriber: Resubscriber,
-        recovery: Recovery,
-    ) -> None:
-        self._context, self._leases, self._registrar = context, leases, registrar
-        self._resubscriber, self._recovery = resubscriber, recovery
-        self._probing: set[Endpoint] = set()
-        self._limit = asyncio.Semaphore(PARALLEL_PROBES)
+    _context: Context
+    _leases: Leases[Endpoint]
+    _registrar: Registrar
+    _resubscriber: Resubscriber
+    _recovery: Recovery
+    _probing: set[Endpoint] = field(default_factory=set)
+    _limit: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARALLEL_PROBES))
 
     async def look(self) -> None:
         """Look after all endpoints once."""
