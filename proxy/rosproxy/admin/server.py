@@ -11,6 +11,7 @@ import json
 import logging
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from aiohttp import web
@@ -35,6 +36,7 @@ Action = Callable[[Any], Awaitable[dict[str, Any]]]
 """Does what a POST asks for, given its JSON body. Raises BodyError, Unreachable, MasterError."""
 
 
+@dataclass(slots=True, eq=False)
 class AdminServer:
     """Serves what people, orchestrators and the operator ask.
 
@@ -43,18 +45,13 @@ class AdminServer:
     post.
     """
 
-    def __init__(
-        self,
-        metrics: CollectorRegistry,
-        status: Callable[[], dict[str, Any]],
-        unready: Callable[[], str | None],
-        actions: Mapping[str, Action],
-        token: str | None = None,
-    ) -> None:
-        self._metrics, self._status, self._unready = metrics, status, unready
-        self._actions, self._token = actions, token
-        self._runner: web.AppRunner | None = None
-        self._locks: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+    _metrics: CollectorRegistry
+    _status: Callable[[], dict[str, Any]]
+    _unready: Callable[[], str | None]
+    _actions: Mapping[str, Action]
+    _token: str | None
+    _runner: web.AppRunner | None = None
+    _locks: Mapping[str, asyncio.Lock] = field(default_factory=lambda: defaultdict(asyncio.Lock))
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
