@@ -113,15 +113,16 @@ class SlaveApi:
             await self._after_registration(endpoint)
             await self._alias.listen_for(slave_api.announced_publishers(parsed))
         self._context.refresh_networks()
-        visit = self._visit(endpoint, call, endpoint.port)
-        addressing = self._context.addressing
+        node, addressing = self._context.node_asker(endpoint), self._context.addressing
         body = self._alias.import_call(body, parsed)
-        reply = await self._ask(endpoint, slave_api.import_call(body, parsed, visit, addressing))
-        said = slave_api.topic_port(parsed, reply)
+        reply = await self._ask(endpoint, slave_api.import_call(body, parsed, node, addressing))
+        port, said = endpoint.port, slave_api.topic_port(parsed, reply)
         if said is not None:
             endpoint.note_tcpros_port(said, parsed.string(1) or "")
-            port = await self._leases.fast_port(endpoint, said) or endpoint.port
-            visit = self._visit(endpoint, call, port)
+            port = await self._leases.fast_port(endpoint, said) or port
+        near = call.reached_locally
+        reached = HostPort(call.local.host, port) if near else addressing.outside(port)
+        visit = Visit(node, reached, self._context.settings.master_uri)
         return slave_api.export_reply(parsed, reply, visit, addressing)
 
     async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
@@ -155,13 +156,6 @@ class SlaveApi:
             raise
         health.note(ProbeResult.ANSWERED, self._context.now())
         return reply
-
-    def _visit(self, endpoint: Endpoint, call: IncomingCall, port: int) -> Visit:
-        """A call at an endpoint, whose topics the caller is to find at a ``port``."""
-        reached = self._context.addressing.outside(port)
-        if call.reached_locally:
-            reached = HostPort(call.local.host, port)
-        return Visit(self._context.node_asker(endpoint), reached, self._context.settings.master_uri)
 
     async def _may(self, method: str, source: str) -> bool:
         anybody = self._context.settings.slave_control == "any"

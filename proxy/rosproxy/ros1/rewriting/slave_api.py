@@ -23,7 +23,7 @@ class Visit(msgspec.Struct, frozen=True):
     """A call at an endpoint.
 
     ``node`` is the endpoint's node as an asker of imported addresses, ``reached`` the address and
-    port that the caller used for the endpoint, ``master_uri`` the master's URI outside.
+    port at which the caller is to find its topics, ``master_uri`` the master's URI outside.
     """
 
     node: Asker
@@ -36,14 +36,14 @@ def rewritten(call: Call) -> bool:
     return call.method in _REWRITTEN
 
 
-def import_call(body: bytes, call: Call, visit: Visit, addressing: Addressing) -> bytes:
+def import_call(body: bytes, call: Call, node: Asker, addressing: Addressing) -> bytes:
     """The call for the inside node: the publishers of a ``publisherUpdate`` imported.
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
     edits, seen = [], set()
     for item in _publishers(call):
-        uri = addressing.import_slave(item.text, visit.node)
+        uri = addressing.import_slave(item.text, node)
         edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
         seen.add(uri)
     return xmlrpc.apply(body, edits)

@@ -137,7 +137,7 @@ def test_the_slave_side_leaves_other_values_alone(
     named = values[2] if len(values) > 2 and isinstance(values[2], list) else []
     publishers = [item for item in named if isinstance(item, str)]
     if len(publishers) == len(set(publishers)):  # publisherUpdate drops what comes twice
-        assert slave_api.import_call(body, parsed, VISIT, WORLD) == body
+        assert slave_api.import_call(body, parsed, ASKER, WORLD) == body
     assert slave_api.export_reply(parsed, answer, VISIT, WORLD) == answer
 
 
@@ -146,7 +146,7 @@ def everything(body: bytes) -> None:
     request = master_api.read_request(body, ASKER)
     exported(request)
     parsed = xmlrpc.parse_call(body)
-    slave_api.import_call(body, parsed, VISIT, WORLD)
+    slave_api.import_call(body, parsed, ASKER, WORLD)
     for call in (parsed, *multicall.inner_calls(parsed)):
         if call:
             xmlrpc.parse_call(multicall.single_call(call))

@@ -44,7 +44,7 @@ def world(reached: HostPort = OUTSIDE) -> tuple[Addressing, Visit]:
 
 def inward(body: bytes) -> bytes:
     addressing, visit = world()
-    return slave_api.import_call(body, xmlrpc.parse_call(body), visit, addressing)
+    return slave_api.import_call(body, xmlrpc.parse_call(body), visit.node, addressing)
 
 
 def outward(method: str, reply: bytes, reached: HostPort = OUTSIDE) -> bytes:
