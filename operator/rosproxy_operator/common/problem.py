@@ -19,6 +19,12 @@ class Problem:
     text: str
     fatal: bool = True
 
+    @property
+    def log_fields(self) -> dict[str, str]:
+        """What a log entry about it has as fields, to be given as ``extra``."""
+        kind, _, name = self.subject.partition(" ")
+        return {kind: name} if kind in ("container", "pod", "proxy") else {}
+
 
 def bounded(text: str, most: int) -> str:
     """A text of at most so many characters."""
@@ -37,7 +43,8 @@ class ProblemLog:
         for problem in now:
             if problem not in self._told:
                 level = logging.ERROR if problem.fatal else logging.WARNING
-                log.log(level, "%s: %s", problem.subject, problem.text)
+                text = "%s: %s"
+                log.log(level, text, problem.subject, problem.text, extra=problem.log_fields)
         for subject in sorted({p.subject for p in self._told} - {p.subject for p in now}):
             log.info("%s: solved", subject)
         self._told = now

@@ -186,7 +186,8 @@ class Executor:
     async def _one(self, action: Action, carry_out: CarryOut) -> None:
         """Carry an action out, and log why it failed: once while it is tried again and again."""
         before, _ = self._refused.get(action, (None, 0.0))
-        log.log(logging.INFO if before is None else logging.DEBUG, "%s", action)
+        about = action.log_fields
+        log.log(logging.INFO if before is None else logging.DEBUG, "%s", action, extra=about)
         outcome = "failed"
         started = time.monotonic()
         try:
@@ -197,7 +198,8 @@ class Executor:
             reason = str(error)
             if isinstance(error, PortTaken):
                 outcome = reason = "taken"  # maybe another port each time
-            log.log(logging.DEBUG if reason == before else logging.WARNING, "%s: %s", action, error)
+            level = logging.DEBUG if reason == before else logging.WARNING
+            log.log(level, "%s: %s", action, error, extra=about)
             self._refused[action] = reason, time.monotonic()
             raise
         finally:
@@ -224,9 +226,11 @@ class DockerApplier:
     async def _retire(self, name: str, access: ProxyAccess) -> None:
         try:
             told = await self._proxies.retire(access.admin, access.token)
-            log.info("%s has unregistered %s nodes at its master", name, told.get("unregistered"))
+            text, what = "%s has unregistered %s nodes at its master", told.get("unregistered")
+            log.info(text, name, what, extra={"proxy": name})
         except ProxyError as error:
-            log.warning("%s could not unregister its nodes at the master: %s", name, error)
+            text = "%s could not unregister its nodes at the master: %s"
+            log.warning(text, name, error, extra={"proxy": name})
 
     def _do(self, action: Action, look: DockerSnapshot) -> None:
         try:

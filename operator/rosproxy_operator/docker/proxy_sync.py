@@ -69,7 +69,8 @@ class ProxyUpdater:
         address = self._news.facts.master_address
         if address and status.master.address != address:
             await self._proxies.master_address(where, token, address)
-            log.info("%s: its master is now at %s", self._name, address)
+            text = "%s: its master is now at %s"
+            log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
         body = self._news.body(nodes_by_address(status).keys(), now)
         if body:
@@ -77,7 +78,7 @@ class ProxyUpdater:
             done = await self._proxies.containers(where, token, body)
             counts = {word: done.get(word) for word in ("unregistered", "moved", "adopted")}
             if text := ", ".join(f"{count} {word}" for word, count in counts.items() if count):
-                log.info("%s: nodes %s", self._name, text)
+                log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
         self._news.told(now)
         self._heard(None)
 

@@ -105,12 +105,14 @@ class ClusterApplier:
             log.exception("%s failed", line(action))
             text = f"the operator failed: {error!r}"
         else:
-            log.log(logging.DEBUG if quiet else logging.INFO, "%s", line(action))
+            level = logging.DEBUG if quiet else logging.INFO
+            log.log(level, "%s", line(action), extra=_log_fields(action))
             self._counted(action, "ok")
             return None
         before = self.failures.get(action.of, {}).get(_subject(action))
         told = text == before or isinstance(action, PatchStatus)
-        log.log(logging.DEBUG if told else logging.WARNING, "%s: %s", line(action), text)
+        level = logging.DEBUG if told else logging.WARNING
+        log.log(level, "%s: %s", line(action), text, extra=_log_fields(action))
         self._counted(action, "failed")
         return text
 
@@ -147,15 +149,17 @@ class ClusterApplier:
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
+        about = _log_fields(action)
         try:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
                 async with asyncio.timeout(RETIRING):
                     told = await self._proxies.retire(address_of(proxy), proxy.token)
-                log.info("%s has unregistered its nodes: %s", action.id, told)
+                log.info("%s has unregistered its nodes: %s", action.id, told, extra=about)
         except (ProxyError, TimeoutError) as error:
             reason = str(error) or f"no answer in {RETIRING:g} s"
-            log.info("%s could not unregister its nodes at the master: %s", action.id, reason)
+            text = "%s could not unregister its nodes at the master: %s"
+            log.info(text, action.id, reason, extra=about)
         finally:
             self._retired.add(action.uid)
             self._retiring.discard(action.uid)
@@ -187,6 +191,12 @@ def _subject(action: Action) -> Name:
             return action.id
         case _:
             return action.of
+
+
+def _log_fields(action: Action) -> dict[str, str]:
+    """What a log entry about an action has as fields: the proxy's pod."""
+    of_proxy = isinstance(action, CreateProxy | DeleteProxy | SetImage)
+    return {"proxy": str(_subject(action))} if of_proxy else {}
 
 
 def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:

@@ -22,3 +22,9 @@ def test_each_problem_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
         ("INFO", "container talker: solved"),
         ("ERROR", "container talker: no master is known"),
     ]
+
+
+def test_what_a_problem_is_about_is_a_field_of_the_record(caplog: pytest.LogCaptureFixture) -> None:
+    ProblemLog().update([FATAL, Problem("proxy rosproxy-a", "ends"), Problem("uplink", "is gone")])
+    fields = [(vars(r).get("container"), vars(r).get("proxy")) for r in caplog.records]
+    assert fields == [("talker", None), (None, "rosproxy-a"), (None, None)]

@@ -23,6 +23,11 @@ class Action(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         return clean(f"{self.does} {self.name}{self._more()}")
 
+    @property
+    def log_fields(self) -> dict[str, str]:
+        """What a log entry about it has as fields: the container's name, or the network's."""
+        return {self.does.rpartition(" ")[2]: self.name}
+
     def _more(self) -> str:
         """The rest of the text."""
         return ""
