@@ -7,9 +7,10 @@
 How it works. A layer is a directory under tests/. Layers run in lanes: what is in a lane runs one
 after another, the lanes run side by side, and on two processors they end at about the same time.
 
-  1. The integration tests, which mind a busy machine, have a processor for themselves. Beside them
-     what other layers need is prepared: packages, programs and images, by scripts that do nothing
-     where their work is done already. After that the lane of unit, chart and docker begins.
+  1. The integration tests have a processor for themselves. Beside them what other layers need is
+     prepared: packages, programs and images, by scripts that do nothing where their work is done
+     already. After that the longest lane begins, docker, which mostly waits, and the one of image,
+     chart and unit.
   2. After the integration tests real ROS nodes and the Kubernetes cluster have a lane each.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
@@ -44,15 +45,17 @@ CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
 ALL, MARKED, NONE = "all", "marked", "none"
 
-ROS, ENGINE, COMPOSE, KUBERNETES, IMAGES = PREPARATIONS = (
+ROS, NODES, ENGINE, COMPOSE, KUBERNETES, IMAGES = PREPARATIONS = (
     "install-ros",
+    "compile-nodes",
     "install-docker",
     "install-compose",
     "install-kubernetes",
     "build-images",
 )
 COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
-    IMAGES: [sys.executable, "-m", "tests.docker.images"]
+    NODES: [sys.executable, "-m", "tests.ros.cpp"],
+    IMAGES: [sys.executable, "-m", "tests.docker.images"],
 }
 
 
@@ -120,14 +123,15 @@ def effective_capabilities() -> int:
 
 
 UNIT = Layer("unit", smoke=ALL)
-INTEGRATION = Layer("integration", smoke=ALL)
+INTEGRATION = Layer("integration", smoke=ALL, workers=2)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
-ROS_NODES = Layer("ros", MARKED, (ROS,), (ROS,), 2, debian_root_obstacle)
+IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
+ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
 DOCKER_ENGINE = Layer(
     "docker", MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
 )
 CLUSTER = Layer("kubernetes", setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle)
-LAYERS = (UNIT, INTEGRATION, CHART, ROS_NODES, DOCKER_ENGINE, CLUSTER)
+LAYERS = (UNIT, INTEGRATION, CHART, IMAGE, ROS_NODES, DOCKER_ENGINE, CLUSTER)
 
 
 class Run:
@@ -146,9 +150,10 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._lane, [INTEGRATION])
             self._prepare()
-            lanes = [integration, pool.submit(self._lane, [UNIT, CHART, DOCKER_ENGINE])]
+            early, late = ([DOCKER_ENGINE], [IMAGE, CHART, UNIT]), ([ROS_NODES], [CLUSTER])
+            lanes = [integration, *(pool.submit(self._lane, lane) for lane in early)]
             integration.result()
-            lanes += [pool.submit(self._lane, [layer]) for layer in (ROS_NODES, CLUSTER)]
+            lanes += [pool.submit(self._lane, lane) for lane in late]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 

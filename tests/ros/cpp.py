@@ -1,4 +1,9 @@
-"""Compiles the C++ test nodes, once per version of their sources."""
+"""Compiles the C++ test nodes, once per version of their sources.
+
+    python -m tests.ros.cpp
+
+does so ahead, while other things go on.
+"""
 
 from __future__ import annotations
 
@@ -60,3 +65,7 @@ def _pkg_config(option: str) -> list[str]:
     if done.returncode != 0:
         raise RuntimeError(done.stderr.strip())
     return done.stdout.split()
+
+
+if __name__ == "__main__":
+    compiled_node()

@@ -1,0 +1,24 @@
+"""The images by themselves, and as people start them by hand: without an operator.
+
+Engine, images and robots are those of `tests.docker`; both layers may run at the same time.
+"""
+
+from tests.docker.conftest import (
+    _engine,
+    base_image,
+    container_name,
+    controller_image,
+    proxy_image,
+    robot,
+    ros_image,
+)
+
+__all__ = [
+    "_engine",
+    "base_image",
+    "container_name",
+    "controller_image",
+    "proxy_image",
+    "robot",
+    "ros_image",
+]
