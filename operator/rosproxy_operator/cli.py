@@ -201,6 +201,7 @@ def _need(library: str, extra: str) -> None:
 
 
 def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> None:
+    from rosproxy.telemetry.text import clean
     from rosproxy_operator.docker.controller import run, run_once
 
     if not once:
@@ -210,7 +211,8 @@ def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> 
     with _one_line():
         problems = run_once(settings, resync)
     for problem in problems:
-        click.echo(f"rosproxy-operator: {problem.subject}: {problem.text}", err=True)
+        text = clean(f"{problem.subject}: {problem.text}")
+        click.echo(f"rosproxy-operator: {text}", err=True)
     sys.exit(1 if problems else 0)
 
 
@@ -355,5 +357,7 @@ def _one_line(*more: type[Exception]) -> Iterator[None]:
 
 
 def _fail(reason: object) -> NoReturn:
-    click.echo(f"rosproxy-operator: {reason}", err=True)
+    from rosproxy.telemetry.text import clean
+
+    click.echo(f"rosproxy-operator: {clean(reason)}", err=True)
     sys.exit(1)

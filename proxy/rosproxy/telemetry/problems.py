@@ -1,10 +1,20 @@
-"""What the user should know: the problems that `rosproxy status` shows."""
+"""What the user should know: the problems that `rosproxy status` shows.
+
+Subjects are nodes' names and texts quote what nodes say, so that both are made harmless and
+bounded here, once for all who note something.
+"""
 
 import time
 
 import msgspec
 
+from rosproxy.telemetry.text import brief
+
 MOST = 50
+"""Problems that are kept."""
+LONGEST_SUBJECT, LONGEST_TEXT = 200, 500
+"""Characters of a problem at most. Names of real nodes have some tens, the proxy's own texts up to
+300; what is longer loses its middle."""
 
 
 class NotedProblem(msgspec.Struct, frozen=True):
@@ -27,12 +37,14 @@ class Problems:
 
     def add(self, subject: str, text: str, port: int | None = None) -> None:
         """Note a problem."""
+        subject, text = brief(subject, LONGEST_SUBJECT), brief(text, LONGEST_TEXT)
         others = [p for p in self._items if (p.subject, p.text) != (subject, text)]
         self._items = [*others, NotedProblem(time.time(), subject, text, port)][-MOST:]
 
     def solved(self, subject: str) -> None:
         """Forget what was noted about a subject."""
-        self._items = [p for p in self._items if p.subject != subject]
+        known = brief(subject, LONGEST_SUBJECT)
+        self._items = [p for p in self._items if p.subject != known]
 
     def solved_at(self, port: int) -> None:
         """Forget what was noted about the node of a lease."""

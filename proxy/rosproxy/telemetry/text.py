@@ -28,7 +28,22 @@ def clean(text: object) -> str:
 
     Node and topic names are whatever a node says they are.
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+    shown = str(text)
+    if shown.isprintable():
+        return shown
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
+
+
+def brief(text: object, most: int) -> str:
+    """A clean text of at most ``most`` characters; a longer one without its middle, and marked.
+
+    For what is kept, sent or logged: how wide it looks does not matter there.
+    """
+    shown = str(text)
+    if len(shown) > most:  # first, since cleaning takes time and may make ten characters of one
+        shown = _without_middle(shown, most)
+    shown = clean(shown)
+    return shown if len(shown) <= most else _without_middle(shown, most)
 
 
 def width(text: str) -> int:
@@ -126,3 +141,9 @@ def _head(text: str, room: int) -> str:
         if room < 0:
             return text[:end]
     return text
+
+
+def _without_middle(text: str, most: int) -> str:
+    """The two ends of a text, with a mark between them."""
+    tail = max(most - 1, 0) // 2
+    return f"{text[: most - 1 - tail]}…{text[len(text) - tail :]}"

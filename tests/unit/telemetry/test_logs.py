@@ -1,21 +1,41 @@
-"""Logs as JSON, one object per line, with fields for what a message is about."""
+"""Logs: as text and as JSON, harmless whatever they quote, and few whoever floods them."""
 
 import json
 import logging
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
-from rosproxy.telemetry.logs import JsonLines
+import pytest
+
+from rosproxy.telemetry.logs import (
+    ALL_EVERY,
+    BURST_OF_ALL,
+    BURST_OF_ONE,
+    LONGEST,
+    MOST_KNOWN,
+    ONE_EVERY,
+    Floods,
+    JsonLines,
+    TextLines,
+)
+
+FORGED = "/a\n2026-01-01 00:00:00,000 ERROR   the robot is on fire\r\x1b[2J\u202e"
+
+
+def record(
+    message: str, *arguments: object, level: int = logging.WARNING, **more: Any
+) -> logging.LogRecord:
+    made = logging.getLogger("rosproxy.test").makeRecord(
+        "rosproxy.test", level, "f.py", 1, message, arguments, more.pop("error", None), extra=more
+    )
+    made.created = 1_795_249_066.5
+    return made
 
 
 def line(message: str, *arguments: object, **more: Any) -> dict[str, Any]:
     """A record as the object of its line."""
-    record = logging.getLogger("rosproxy.test").makeRecord(
-        "rosproxy.test", logging.WARNING, "f.py", 1, message, arguments, more.pop("error", None),
-        extra=more,
-    )  # fmt: skip
-    record.created = 1_795_249_066.5
-    text = JsonLines().format(record)
+    text = JsonLines().format(record(message, *arguments, **more))
     assert text.isascii()
     assert "\n" not in text
     found: dict[str, Any] = json.loads(text)
@@ -28,7 +48,7 @@ def test_a_line_has_time_level_logger_and_message() -> None:
     assert datetime.fromisoformat(found["time"]) == datetime.fromtimestamp(1_795_249_066.5, UTC)
     assert found["time"].endswith(("Z", "+00:00"))
     assert (found["level"], found["logger"]) == ("warning", "rosproxy.test")
-    assert found["message"] == "node /a\n\u202e"
+    assert found["message"] == "node /a\\n\\u202e"
 
 
 def test_what_a_message_is_about_has_fields_of_its_own() -> None:
@@ -43,3 +63,103 @@ def test_an_exception_is_an_error() -> None:
     except OSError as error:
         found = line("failed", error=(OSError, error, error.__traceback__))
     assert found["error"].endswith("OSError: no route")
+
+
+def raised(text: str, cause: str = "") -> Any:
+    """What a handler knows of an exception with that text."""
+    try:
+        try:
+            raise KeyError(cause)
+        except KeyError as error:
+            raise ValueError(text) from error
+    except ValueError as error:
+        return ValueError, error, error.__traceback__
+
+
+def test_no_text_of_others_forges_a_line() -> None:
+    text = TextLines().format(record("%s: %s", FORGED, FORGED))
+    assert text.isprintable()
+    assert text.endswith("\\x1b[2J\\u202e")
+    found = line("%s", FORGED, node=FORGED)
+    assert found["message"].isprintable()
+    assert found["node"].isprintable()
+
+
+@pytest.mark.parametrize("form", [TextLines(), JsonLines()])
+def test_a_message_of_any_size_is_short(form: logging.Formatter) -> None:
+    huge = "a" * 8_000_000
+    text = form.format(record("%s at %s", huge, "\u202e" * 1_000_000, node=huge))
+    assert len(text) < 3 * LONGEST
+
+
+def test_both_ends_of_a_long_message_are_shown() -> None:
+    message = line("%s", "first" + "-" * LONGEST + "last")["message"]
+    assert len(message) == LONGEST
+    assert (message[:6], message[-5:]) == ("first-", "-last")
+    assert "…" in message
+
+
+def test_a_traceback_has_its_lines_and_no_others() -> None:
+    lines = TextLines().format(record("failed", error=raised(FORGED, FORGED))).splitlines()
+    assert all(text.isprintable() for text in lines)
+    assert lines[0].endswith("WARNING failed")
+    assert len([text for text in lines if text.startswith("Traceback")]) == 2
+    assert lines[-1].startswith("ValueError: /a\\n2026-01-01")
+    assert not [text for text in lines if text.startswith("2026-01-01")]
+
+
+def test_the_text_of_an_exception_is_short() -> None:
+    assert len(TextLines().format(record("failed", error=raised("x" * 8_000_000)))) < 2 * LONGEST
+
+
+class Clock:
+    """A clock that stands still until it is told."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def written(floods: Floods, records: Iterable[logging.LogRecord]) -> list[logging.LogRecord]:
+    return [one for one in records if floods.filter(one)]
+
+
+def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) -> None:
+    floods = Floods(clock)
+    assert len(written(floods, (record("%s: gone", "/a") for _ in range(1000)))) == BURST_OF_ONE
+    assert len(written(floods, [record("%s: gone", "/b")])) == 1
+    clock.now += ONE_EVERY
+    (again,) = written(floods, (record("%s: gone", "/a") for _ in range(1000)))
+    assert (
+        TextLines()
+        .format(again)
+        .endswith(f"/a: gone ({1000 - BURST_OF_ONE} more like it were left out)")
+    )
+    assert json.loads(JsonLines().format(again))["left_out"] == 1000 - BURST_OF_ONE
+    clock.now += 1000 * ONE_EVERY
+    assert len(written(floods, (record("%s: gone", "/a") for _ in range(10)))) == BURST_OF_ONE
+
+
+@pytest.mark.parametrize("level", [logging.INFO, logging.ERROR])
+def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int) -> None:
+    floods, more = Floods(clock), 3 * MOST_KNOWN
+    names = [record("%s is new", f"/{n}", level=level) for n in range(BURST_OF_ALL + more)]
+    assert len(written(floods, names)) == BURST_OF_ALL
+    assert len(written(floods, [record("%s is old", "/a", level=level)])) == 1
+    clock.now += ALL_EVERY
+    (later,) = written(floods, (record("%s is new", f"/{n}", level=level) for n in range(9)))
+    assert later.__dict__["left_out"] == more
+
+
+def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:
+    floods = Floods(clock)
+    debug = [record("look", level=logging.DEBUG) for _ in range(2 * BURST_OF_ALL)]
+    assert written(floods, debug) == debug
+    started = [record("%s at %s is %s", f"/{n}", "a", "b", level=logging.INFO) for n in range(1000)]
+    assert written(floods, started) == started

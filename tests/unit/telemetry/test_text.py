@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from rosproxy.telemetry.text import (
     besides_first,
+    brief,
     clean,
     duration,
     listed,
@@ -44,6 +45,28 @@ def test_clean_text_is_printable(text: str) -> None:
     cleaned = clean(text)
     assert cleaned.isprintable()
     assert not any(unicodedata.category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp") for c in cleaned)
+
+
+@pytest.mark.parametrize(
+    ("text", "most", "shown"),
+    [
+        ("/talker", 7, "/talker"),
+        ("/robot1/camera", 9, "/rob…mera"),
+        ("a\nb", 4, "a\\nb"),
+        ("a\nb", 3, "a…b"),
+        ("abc", 1, "…"),
+    ],
+)
+def test_brief_is_clean_and_keeps_both_ends(text: str, most: int, shown: str) -> None:
+    assert brief(text, most) == shown
+
+
+@given(st.text(), st.integers(1, 40))
+def test_brief_text_fits(text: str, most: int) -> None:
+    shown = brief(text, most)
+    assert len(shown) <= most
+    assert shown.isprintable()
+    assert brief(shown, most) == shown
 
 
 @pytest.mark.parametrize(

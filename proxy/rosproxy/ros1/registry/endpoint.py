@@ -6,7 +6,11 @@ from dataclasses import dataclass, field, replace
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.health import Health, ProbeResult
+from rosproxy.telemetry.text import listed
 
+MOST_NAMED = 3
+"""Node names of one endpoint that a message gives: one as a rule, several where a port was used
+again by another node."""
 STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "unverified")
 
 
@@ -212,12 +216,12 @@ class Endpoint:
     @property
     def label(self) -> str:
         """How messages name this endpoint: node name and own URI."""
-        return f"{', '.join(self.caller_ids) or 'unnamed node'} ({self.uri})"
+        return f"{listed(self.caller_ids, MOST_NAMED) or 'unnamed node'} ({self.uri})"
 
     @property
     def log_fields(self) -> dict[str, str | int]:
         """What a log entry about it has as fields, to be given as ``extra``."""
-        return {"node": ", ".join(self.caller_ids), "port": self.port}
+        return {"node": listed(self.caller_ids, MOST_NAMED), "port": self.port}
 
     def names(self, kind: Kind) -> list[str]:
         """The topics, services or parameters registered as ``kind``."""

@@ -4,6 +4,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rosproxy_operator.cli import main
+from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.settings import DEFAULT_ADMIN, make_plan_settings
 
@@ -78,6 +79,14 @@ def test_once_is_for_the_controller_itself() -> None:
     result = run("docker", "--once", "status")
     assert result.exit_code == 2
     assert "--once has no meaning for status" in result.stderr
+
+
+def test_a_problem_with_an_odd_name_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Problem("container a\nforged", "\x1b[2J is no port")]
+    monkeypatch.setattr("rosproxy_operator.docker.controller.run_once", lambda *_: found)
+    result = run("docker", "--once")
+    assert result.exit_code == 1
+    assert result.stderr == "rosproxy-operator: container a\\nforged: \\x1b[2J is no port\n"
 
 
 def test_health_of_a_controller_that_is_not_there() -> None:

@@ -1,0 +1,35 @@
+"""Problems: the newest are kept, and no text of others makes them large."""
+
+from rosproxy.telemetry.problems import LONGEST_SUBJECT, LONGEST_TEXT, MOST, Problems
+
+
+def test_only_the_newest_are_kept() -> None:
+    problems = Problems()
+    for number in range(MOST + 10):
+        problems.add(f"/n{number}", "gone")
+    assert [p.subject for p in problems.all()] == [f"/n{n}" for n in range(10, MOST + 10)]
+
+
+def test_the_same_again_replaces_the_older_one() -> None:
+    problems = Problems()
+    for text in ("gone", "deaf", "gone"):
+        problems.add("/a", text)
+    assert [p.text for p in problems.all()] == ["deaf", "gone"]
+
+
+def test_texts_of_any_size_are_short_and_harmless() -> None:
+    problems = Problems()
+    problems.add("/a\n" + "x" * 8_000_000, "y" * 8_000_000 + "\x1b[2J", port=5)
+    (one,) = problems.at(5)
+    assert (len(one.subject), len(one.text)) == (LONGEST_SUBJECT, LONGEST_TEXT)
+    assert one.subject.startswith("/a\\nx")
+    assert one.text.endswith("y\\x1b[2J")
+
+
+def test_what_was_noted_of_a_long_name_is_forgotten_when_it_is_solved() -> None:
+    problems, name = Problems(), "/" + "x" * 8000
+    problems.add(name, "gone")
+    problems.add("/b", "gone", port=7)
+    problems.solved(name)
+    problems.solved_at(7)
+    assert problems.all() == []
