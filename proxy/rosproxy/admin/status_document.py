@@ -4,7 +4,8 @@
 it with `parse_status` (text of an answer) or `read_status` (decoded JSON). It is made of what ROS
 nodes say of themselves and may come from another version of the proxy. So reading is tolerant:
 unknown keys are ignored, what is missing or of another type is as its default says, and an item of
-a list that is no such item is left out. No text and no list is bounded, and texts may hold control
+a list that is no such item is left out. The proxy bounds texts and lists by what it admits
+(`rosproxy.ros1.protocol.bounds`), but another version may not, and texts may hold control
 characters: `rosproxy.telemetry.text` makes them fit to be shown.
 
 Times are in seconds, rates in bytes per second; ``sent`` is what went outside.

@@ -64,6 +64,8 @@ class Metrics:
         self.cleanups = counter("cleanups", gone)
         refused = "Registrations refused because no port was left."
         self.exhausted = counter("range_exhausted", refused)
+        bounds = "Requests and connections refused because they were over a bound."
+        self.refused = counter("refused", bounds, "reason")
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
             "Time for a call of the proxy's own to the master.",

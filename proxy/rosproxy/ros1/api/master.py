@@ -6,21 +6,26 @@ addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All 
 they are.
 """
 
+import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.bounds import too_long_to_register
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Admission, MasterReply, Request
+from rosproxy.ros1.rewriting.master_api import Admission, MasterReply, Refusal, Request
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.recovery import Recovery
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, eq=False)
@@ -78,7 +83,7 @@ class MasterApi:
         admissions: list[Admission] = []
         try:
             for call in request.calls:  # one after the other: they may register the same new node
-                admission = await self._admission.admit(call, request.asker) if call else None
+                admission = await self._admit(call, request.asker) if call else None
                 admissions.append(admission)
                 if isinstance(admission, Endpoint):
                     admission.hold()
@@ -88,6 +93,26 @@ class MasterApi:
             for admission in admissions:
                 if isinstance(admission, Endpoint):
                     admission.release()
+
+    async def _admit(self, call: Call, asker: Asker) -> Admission:
+        """What becomes of one call; what is too long, or one too many, is refused."""
+        if text := too_long_to_register(call):
+            return self._refuse("long_name", call, asker, text)
+        admission = await self._admission.admit(call, asker)
+        if isinstance(admission, Endpoint) and (text := admission.full):
+            return self._refuse("too_many_names", call, asker, text)
+        return admission
+
+    def _refuse(self, reason: str, call: Call, asker: Asker, text: str) -> Refusal:
+        """Refuse a call that is over a bound, and tell of it: of the last one for each reason."""
+        self._context.metrics.refused.labels(reason).inc()
+        subject = f"refused: {reason.replace('_', ' ')}"
+        self._context.problems.solved(subject)
+        self._context.problems.add(subject, f"from {asker.address}: {text}")
+        log.warning(
+            "%s: %s of %s is refused: %s", asker.address, call.method, asker.caller_id, text
+        )
+        return Refusal(f"rosproxy: {text}")
 
     def _note(self, reply: MasterReply, source: str) -> None:
         """Take in what the master accepted.

@@ -15,6 +15,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.bounds import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall
@@ -99,6 +100,9 @@ class SlaveApi:
         if not await self._may(parsed.method, call.source):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+        if too_long := too_long_to_ask(parsed):
+            self._context.metrics.count("slave", parsed.method, "refused")
+            return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
         reply = self._forward(endpoint, parsed, body, call)
         return await counted(self._context.metrics, "slave", parsed.method, reply)
 

@@ -23,6 +23,8 @@ from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, read_state
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.problems import LONGEST_TEXT
+from rosproxy.telemetry.text import brief
 
 CALLER_ID = "/rosproxy"
 """The node name under which the proxy itself calls."""
@@ -201,10 +203,8 @@ def _value(method: str, reply: Any) -> Any:
     match reply:
         case [1, _, value]:
             return value
-        case [_, str(message), _]:
-            raise MasterError(f"{method}: {message}")
-        case {"faultString": str(message)}:
-            raise MasterError(f"{method}: {message}")
+        case [_, str(message), _] | {"faultString": str(message)}:
+            raise MasterError(f"{method}: {brief(message, LONGEST_TEXT)}")
     raise MasterError(f"{method}: not a ROS status triple")
 
 

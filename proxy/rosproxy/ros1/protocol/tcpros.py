@@ -10,6 +10,8 @@ from collections.abc import Mapping
 MAX_HEADER = 1_000_000
 """Longest header in bytes that is read. A header holds a message definition at most; roscpp's own
 bound is 10^9 (connection.cpp), rospy has none."""
+MAX_FIELDS = 64
+"""Most fields of a header that are read; roscpp and rospy send nine at most."""
 
 _LENGTH = struct.Struct("<I")
 
@@ -28,10 +30,13 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 def decode_header(body: bytes) -> dict[str, str]:
     """The fields of a header, given without its leading total length.
 
-    Raises HeaderError if a field's length leads outside the body or a field has no ``=``.
+    Raises HeaderError if a field's length leads outside the body, a field has no ``=`` or there are
+    more than MAX_FIELDS.
     """
-    fields, position = {}, 0
+    fields, position = dict[str, str](), 0
     while position < len(body):
+        if len(fields) == MAX_FIELDS:
+            raise HeaderError(f"connection header of more than {MAX_FIELDS} fields")
         start = position + 4
         if start > len(body):
             raise HeaderError("connection header ends inside a field's length")

@@ -14,6 +14,10 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort, cached, is_address, parse_authority, parse_host_port
 
+LONGEST_URI = 2048
+"""Characters of a URI at most: a host's name has 253 at most, and it stands twice in an advertised
+URI. What is longer is no URI to the proxy: it is neither rewritten nor remembered."""
+
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
@@ -31,12 +35,12 @@ class InsidePath(msgspec.Struct, frozen=True):
 
 def parse_slave_uri(uri: str) -> HostPort | None:
     """Host and port of an ``http://host:port/…`` URI, or None if it is no such URI."""
-    return parse_authority(uri) if uri.startswith("http://") else None
+    return parse_authority(uri) if uri.startswith("http://") and _fits(uri) else None
 
 
 def parse_service_uri(uri: str) -> HostPort | None:
     """Host and port of a ``rosrpc://host:port`` URI, or None if it is no such URI."""
-    return parse_authority(uri) if uri.startswith("rosrpc://") else None
+    return parse_authority(uri) if uri.startswith("rosrpc://") and _fits(uri) else None
 
 
 def slave_uri(where: HostPort, path: str = "/") -> str:
@@ -61,6 +65,8 @@ def parse_inside_path(uri: str) -> InsidePath | None:
 
     An address segment must be an IP address; a name there is refused.
     """
+    if not _fits(uri):
+        return None
     try:
         parts = [unquote(part) for part in urlsplit(uri).path.strip("/").split("/")]
     except ValueError:
@@ -69,6 +75,10 @@ def parse_inside_path(uri: str) -> InsidePath | None:
     if node is None or len(parts) > 2 or (len(parts) == 2 and not is_address(parts[1])):
         return None
     return InsidePath(node, parts[1] if len(parts) == 2 else None)
+
+
+def _fits(uri: str) -> bool:
+    return len(uri) <= LONGEST_URI
 
 
 def _quoted(text: str) -> str:

@@ -8,6 +8,14 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
 
+MOST_REGISTRATIONS = 10_000
+"""Registrations of one endpoint. A node for each topic of a thousand nodes, as ``rosbag record
+-a``, has some thousands; a usual one has ten."""
+MOST_CHARACTERS = 2_000_000
+"""Characters of all names and types that are registered for one endpoint. Those of 10,000 topics of
+a large system are 1,000,000."""
+LONGEST_REGISTRATION = 8192
+"""Characters of one registration: three names and a URI, the topic's name with its namespace."""
 MOST_NAMED = 3
 """Node names of one endpoint that a message gives: one as a rule, several where a port was used
 again by another node."""
@@ -50,12 +58,19 @@ class Registration:
         """What tells registrations apart at the master."""
         return self.kind, self.name, self.caller_id
 
+    @property
+    def characters(self) -> int:
+        """How long its texts are together."""
+        texts = self.name, self.caller_id, self.type, self.service_api or ""
+        return sum(map(len, texts))
+
 
 @dataclass(slots=True, eq=False)
 class Endpoint:
     """An inside slave URI and the port that stands for it outside.
 
-    ``callers`` are the nodes' names with the number of their registrations, which `Registry` keeps.
+    ``callers`` are the nodes' names with the number of their registrations, and ``characters`` is
+    how long these are together; `Registry` keeps both.
     It is plain state: who learns something of the node tells it by the methods (``note_…``), and
     `Registry` keeps what it is found by.
 
@@ -79,6 +94,7 @@ class Endpoint:
     port: int
     registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
     callers: dict[str, int] = field(default_factory=dict)
+    characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
     tcpros_port: int | None = None
     connections: int = 0
@@ -245,6 +261,17 @@ class Endpoint:
     def fast_connections(self) -> int:
         """How many connections the kernel forwards now."""
         return sum(self.fast_peers.values())
+
+    @property
+    def full(self) -> str | None:
+        """Why nothing more is registered here; None if something may be."""
+        for count, most, what in (
+            (len(self.registrations), MOST_REGISTRATIONS, "registrations"),
+            (self.characters, MOST_CHARACTERS, "characters of registered names"),
+        ):
+            if count >= most:
+                return f"the node at {self.uri} has {count} {what}, at most {most} are accepted"
+        return None
 
     @property
     def unused(self) -> bool:

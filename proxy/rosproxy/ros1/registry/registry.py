@@ -10,7 +10,7 @@ from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import LONGEST_REGISTRATION, Endpoint, Place, Registration
 
 
 class RangeExhausted(Exception):
@@ -120,8 +120,13 @@ class Registry:
         """Note what the master has accepted.
 
         As the master does, a service has one provider, and a name that registers from another
-        URI loses all that it had at the old one (rosmaster/registrations.py).
+        URI loses all that it had at the old one (rosmaster/registrations.py). What is over a bound
+        is left out: a node that registers it is refused before; what is read from the master or
+        from a node may be anything.
         """
+        former = endpoint.registrations.get(held.key)
+        if held.characters > LONGEST_REGISTRATION or (endpoint.full and former is None):
+            return
         other = self.by_caller.get(held.caller_id)
         if other and other is not endpoint:
             self.drop_caller(other, held.caller_id)
@@ -132,6 +137,7 @@ class Registry:
             self.services[held.name] = (endpoint, held)
         if held.key not in endpoint.registrations:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
+        endpoint.characters += held.characters - (former.characters if former else 0)
         endpoint.registrations[held.key] = held
         self.by_caller[held.caller_id] = endpoint
         endpoint.note_used()
@@ -222,8 +228,10 @@ class Registry:
             del self._by_uri[endpoint.uri]
 
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
-        if endpoint.registrations.pop(key, None) is None:
+        held = endpoint.registrations.pop(key, None)
+        if held is None:
             return
+        endpoint.characters -= held.characters
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self.services.pop(name, None)

@@ -14,6 +14,7 @@ from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.bounds import too_long_to_connect
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
@@ -61,6 +62,8 @@ class TcprosServer:
         try:
             header = await _read_header(conn)
             fields = decode_header(header[4:])
+            if too_long := too_long_to_connect(fields):
+                raise HeaderError(too_long)
         except HeaderError as error:
             reply = encode_header({"error": f"rosproxy: {error}"})
             await asyncio.get_running_loop().sock_sendall(conn, reply)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.tcpros import (
+    MAX_FIELDS,
     MAX_HEADER,
     HeaderError,
     decode_header,
@@ -158,3 +159,10 @@ def test_what_looks_like_http_is_no_header_that_is_read(first: bytes) -> None:
 def test_a_longer_header_is_refused() -> None:
     with pytest.raises(HeaderError, match="1000001"):
         header_length(struct.pack("<I", MAX_HEADER + 1))
+
+
+def test_a_header_of_more_fields_than_anybody_sends_is_refused() -> None:
+    fields = {f"f{n}": "" for n in range(MAX_FIELDS)}
+    assert decode_header(encode_header(fields)[4:]) == fields
+    with pytest.raises(HeaderError, match="more than"):
+        decode_header(encode_header({**fields, "one": "more"})[4:])

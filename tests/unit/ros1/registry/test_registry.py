@@ -6,7 +6,14 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import (
+    LONGEST_REGISTRATION,
+    MOST_CHARACTERS,
+    MOST_REGISTRATIONS,
+    Endpoint,
+    Place,
+    Registration,
+)
 from rosproxy.ros1.registry.health import Health
 from rosproxy.ros1.registry.registry import RangeExhausted, Registry
 from tests.unit.builders import own_uri
@@ -359,3 +366,45 @@ def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
     assert registry.move(places) == []
     assert [e.place.address for e in (one, holder, third)] == ["10.0.0.5", "10.0.0.6", "10.0.0.7"]
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is one
+
+
+def test_an_endpoint_has_so_many_registrations_at_most() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for number in range(MOST_REGISTRATIONS + 10):
+        register(registry, endpoint, PUB, f"/t{number}")
+    assert len(endpoint.registrations) == endpoint.callers["/node"] == MOST_REGISTRATIONS
+    assert "10000 registrations, at most 10000" in (endpoint.full or "")
+    held = Registration(PUB, "/t0", "/node", "std_msgs/String")
+    registry.register(endpoint, held)
+    assert endpoint.registrations[held.key] is held
+    registry.unregister(PUB, "/t0", "/node")
+    assert endpoint.full is None
+
+
+def test_an_endpoint_has_so_many_characters_of_names_at_most() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for number in range(2 * MOST_CHARACTERS // 1000):
+        register(registry, endpoint, SRV, f"/{number}".ljust(1000, "x"), "/node")
+    assert MOST_CHARACTERS <= endpoint.characters < MOST_CHARACTERS + 1100
+    assert "characters of registered names" in (endpoint.full or "")
+    registry.drop_caller(endpoint, "/node")
+    assert (endpoint.characters, endpoint.full) == (0, None)
+
+
+def test_a_registration_that_is_too_long_is_not_kept() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    register(registry, endpoint, PUB, "/" + "x" * LONGEST_REGISTRATION)
+    assert not endpoint.registrations
+    assert not registry.by_caller
+
+
+def test_an_endpoint_of_many_nodes_has_a_short_label() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for number in range(1000):
+        register(registry, endpoint, PUB, "/t", f"/n{number}")
+    assert endpoint.label == "/n0, /n1, /n10 and 997 more (http://10.0.0.5:40001/)"
+    assert endpoint.log_fields["node"] == "/n0, /n1, /n10 and 997 more"
