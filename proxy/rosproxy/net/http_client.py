@@ -30,14 +30,18 @@ class HttpClient:
     """Calls one kind of peer.
 
     ``headers`` are sent with each call. A connection that is not used for ``keepalive`` seconds is
-    closed; there are never more than ``most`` in use. ``last`` is the address reached last.
+    closed; there are never more than ``most`` in use. ``source`` is who gives the peers' names (see
+    `resolver`). ``last`` is the address reached last.
     """
 
-    def __init__(self, headers: Mapping[str, str], keepalive: float, most: int) -> None:
+    def __init__(
+        self, headers: Mapping[str, str], keepalive: float, most: int, source: str = ""
+    ) -> None:
         self.last: str | None = None
         lines = {"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers}
         self._headers = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
         self._keepalive, self._limit = keepalive, asyncio.Semaphore(most)
+        self._source = source
         self._idle: dict[HostPort, list[tuple[float, ResponseHandler]]] = {}
         self._used: set[ResponseHandler] = set()
         self._sweeper: asyncio.TimerHandle | None = None
@@ -103,7 +107,7 @@ class HttpClient:
             raise ConnectionAbortedError("the proxy is stopping")
         loop = asyncio.get_running_loop()
         failure = OSError(None, f"host name {where.host} can't be resolved")
-        for address in await resolver.resolve(where.host):
+        for address in await resolver.resolve(where.host, self._source):
             try:
                 sock = await dial(HostPort(address, where.port), CONNECT_TIMEOUT)
             except OSError as error:

@@ -2,28 +2,45 @@
 
 ``getaddrinfo`` can't be stopped and may take 40 s. It runs in daemon threads, one per name at most,
 so that look-ups that hang block neither other names nor the end of the process.
+
+Threads are bounded, and nodes choose names: who gives names whose name server hangs, one after the
+other, would use up all threads. So a look-up is counted for whoever gave the name, its ``source``,
+who has a few at a time; and some are left for names of the proxy's own, as the master's.
 """
 
 import asyncio
+import logging
 import socket
 import threading
 from concurrent.futures import Future
 
 from rosproxy.net.addresses import is_address, plain_address
 
+log = logging.getLogger(__name__)
+
 RESOLVE_TIMEOUT = 1.0
 """Seconds after which a name counts as unresolvable."""
 MOST_LOOKUPS = 64
 """Look-ups that may be under way at once; beyond that names count as unresolvable."""
+MOST_FOR_OTHERS, MOST_FOR_ONE = 56, 8
+"""Of these, how many of names that others gave, and that one of them gave: the nodes of one machine
+give its name."""
+NODES, MOST_FOR_NODES = "nodes", 32
+"""The source of names that the master has of nodes, since it does not say who gave them; and how
+many: they are as many as there are machines, and come all at once."""
 
-_running: dict[str, Future[list[str]]] = {}
+_running: dict[str, tuple[str, Future[list[str]]]] = {}
+"""The look-ups under way, each with its source; an entry ends when its thread does."""
 
 
-async def resolve(host: str) -> list[str]:
-    """The addresses of a host name, IPv4 first; empty if it can't be resolved in time."""
+async def resolve(host: str, source: str = "") -> list[str]:
+    """The addresses of a host name, IPv4 first; empty if it can't be resolved in time.
+
+    ``source`` is who gave the name: an address, or NODES; empty for the proxy's own names.
+    """
     if is_address(host):
         return [plain_address(host)]
-    lookup = _running.get(host) or _start(host)
+    _, lookup = _running.get(host) or ("", _start(host, source))
     try:
         async with asyncio.timeout(RESOLVE_TIMEOUT):
             return await asyncio.shield(asyncio.wrap_future(lookup))
@@ -31,21 +48,42 @@ async def resolve(host: str) -> list[str]:
         return []
 
 
-def _start(host: str) -> Future[list[str]]:
+def _start(host: str, source: str) -> Future[list[str]]:
     lookup: Future[list[str]] = Future()
-    if len(_running) >= MOST_LOOKUPS:
+    if not _may_start(source):
+        who = source or "the proxy"
+        log.warning("%s has too many look-ups under way; %s counts as unresolvable", who, host)
         lookup.set_result([])
         return lookup
-    _running[host] = lookup
-    threading.Thread(target=_look_up, args=(host, lookup), daemon=True).start()
+    _running[host] = source, lookup
+    try:
+        threading.Thread(target=_look_up, args=(host, lookup), daemon=True).start()
+    except RuntimeError as error:  # the process or the machine has no thread left
+        log.warning("%s can't be looked up: %s", host, error)
+        _end(host, lookup, [])
     return lookup
 
 
+def _may_start(source: str) -> bool:
+    """Whether there is a thread for one more look-up of a source's."""
+    sources = [source for source, _ in list(_running.values())]  # threads end at any time
+    if not source:
+        return len(sources) < MOST_LOOKUPS
+    most = MOST_FOR_NODES if source == NODES else MOST_FOR_ONE
+    return sum(map(bool, sources)) < MOST_FOR_OTHERS and sources.count(source) < most
+
+
 def _look_up(host: str, lookup: "Future[list[str]]") -> None:
+    addresses: list[str] = []
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-        addresses = dict.fromkeys(plain_address(str(info[4][0])) for info in found)
-    except (OSError, UnicodeError):
-        addresses = {}
+        addresses = list(dict.fromkeys(plain_address(str(info[4][0])) for info in found))
+    except (OSError, ValueError):  # not to be found; nothing that could be (UnicodeError is one)
+        pass
+    finally:
+        _end(host, lookup, addresses)
+
+
+def _end(host: str, lookup: "Future[list[str]]", addresses: list[str]) -> None:
     del _running[host]
     lookup.set_result(sorted(addresses, key=lambda address: ":" in address))

@@ -259,7 +259,7 @@ async def test_nothing_happens_without_need(
     options: dict[str, Any],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def resolve(host: str) -> list[str]:
+    async def resolve(host: str, source: str) -> list[str]:
         return [MASTER]
 
     monkeypatch.setattr("rosproxy.net.resolver.resolve", resolve)

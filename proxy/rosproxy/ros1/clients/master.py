@@ -17,7 +17,7 @@ import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.net.http_client import HttpClient
-from rosproxy.net.resolver import resolve
+from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, read_state
@@ -77,7 +77,8 @@ class MasterClient:
         self._master_path, self._netloc = parts.path or "/", parts.netloc
         self._master_where = HostPort(parts.hostname or "", parts.port or 80)
         self._master = HttpClient({LOOP_HEADER: instance}, MASTER_KEEPALIVE, MASTER_CONNECTIONS)
-        self._nodes = HttpClient({LOOP_HEADER: f"{instance} node"}, NODE_KEEPALIVE, 10_000)
+        node_headers = {LOOP_HEADER: f"{instance} node"}
+        self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, 10_000, NODES)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -187,7 +188,7 @@ def _unreachable(who: str, error: BaseException) -> Unreachable:
     elif isinstance(error, OSError) and error.strerror:
         reason = error.strerror.lower()
     else:
-        reason = str(error) or type(error).__name__
+        reason = brief(error, LONGEST_TEXT) or type(error).__name__
     return Unreachable(f"{who}: {reason}", refused)
 
 

@@ -93,7 +93,7 @@ class NodeAdmission:
 
     async def _place(self, node: HostPort, source: str) -> Place:
         """Where a node is that gives ``node`` as its address and registers from ``source``."""
-        addresses = await resolve(self._context.upstream.reach(node).host)
+        addresses = await resolve(self._context.upstream.reach(node).host, source)
         elsewhere = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not elsewhere:
             return Place(source, named=source in addresses)

@@ -159,7 +159,8 @@ class Adopter:
         """
         uri = nodes[0].uri
         own = parse_slave_uri(uri) or place
-        named = place.host in await resolve(self._context.upstream.reach(own).host)
+        host = self._context.upstream.reach(own).host
+        named = place.host in await resolve(host, place.host)
         asker = Asker(place.host, "", nodes[0].caller_id)
         where = Place(place.host, named, confirmed=False)
         endpoint = self._admission.take_in(uri, own, where, asker)

@@ -159,7 +159,8 @@ class Recovery:
         endpoint.note_verified(info.pid, info.tcpros_port)
         self._leases.open(endpoint)
         address = endpoint.place.address
-        addresses = await resolve(self._context.upstream.reach(endpoint.node).host)
+        host = self._context.upstream.reach(endpoint.node).host
+        addresses = await resolve(host, address)
         if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
         await self._registrar.register_missing(endpoint, info)

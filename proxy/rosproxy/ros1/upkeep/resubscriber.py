@@ -19,7 +19,7 @@ import logging
 from collections.abc import Iterable, Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.net.resolver import resolve
+from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -165,7 +165,7 @@ class Resubscriber:
         async def find(uri: str) -> list[str]:
             endpoint = self._context.addressing.stands_for(uri)
             where = endpoint.slave if endpoint else parse_slave_uri(uri)
-            return await resolve(self._context.upstream.reach(where).host) if where else []
+            return await resolve(self._context.upstream.reach(where).host, NODES) if where else []
 
         nodes = sorted({one.caller_id for one in left if one.endpoint.fast_peers})
         found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
