@@ -22,19 +22,26 @@ RUN if ! python3 -c 'import ensurepip' 2>/dev/null; then \
 # Two environments: one with pip, that stays here, and the one that is shipped.
 RUN python3 -m venv /opt/build && python3 -m venv --without-pip /opt/rosproxy
 WORKDIR /src
-# PIP_CONSTRAINT and not --constraint: it pins the build backend too.
-ENV PIP_CONSTRAINT=/src/constraints.txt
+# Of what others made only wheels are taken, and only those whose hashes are in constraints.txt. What
+# builds rosproxy stays here, with pip.
+ENV PIP_NO_CACHE_DIR=1
 COPY pyproject.toml constraints.txt README.md LICENSE ./
-COPY proxy proxy
+COPY scripts/pins.py scripts/
+RUN python3 scripts/pins.py build-system > pins.txt \
+    && /opt/build/bin/pip install --only-binary :all: --require-hashes --requirement pins.txt
 
 
 FROM builder AS proxy-builder
 # Extras to install besides the proxy itself, for example: --build-arg EXTRAS=uvloop
 ARG EXTRAS=""
+RUN python3 scripts/pins.py "$EXTRAS" > pins.txt \
+    && /opt/build/bin/pip --python /opt/rosproxy/bin/python install --compile \
+         --only-binary :all: --require-hashes --requirement pins.txt
 # Without operator/: a change of the operator makes no other proxy image, so it replaces no
 # proxy. What is left of it is the name of a program.
-RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
-      ".${EXTRAS:+[$EXTRAS]}" \
+COPY proxy proxy
+RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /wheels . \
+    && /opt/build/bin/pip --python /opt/rosproxy/bin/python install --compile --no-deps /wheels/*.whl \
     && rm /opt/rosproxy/bin/rosproxy-operator
 # rich needs these to colour source code and to show Markdown, and we show neither: 11 MB.
 RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python uninstall --yes \
@@ -74,9 +81,13 @@ CMD ["run"]
 FROM builder AS operator-builder
 # Which engines: docker, kubernetes, or operator for both.
 ARG OPERATOR_EXTRAS=operator
+RUN python3 scripts/pins.py "$OPERATOR_EXTRAS" > pins.txt \
+    && /opt/build/bin/pip --python /opt/rosproxy/bin/python install --compile \
+         --only-binary :all: --require-hashes --requirement pins.txt
+COPY proxy proxy
 COPY operator operator
-RUN /opt/build/bin/pip --python /opt/rosproxy/bin/python install --no-cache-dir --compile \
-      ".[$OPERATOR_EXTRAS]"
+RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /wheels . \
+    && /opt/build/bin/pip --python /opt/rosproxy/bin/python install --compile --no-deps /wheels/*.whl
 
 
 FROM base AS operator

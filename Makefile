@@ -19,11 +19,11 @@ LAYERS ?=
 BENCH ?=
 SOURCES := proxy operator examples tests scripts
 
-$(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh
+$(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh scripts/pins.py
 	@scripts/venv.sh $(VENV)
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh
+$(VENV)/.dev: pyproject.toml constraints.txt scripts/venv.sh scripts/pins.py
 	@scripts/venv.sh $(VENV) dev,uvloop,operator
 	@touch $(VENV)/.runtime $@
 

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Pin everything that CI and the image install: a fresh environment, frozen.
+# Pin everything that CI and the images install, for each Python that rosproxy runs on, with the
+# hashes of all files of each version.
 #   scripts/lock.sh constraints.txt
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -8,14 +9,17 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 "${PYTHON:-python3}" -m venv "$work/venv"
-pip=("$work/venv/bin/python" -m pip --disable-pip-version-check)
-# The build backend is pinned with the rest, so that an image built later is the same image.
-"${pip[@]}" install --quiet --upgrade '.[bench,dev,operator,uvloop]' hatchling
+"$work/venv/bin/python" -m pip --disable-pip-version-check install --quiet uv
 {
   echo "# Written by \`make lock\`. Versions that the tests ran with; pyproject.toml has the floors."
-  "${pip[@]}" freeze --exclude rosproxy --exclude-editable
+  # The build backend is pinned with the rest, so that an image built later is the same image.
+  "$work/venv/bin/python" -c 'import tomllib
+with open("pyproject.toml", "rb") as project:
+    print(*tomllib.load(project)["build-system"]["requires"], sep="\n")' |
+    "$work/venv/bin/uv" pip compile --quiet --no-header --universal --fork-strategy fewest \
+      --python-version 3.11 --generate-hashes --all-extras pyproject.toml -
 } >"$work/constraints.txt"
-if grep -n '@\|://' "$work/constraints.txt"; then
+if grep -n ' @ \|://' "$work/constraints.txt"; then
   echo "a pin names a place instead of a version" >&2
   exit 1
 fi

@@ -43,10 +43,14 @@ make_venv() {
 }
 
 directory=$1
-extras=${2:+[$2]}
 if ! recent "$directory/bin/python" || ! "$directory/bin/python" -m pip --version >/dev/null 2>&1; then
   python=$(find_python)
   make_venv "$python" "$directory"
 fi
-"$directory/bin/python" -m pip install --quiet --disable-pip-version-check \
-  --constraint constraints.txt --editable ".$extras"
+pins=$(mktemp)
+trap 'rm -f "$pins"' EXIT
+"$directory/bin/python" scripts/pins.py "build-system,${2:-}" >"$pins"
+install=("$directory/bin/python" -m pip install --quiet --disable-pip-version-check)
+# Wheels only: an archive of sources would run its own code, with whatever that needs unpinned.
+"${install[@]}" --only-binary :all: --require-hashes --requirement "$pins"
+"${install[@]}" --no-deps --no-build-isolation --editable .

@@ -1,0 +1,87 @@
+"""The pins of what rosproxy needs with some extras, hashes and all: a requirements file for pip.
+
+    python scripts/pins.py [EXTRA,EXTRA...]
+
+``build-system`` is an extra here, too: what builds rosproxy itself. All pins are in
+constraints.txt (``make lock``), each with who needs it in its ``# via`` lines; pyproject.toml says
+what rosproxy and its extras need. pip can't take the pins as constraints: where it checks hashes,
+it wants them from requirements.
+"""
+
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_VIA = re.compile(r"#\s+(?:via\s*)?(.*)")
+
+
+class Pin(NamedTuple):
+    """A pinned project: its name, its lines, and who needs it."""
+
+    name: str
+    text: str
+    via: frozenset[str]
+
+
+def pins(extras: Iterable[str]) -> list[Pin]:
+    """The pins of rosproxy's requirements with some extras, and of whatever these need.
+
+    Raises KeyError if there is no such extra, LookupError if a requirement has no pin.
+    """
+    every = list(_read((ROOT / "constraints.txt").read_text()))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    wanted = {name for extra in ("", *extras) for name in _required(project, extra)}
+    missing = wanted - {pin.name for pin in every}
+    if missing:
+        raise LookupError(f"constraints.txt has no {', '.join(sorted(missing))}: make lock")
+    grown: set[str] = set()
+    while grown != wanted:
+        grown = set(wanted)
+        wanted |= {pin.name for pin in every if pin.via & grown}
+    return [pin for pin in every if pin.name in wanted]
+
+
+def _required(project: dict, extra: str) -> Iterator[str]:  # type: ignore[type-arg]
+    """The names that rosproxy itself (no extra) or one of its extras requires."""
+    if extra == "build-system":
+        requirements = project["build-system"]["requires"]
+    elif extra:
+        requirements = project["project"]["optional-dependencies"][extra]
+    else:
+        requirements = project["project"]["dependencies"]
+    for requirement in requirements:
+        own = re.match(r"rosproxy\[([^\]]*)\]", requirement)
+        if own:
+            for other in own[1].split(","):
+                yield from _required(project, other.strip())
+        else:
+            yield _name(requirement)
+
+
+def _read(text: str) -> Iterator[Pin]:
+    """The pins of a file that ``uv pip compile`` or ``pip-compile`` has written."""
+    for block in re.split(r"^(?=[A-Za-z0-9])", text, flags=re.M):
+        if not _NAME.match(block):
+            continue  # the heading
+        lines = block.splitlines()
+        comments = [found[1] for line in lines if (found := _VIA.match(line.strip()))]
+        via = frozenset(_name(comment) for comment in comments if _NAME.match(comment))
+        pinned = "\n".join(line for line in lines if not line.lstrip().startswith("#"))
+        yield Pin(_name(block), pinned.rstrip(), via)
+
+
+def _name(text: str) -> str:
+    """The name that a requirement begins with, as indexes compare names (PEP 503)."""
+    found = _NAME.match(text)
+    return re.sub(r"[-_.]+", "-", found[0]).lower() if found else ""
+
+
+if __name__ == "__main__":
+    for one in pins(filter(None, ",".join(sys.argv[1:]).split(","))):
+        print(one.text)
