@@ -101,3 +101,10 @@ def test_adds_little_to_its_base(proxy_image: str) -> None:
 def test_ships_no_installer(proxy_image: str) -> None:
     listing = ("--entrypoint", "ls", proxy_image, "/opt/rosproxy/bin")
     assert "pip" not in docker("run", "--rm", *listing).split()
+
+
+@pytest.mark.parametrize("image", ["proxy_image", "controller_image"])
+def test_no_program_changes_its_user_or_group(image: str, request: pytest.FixtureRequest) -> None:
+    search = ("--user", "0:0", "--entrypoint", "find", request.getfixturevalue(image), "/")
+    found = docker("run", "--rm", *search, "-xdev", "-perm", "/6000", "-type", "f")
+    assert found.split() == []
