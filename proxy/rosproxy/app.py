@@ -91,8 +91,8 @@ class App:
             "/master-address": self._set_master_address,
             "/retire": self._retire,
         }
-        metrics, token = context.metrics.registry, settings.admin_token
-        self._admin = AdminServer(metrics, self.status, self._unready, actions, token)
+        metrics, token_hash = context.metrics.registry, settings.token_hash
+        self._admin = AdminServer(metrics, self.status, self._unready, actions, token_hash)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""

@@ -5,6 +5,7 @@ and raises ValueError with what is wrong and an example. `make_settings` puts va
 raises SettingError where they don't go together.
 """
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ DataPlane = Literal["auto", "kernel", "splice", "copy"]
 _Value = TypeVar("_Value")
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
 _TOKEN = re.compile(r"[!-~]{8,200}")
+_HASH = re.compile(r"[0-9a-f]{64}")
 _LONGEST = 40
 """Characters of a bad value that a message repeats."""
 
@@ -40,8 +42,9 @@ class Settings:
 
     ``inside_networks`` empty means: the networks of the proxy's own interfaces.
     ``master_address``: the IP address of the master's host where the proxy can't resolve its name
-    or would find itself. ``admin_token``: what callers that are not on loopback must know.
-    Raises SettingError if two of them want the same port.
+    or would find itself. ``admin_token``: what callers that are not on loopback must know, or
+    ``admin_token_hash``: its SHA-256 in hex digits, for a proxy that is not to hold the token.
+    Raises SettingError if two of them want the same port, or both a token and a hash are given.
     """
 
     master_uri: str
@@ -61,8 +64,11 @@ class Settings:
     data_plane: DataPlane = "auto"
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
+    admin_token_hash: str | None = None
 
     def __post_init__(self) -> None:
+        if self.admin_token and self.admin_token_hash:
+            raise SettingError("--admin-token-hash", "goes instead of --admin-token, not with it")
         taken: dict[int, str] = {}
         for option, port in (
             ("--master-port", self.master_port),
@@ -78,6 +84,19 @@ class Settings:
                 text = f"port {port} is that of {taken[port]}; move one of them"
                 raise SettingError(option, text)
             taken[port] = option
+
+    @property
+    def token_hash(self) -> str | None:
+        """The hash of what callers that are not on loopback must know; None: they may do nothing.
+
+        It is that of the token where that was given: the admin endpoint holds a hash in any case.
+        """
+        return hash_token(self.admin_token) if self.admin_token else self.admin_token_hash
+
+
+def hash_token(token: str) -> str:
+    """The SHA-256 of a token, in 64 hex digits, as ``--admin-token-hash`` takes it."""
+    return hashlib.sha256(token.encode()).hexdigest()
 
 
 def make_settings(
@@ -175,6 +194,16 @@ def read_token(text: str) -> str | None:
             "openssl rand -hex 16"
         )
     return text or None
+
+
+def read_token_hash(text: str) -> str | None:
+    """A SHA-256 in hex digits, in lower case; None for no text. Raises ValueError."""
+    digits = text.strip().lower()
+    if digits and not _HASH.fullmatch(digits):
+        raise ValueError(
+            'must be the 64 hex digits of a SHA-256: printf %s "$TOKEN" | sha256sum gives them'
+        )
+    return digits or None
 
 
 def parse_range(option: str, text: str) -> PortRange:

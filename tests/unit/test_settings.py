@@ -18,6 +18,9 @@ GIVEN: dict[str, Any] = {
     "port_range": "45000-45099",
 }
 
+HASH = "9f9f5111f7b27a781f1f1ddde5ebc2dd2b796bfc7365c9c28b548e564176929f"
+"""``printf %s 0123456789abcdef | sha256sum``"""
+
 
 def test_the_defaults() -> None:
     settings = parse_settings(GIVEN)
@@ -61,6 +64,10 @@ GOOD = [
     ("master_address", "", "master_address", None),
     ("admin_token", "0123456789abcdef", "admin_token", "0123456789abcdef"),
     ("admin_token", "", "admin_token", None),
+    ("admin_token", "0123456789abcdef", "token_hash", HASH),
+    ("admin_token_hash", HASH, "token_hash", HASH),
+    ("admin_token_hash", f" {HASH.upper()}\n", "token_hash", HASH),
+    ("admin_token_hash", "", "token_hash", None),
     (
         "inside_network",
         ("10.0.0.0/24", "fd00::/64", "10.1.2.3"),
@@ -104,6 +111,7 @@ BAD: list[tuple[str, str, list[Any]]] = [
         "8 to 200",
         ["short", "with a space", "new\nline-1234", "ümlaut-1234", "x" * 201],
     ),
+    ("admin_token_hash", "64 hex digits", ["0123456789abcdef", "x" * 64, f"{HASH}0"]),
     ("advertise_host", "missing", [None]),
     ("advertise_host", "neither a host name nor an address", ["", "robot:45000", "http://robot"]),
     ("advertise_host", "neither a host name nor an address", ["ro bot", "user@robot", "robot/x"]),
@@ -133,6 +141,11 @@ BAD: list[tuple[str, str, list[Any]]] = [
     *((name, "is not between", [0]) for name in ("probe_interval", "probe_timeout")),
     ("master_interval", "is not between 0.05 and 86400", [0.01]),
 ]
+
+
+def test_a_token_and_a_hash_do_not_go_together() -> None:
+    with pytest.raises(SettingError, match="--admin-token-hash: goes instead of --admin-token"):
+        parse_settings({**GIVEN, "admin_token": "0123456789abcdef", "admin_token_hash": HASH})
 
 
 @pytest.mark.parametrize(

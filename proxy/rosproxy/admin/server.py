@@ -2,10 +2,12 @@
 
 GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default. POST
 changes things: it is for callers on loopback that are no web page, and for those that know the
-token. What a POST does is given as an action by its path; calls of one path wait for each other.
+token, of which only the hash is held here. What a POST does is given as an action by its path;
+calls of one path wait for each other.
 """
 
 import asyncio
+import hashlib
 import hmac
 import json
 import logging
@@ -41,15 +43,15 @@ class AdminServer:
     """Serves what people, orchestrators and the operator ask.
 
     ``unready`` gives the reason why the proxy is not ready, None if it is; ``actions`` are what
-    paths do when something is posted there; ``token`` lets callers from elsewhere than loopback
-    post.
+    paths do when something is posted there; ``token_hash``, a SHA-256 in hex digits, is that of the
+    token with which callers from elsewhere than loopback may post.
     """
 
     _metrics: CollectorRegistry
     _status: Callable[[], dict[str, Any]]
     _unready: Callable[[], str | None]
     _actions: Mapping[str, Action]
-    _token: str | None
+    _token_hash: str | None
     _runner: web.AppRunner | None = None
     _locks: Mapping[str, asyncio.Lock] = field(default_factory=lambda: defaultdict(asyncio.Lock))
 
@@ -86,7 +88,7 @@ class AdminServer:
 
     async def _post(self, request: web.Request) -> web.Response:
         if not self._may_post(request):
-            hint = "" if self._token else "; this proxy has none"
+            hint = "" if self._token_hash else "; this proxy has none"
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
             body = _read_json(await request.read())
@@ -103,9 +105,11 @@ class AdminServer:
 
         A browser on this host is on loopback too; it says on behalf of which page it calls.
         """
-        if self._token:
-            said = request.headers.get("Authorization", "").encode("utf-8", "replace")
-            if hmac.compare_digest(said, f"Bearer {self._token}".encode()):
+        scheme, _, said = request.headers.get("Authorization", "").partition(" ")
+        if self._token_hash and scheme == "Bearer":
+            # aiohttp keeps bytes that are no UTF-8 as surrogates.
+            sent = hashlib.sha256(said.encode("utf-8", "surrogateescape")).hexdigest()
+            if hmac.compare_digest(sent, self._token_hash):
                 return True
         return is_loopback(request.remote or "") and "Origin" not in request.headers
 

@@ -82,6 +82,11 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     "Better given as a variable: command lines can be seen by everybody.",
 )
 @click.option(
+    "--admin-token-hash",
+    type=options.TOKEN_HASH,
+    help="The same where the proxy is not to hold the token: its SHA-256 in hex digits.",
+)
+@click.option(
     "--inside-network",
     type=options.NETWORK,
     envvar="ROSPROXY_INSIDE_NETWORKS",

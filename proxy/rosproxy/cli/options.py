@@ -63,6 +63,7 @@ HOST_PORT = Parsed("address:port", settings.read_host_port)
 NETWORK = Parsed("CIDR", settings.read_network)
 MASTER_URI = Parsed("URI", settings.read_master_uri)
 TOKEN = Parsed("token", settings.read_token)
+TOKEN_HASH = Parsed("hash", settings.read_token_hash)
 
 
 class OneLineError(click.ClickException):

@@ -8,6 +8,7 @@ from examples.demo.fake_http import End, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.settings import hash_token
 from tests.integration.admin_calls import news, post, tell
 from tests.integration.commands import admin_url, run
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -60,6 +61,18 @@ async def test_who_is_not_on_loopback_needs_the_token(make_proxy: MakeProxy, pat
     assert not proxy.app.context.retired
     right = await post(proxy, path, '{"x": 1}', f"Authorization: Bearer {TOKEN}")
     assert right.status in (200, 400)
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_a_proxy_that_has_the_hash_alone_lets_in_who_has_the_token(
+    make_proxy: MakeProxy,
+) -> None:
+    proxy = await make_proxy(admin_token_hash=hash_token(TOKEN))
+    for said in ("wrong-token", hash_token(TOKEN), ""):
+        reply = await post(proxy, "/retire", "{}", f"Authorization: Bearer {said}")
+        assert reply.status == 403
+        assert b"this proxy has none" not in reply.body
+    assert (await post(proxy, "/retire", "{}", f"Authorization: Bearer {TOKEN}")).status == 200
 
 
 @pytest.mark.usefixtures("from_afar")
