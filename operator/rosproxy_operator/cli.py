@@ -25,6 +25,7 @@ from rosproxy.cli.options import (
     setting_errors,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy_operator.docker.options import bound_options
 from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
 from rosproxy_operator.docker.settings import (
     DEFAULT_ADMIN,
@@ -141,6 +142,7 @@ def main() -> None:
     default="auto",
     help="How proxies forward topics. kernel: they get the capability NET_ADMIN for it.",
 )
+@bound_options
 @click.option(
     "--expose-by-default",
     is_flag=True,

@@ -73,8 +73,10 @@ def update(tag: str) -> None:
 
 
 def secret(proxy: Proxy) -> str:
-    words = inspect(proxy.name)["Config"]["Env"]
-    return next(str(word) for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN="))
+    """The hash of its token; nobody but the controller has the token itself."""
+    words = [str(word) for word in inspect(proxy.name)["Config"]["Env"]]
+    assert not [word for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN=")]
+    return next(word for word in words if word.startswith("ROSPROXY_ADMIN_TOKEN_HASH="))
 
 
 def test_missing_image_is_told_with_what_to_do(

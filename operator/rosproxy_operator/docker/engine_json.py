@@ -12,6 +12,7 @@ import msgspec
 
 from rosproxy_operator.docker.client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
+from rosproxy_operator.docker.planner.specs import SECRET
 
 _NEVER = "0001-"
 
@@ -78,6 +79,17 @@ def signature(row: Json) -> tuple[tuple[str, str], ...]:
     return tuple(
         sorted((name, end.get("EndpointID") or "") for name, end in endpoints(row).items())
     )
+
+
+def uplink_secret(rows: Iterable[Json], uplink: str) -> str:
+    """The secret that the uplink network has, from the list of networks; empty if it is not there.
+
+    Labels of a network come from whoever made it, and no container can read them. A network that
+    somebody made without one has at least an id of 256 random bits, which no container knows
+    either; but it shows wherever a container on that network is inspected.
+    """
+    found = next((row for row in rows if row.get("Name") == uplink), None)
+    return str(dig(found, "Labels", SECRET) or found["Id"]) if found else ""
 
 
 def read_container(

@@ -9,7 +9,6 @@ vanished meanwhile: that is no error, the next look sees what is left to do.
 
 import asyncio
 import logging
-import secrets
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
@@ -37,6 +36,7 @@ from rosproxy_operator.docker.planner.model import Key, PlanSettings
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
+    SECRET,
     container_config,
     master,
     proxy_name,
@@ -247,14 +247,15 @@ class DockerApplier:
         do = self._engine.do
         match action:
             case CreateNetwork(name):
-                labels = {MANAGED: "true"}
+                labels = {MANAGED: "true", SECRET: look.fresh}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case CreateSandbox(name):
                 self._create(name, sandbox_config(action, self._settings))
             case Create(name, key):
-                token = look.tokens.get(key) or secrets.token_hex(16)
-                address = look.state.masters.get(master(key).host.lower(), "")
-                self._create(name, container_config(action, self._settings, token, address))
+                secret, masters = look.state.secret, look.state.masters
+                address = masters.get(master(key).host.lower(), "")
+                config = container_config(action, self._settings, secret, address)
+                self._create(name, config)
             case Start(name):
                 do("start", name)
             case Restart(name):

@@ -6,6 +6,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 from rosproxy.net.addresses import HostPort, is_loopback
@@ -14,6 +15,7 @@ from rosproxy.settings import SettingError, read_master_uri
 from rosproxy_operator.docker.planner.model import PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
+LEAST_SECRET = 32
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -39,6 +41,22 @@ def read_shared_master_uri(text: str) -> str:
             "master's host, or http://host.docker.internal:PORT for this one"
         )
     return text
+
+
+def read_secret(path: str) -> str:
+    """The secret in a file, without blanks around it; empty for no path. Raises ValueError."""
+    if not path:
+        return ""
+    try:
+        secret = Path(path).read_text("utf-8").strip()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or "it is not UTF-8"
+        raise ValueError(f"{path} can't be read: {why}") from None
+    if len(secret) < LEAST_SECRET:
+        raise ValueError(
+            f"{path} must hold at least {LEAST_SECRET} characters: openssl rand -hex 32 gives them"
+        )
+    return secret
 
 
 def read_uplink(text: str) -> str:

@@ -1,14 +1,15 @@
 """A look at a Docker host: the engine, the labels of its containers, and where their masters are.
 
 What is seen is data for the planner (`HostState`); beside it stands what the planner needs not
-know: how proxies are reached, and their tokens. Labels are read here, once per look, since what
+know: how proxies are reached, and by which tokens. Labels are read here, once per look, since what
 they say decides which masters' names are resolved.
 """
 
 import asyncio
 import logging
+import secrets
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import msgspec
 
@@ -22,16 +23,16 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading, master
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     HostState,
-    Key,
     Network,
     PlanSettings,
     Proxy,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import (
+    FORMER_TOKEN,
     ROLE_SANDBOX,
-    TOKEN_VARIABLE,
     admin_port,
+    proxy_token,
     read_own,
 )
 
@@ -51,7 +52,7 @@ class ProxyAccess:
     """
 
     admin: HostPort
-    token: str
+    token: str = field(repr=False)
     run: str
 
 
@@ -60,14 +61,14 @@ class DockerSnapshot:
     """A Docker host at one moment.
 
     ``access`` to those proxies that run is by name. ``at_host``: the operator is in the host's
-    network namespace.
+    network namespace. ``fresh`` is the secret for an uplink network that is made now.
     """
 
     state: HostState
     labels: LabelReading
     access: Mapping[str, ProxyAccess]
-    tokens: Mapping[Key, str]
     at_host: bool
+    fresh: str = field(default="", repr=False)
 
 
 class Inspector:
@@ -152,6 +153,7 @@ class DockerObserver:
     ) -> None:
         self._engine, self._settings, self._masters = engine, settings, masters
         self._inspector = Inspector(engine, late)
+        self._fresh = secrets.token_hex(32)
 
     @property
     def waiting(self) -> bool:
@@ -178,6 +180,8 @@ class DockerObserver:
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         at_host = any(map(host.has, bridges))
         state = self._read(rows, networks, listening if at_host else frozenset())
+        secret = self._settings.secret or engine_json.uplink_secret(found, self._settings.uplink)
+        state = replace(state, image_id=image, secret=secret or self._fresh)
         labels = read_labels(state, self._settings)
         masters = await self._resolve(state, master_hosts(labels, state))
         gateways = {network.gateway for network in networks}
@@ -187,11 +191,11 @@ class DockerObserver:
             if at_host and address and (own := host.own_address_towards(address, gateways))
         }
         return DockerSnapshot(
-            state=replace(state, image_id=image, masters=masters, advertise=advertise),
+            state=replace(state, masters=masters, advertise=advertise),
             labels=labels,
             access={p.container.name: way for p in state.proxies if (way := self._way(p, state))},
-            tokens={p.key: token for p in state.proxies if (token := self._token(p))},
             at_host=at_host,
+            fresh=self._fresh,
         )
 
     def _read(
@@ -245,11 +249,9 @@ class DockerObserver:
         address = next((a.address for a in box.container.attachments if a.network == uplink), "")
         run = f"{proxy.container.id} {proxy.container.started_at}"
         admin = HostPort(address, admin_port(proxy.key))
-        return ProxyAccess(admin, self._token(proxy), run) if address else None
-
-    def _token(self, proxy: Proxy) -> str:
         variables = engine_json.environment(self._inspector.get(proxy.container.id))
-        return variables.get(TOKEN_VARIABLE, "")
+        token = variables.get(FORMER_TOKEN) or proxy_token(proxy.key, state.secret)
+        return ProxyAccess(admin, token, run) if address else None
 
 
 def strangers(

@@ -26,6 +26,8 @@ class PlanSettings:
     without a label of their own. ``ports`` is the least number that a proxy gets, ``port_window``
     where they are looked for, ``publish_address`` the host's addresses on which they are published.
     ``grace`` is in seconds: how long a proxy outlives its last container.
+
+    ``secret`` is what the proxies' tokens are made of; empty: the one that the uplink network has.
     """
 
     master_uri: str | None = None
@@ -38,6 +40,7 @@ class PlanSettings:
     grace: float = 60.0
     uplink: str = "0-rosproxy"
     data_plane: DataPlane = "auto"
+    secret: str = field(default="", repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +154,7 @@ class HostState:
     name, this host's address towards it; without an entry it is not known. ``masters`` are the
     addresses of the masters' hosts, by name, empty where unknown. ``busy`` are the names of own
     containers of which not everything is known yet, so that nothing can be done to them, and
-    ``addresses`` those of all containers.
+    ``addresses`` those of all containers. ``secret`` is what the tokens of proxies are made of.
     """
 
     containers: tuple[Container, ...]
@@ -165,6 +168,7 @@ class HostState:
     masters: Mapping[str, str] = field(default_factory=dict)
     busy: frozenset[str] = frozenset()
     addresses: frozenset[str] = frozenset()
+    secret: str = field(default="", repr=False)
 
     @property
     def own(self) -> tuple[OwnContainer, ...]:

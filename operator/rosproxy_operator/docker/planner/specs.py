@@ -1,6 +1,7 @@
 """The containers of a proxy: what they are made of, and what is read back from their labels."""
 
 import hashlib
+import hmac
 import json
 import re
 from collections.abc import Mapping
@@ -12,7 +13,7 @@ from msgspec.structs import replace
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import SettingError, parse_range
+from rosproxy.settings import SettingError, hash_token, parse_range
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
@@ -24,8 +25,11 @@ MASTER_URI = "io.rosproxy.master-uri"
 ADVERTISE_HOST = "io.rosproxy.advertise-host"
 RANGE = "io.rosproxy.range"
 FINGERPRINT = "io.rosproxy.fingerprint"
+SECRET = "io.rosproxy.secret"  # noqa: S105 - the label's name
+"""On the uplink network: what the proxies' tokens are made of."""
 
-TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
+FORMER_TOKEN = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
+"""Where proxies had their token before they got the hash alone."""
 ADMIN_PORT = 11312
 _COMMON: Mapping[str, Any] = {
     "ReadonlyRootfs": True,
@@ -82,6 +86,16 @@ def admin_port(key: Key) -> int:
     return ADMIN_PORT + 1 if master(key).port == ADMIN_PORT else ADMIN_PORT
 
 
+def proxy_token(key: Key, secret: str) -> str:
+    """The token of a key's proxy, 64 hex digits: HMAC-SHA256 (RFC 2104) of the key.
+
+    It is made anew whenever it is needed, so that it is kept nowhere: the proxy has its hash, and
+    the operator has no disk.
+    """
+    text = f"{key.master_uri} {key.advertise_host}"
+    return hmac.new(secret.encode(), text.encode(), hashlib.sha256).hexdigest()
+
+
 def reserved_ports(key: Key) -> frozenset[int]:
     """The ports on which a key's proxy listens besides its range, so never to be in it."""
     return frozenset({master(key).port, admin_port(key)})
@@ -123,12 +137,13 @@ def sandbox_fingerprint(made: CreateSandbox, settings: PlanSettings) -> str:
     return _digest({**body, "Image": ""})
 
 
-def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str) -> str:
+def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
     """What a proxy's own container is made of, in 16 hex digits.
 
-    Neither its name, its token, its sandbox nor the master's address are in it.
+    Neither its name, its sandbox nor the master's address are in it. The hash of its token is: a
+    proxy that knows another one would not listen to the operator.
     """
-    body = container_config(replace(made, sandbox="", fingerprint=""), settings, "", "")
+    body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
     return _digest({**body, "Image": image_id})
 
 
@@ -165,11 +180,12 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
 
 
 def container_config(
-    made: Create, settings: PlanSettings, token: str, master_address: str
+    made: Create, settings: PlanSettings, secret: str, master_address: str
 ) -> dict[str, Any]:
     """The body of the engine's ``POST /containers/create`` for a proxy.
 
-    ``master_address`` may be empty: then the proxy resolves its master's host itself.
+    ``secret`` is what its token is made of. ``master_address`` may be empty: then the proxy
+    resolves its master's host itself.
     """
     variables = {
         "ROS_MASTER_URI": made.key.master_uri,
@@ -178,7 +194,7 @@ def container_config(
         "ROSPROXY_MASTER_PORT": str(master(made.key).port),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(made.key)}",
         "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
-        TOKEN_VARIABLE: token,
+        "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
     }
     return {

@@ -255,7 +255,8 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
     taken = context.taken(proxies)
     name = free_name(wanted, taken)
     made = Create(name, key, context.ports, home.name, context.desired.data_plane)
-    expected = proxy_fingerprint(made, context.settings, context.observed.image_id)
+    observed = context.observed
+    expected = proxy_fingerprint(made, context.settings, observed.image_id, observed.secret)
     there = [one for one in proxies if one.container.name not in gone]
     found = context.select(there, wanted, expected, lambda one: one.shares == home.id)
     kept = found.kept

@@ -38,6 +38,7 @@ KEY = Key(ROBOT, HERE)
 RANGE = PortRange(11400, 11431)
 SETTINGS = PlanSettings(advertise_host=HERE)
 IMAGE = "sha256:1"
+SECRET = "what tokens are made of"
 EPHEMERAL = PortRange(32768, 60999)
 UPLINK = Network("n0", "0-rosproxy", gateway="172.30.0.1")
 APP = Network("n1", "app", gateway="172.18.0.1")
@@ -111,7 +112,7 @@ def proxy(
     """A proxy as the operator makes it, by default one that runs in the `sandbox` of its key."""
     name = name or proxy_name(key)
     create = Create(name, key, ports, sandbox_name(key))
-    made = made or proxy_fingerprint(create, settings, image)
+    made = made or proxy_fingerprint(create, settings, image, SECRET)
     mode = f"container:{sandbox_id or f'id-{sandbox_name(key)}'}"
     labels = own_labels(structs.replace(create, fingerprint=made))
     own = container(name, labels, [], state, mode=mode)
@@ -144,8 +145,27 @@ def observed(
         image_id=image,
         advertise=advertise or {},
         sandboxes=tuple(sandboxes),
-        **more,
+        **{"secret": SECRET, **more},
     )
+
+
+def inspection(body: Mapping[str, Any], image: str = IMAGE, **more: Any) -> dict[str, Any]:
+    """What the engine tells of a container that was made from the body of a call."""
+    from_image = {"Entrypoint": ["rosproxy"], "Cmd": ["run"]}
+    config = {key: body[key] for key in ("User", "Env", "Labels", *from_image) if key in body}
+    host = {
+        "Privileged": False,
+        "Binds": None,
+        "IpcMode": "private",
+        "PidMode": "",
+        "Devices": [],
+        "CapAdd": None,
+        "PortBindings": {},
+        "Sysctls": None,
+        "UsernsMode": "",
+        **body["HostConfig"],
+    }
+    return {"Image": image, "Config": from_image | config, "HostConfig": host, **more}
 
 
 def planned(

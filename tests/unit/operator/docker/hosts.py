@@ -351,7 +351,7 @@ class Hosts:
         box = CreateSandbox("", key, is_.range, forwards=plane == "kernel")
         assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
         proxy = Create("", key, is_.range, "", plane)
-        assert runs.fingerprint == proxy_fingerprint(proxy, SETTINGS, self.engine.image)
+        assert runs.fingerprint == proxy_fingerprint(proxy, SETTINGS, self.engine.image, "")
 
     def is_named(self, box: Box, name: str) -> bool:
         """Whether it has its name, if no stranger has."""

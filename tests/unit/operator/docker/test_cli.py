@@ -1,5 +1,7 @@
 """The command line of the operator: every mistake is one line that names the option."""
 
+from pathlib import Path
+
 import pytest
 from click.testing import CliRunner, Result
 
@@ -37,6 +39,7 @@ def test_the_defaults() -> None:
         ("--uplink", "-x", "'-x' is not a network's name"),
         ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
         ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
+        ("--secret-file", "/nowhere", "/nowhere can't be read: No such file or directory"),
         ("--grace", "-1", "-1 s is not between 0 and 86400 s"),
         ("--resync", "0", "0 s is not between 1 and 86400 s"),
     ],
@@ -47,6 +50,21 @@ def test_a_bad_value_names_its_option(option: str, value: str, told: str) -> Non
     assert result.stderr.startswith(f"rosproxy-operator: {option}: ")
     assert told in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_a_secret_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "secret"
+    file.write_text(f" {'s' * 32}\n")
+    for name, value in (("SECRET_FILE", str(file)),):
+        monkeypatch.setenv(f"ROSPROXY_{name}", value)
+    options = (
+        main.commands["docker"].make_context("docker", [], auto_envvar_prefix="ROSPROXY").params
+    )
+    found = make_plan_settings(options)
+    assert found.secret == "s" * 32
+    file.write_text("short")
+    result = run("docker", "plan", ROSPROXY_SECRET_FILE=str(file))
+    assert "must hold at least 32 characters: openssl rand -hex 32" in result.stderr
 
 
 def test_every_option_has_a_variable() -> None:

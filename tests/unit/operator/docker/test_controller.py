@@ -1,5 +1,6 @@
 """Looks at an engine that is given by the test, and what the controller makes of them."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,13 +12,23 @@ from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
-from rosproxy_operator.docker.planner.specs import own_labels, proxy_name, sandbox_name
+from rosproxy_operator.docker.planner.specs import (
+    container_config,
+    own_labels,
+    proxy_name,
+    proxy_token,
+    sandbox_config,
+    sandbox_name,
+)
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
-from tests.unit.operator.docker.builders import KEY, RANGE
+from tests.unit.operator.docker.builders import KEY, RANGE, inspection
 from tests.unit.operator.docker.conftest import FakeEngine
 
-SETTINGS = PlanSettings(advertise_host=KEY.advertise_host)
+SETTINGS = PlanSettings(advertise_host=KEY.advertise_host, secret="secret")
+BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE, "f")
+PROCESS = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
+TOKEN = proxy_token(KEY, "secret")
 
 
 def own(spec: CreateSandbox | Create, number: str, network: str, address: str) -> dict[str, Any]:
@@ -35,14 +46,14 @@ def own(spec: CreateSandbox | Create, number: str, network: str, address: str) -
 def containers(engine: FakeEngine) -> None:
     """A labelled container, which is called as its master is, and a proxy in its sandbox."""
     engine.knows["/networks"] = [captured.network()]
-    details = captured.inspected() | {"State": {"Status": "running", "StartedAt": "1"}}
+    state = {"State": {"Status": "running", "StartedAt": "1"}}
+    details = captured.inspected() | state
     details["NetworkSettings"] = {"Networks": {"app": {"Aliases": ["robot"]}}}
     engine.add(captured.running(), details)
-    box = CreateSandbox(sandbox_name(KEY), KEY, RANGE, "f")
-    engine.add(own(box, "b" * 64, SETTINGS.uplink, "172.30.0.2"), details)
-    process = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f")
-    token = {"Config": {"Env": ["ROSPROXY_ADMIN_TOKEN=secret"]}, "State": details["State"]}
-    engine.add(own(process, "p" * 64, f"container:{'b' * 64}", ""), token)
+    made = inspection(sandbox_config(BOX, SETTINGS)) | state
+    engine.add(own(BOX, "b" * 64, SETTINGS.uplink, "172.30.0.2"), made)
+    process = inspection(container_config(PROCESS, SETTINGS, "secret", "")) | state
+    engine.add(own(PROCESS, "p" * 64, f"container:{'b' * 64}", ""), process)
 
 
 def observer() -> DockerObserver:
@@ -60,8 +71,26 @@ async def test_a_look_finds_containers_labels_masters_and_proxies() -> None:
     assert not state.busy
     assert state.addresses >= {"172.29.0.2", "172.30.0.2"}
     access = look.access[name]
-    assert (str(access.admin), access.token) == ("172.30.0.2:11312", "secret")
-    assert look.tokens == {KEY: "secret"}
+    assert (str(access.admin), access.token) == ("172.30.0.2:11312", TOKEN)
+    assert "secret" not in repr(look)
+    assert TOKEN not in repr(look)
+
+
+async def test_a_proxy_that_was_made_with_its_token_is_told_it(engine: FakeEngine) -> None:
+    engine.knows[f"/containers/{'p' * 64}/json"]["Config"]["Env"] = ["ROSPROXY_ADMIN_TOKEN=old"]
+    look = await observer().look(5.0)
+    assert [access.token for access in look.access.values()] == ["old"]
+
+
+async def test_without_a_file_the_secret_is_the_uplinks(engine: FakeEngine) -> None:
+    settings = replace(SETTINGS, secret="")
+    looking = DockerObserver(DockerClient(), settings, MasterResolver(print), print)
+    fresh = (await looking.look(5.0)).state.secret
+    assert fresh == (await looking.look(5.0)).fresh  # for the network that is going to be made
+    uplink = captured.network() | {"Name": SETTINGS.uplink}
+    engine.knows["/networks"].append(uplink | {"Labels": {"io.rosproxy.secret": "kept"}})
+    assert (await looking.look(5.0)).state.secret == "kept"
+    assert (await observer().look(5.0)).state.secret == "secret"
 
 
 async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine) -> None:
@@ -104,7 +133,7 @@ async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
     del engine.knows[f"/containers/{'p' * 64}/json"]
     look = await looking.look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
-    assert look.tokens == {KEY: "secret"}
+    assert look.access[proxy_name(KEY)].token == TOKEN
 
 
 async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:

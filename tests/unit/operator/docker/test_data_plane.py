@@ -22,6 +22,7 @@ from tests.unit.operator.docker.builders import (
     IMAGE,
     KEY,
     RANGE,
+    SECRET,
     SETTINGS,
     container,
     observed,
@@ -65,7 +66,7 @@ def made(actions: tuple[Action, ...]) -> tuple[list[bool], list[DataPlane]]:
 def own(plane: DataPlane, forwards: bool) -> tuple[Sandbox, Proxy]:
     """A sandbox and its proxy, as they were created for a data plane."""
     box = sandbox_fingerprint(structs.replace(SANDBOX, forwards=forwards), SETTINGS)
-    process = proxy_fingerprint(structs.replace(PROXY, data_plane=plane), SETTINGS, IMAGE)
+    process = proxy_fingerprint(structs.replace(PROXY, data_plane=plane), SETTINGS, IMAGE, SECRET)
     return sandbox(made=box), proxy(made=process)
 
 

@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 
+from rosproxy.settings import hash_token
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.engine_json import uplink_secret
 from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.executor import DockerApplier
 from rosproxy_operator.docker.planner.actions import (
@@ -24,15 +26,26 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.labels.members import LabelReading
-from rosproxy_operator.docker.planner.specs import own_labels
+from rosproxy_operator.docker.planner.specs import (
+    proxy_token,
+    sandbox_config,
+    sandbox_name,
+)
 from rosproxy_operator.docker.snapshot import DockerSnapshot
-from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, observed
+from tests.unit.operator.docker.builders import (
+    KEY,
+    RANGE,
+    SECRET,
+    SETTINGS,
+    inspection,
+    observed,
+)
 from tests.unit.operator.docker.conftest import FakeEngine
 
 PERMISSIONS = Path(__file__).parents[4] / "docs/reference/permissions.md"
-BOX = CreateSandbox("box", KEY, RANGE)
+BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
 SEEN = observed(masters={"robot": "192.0.2.7"})
-LOOK = DockerSnapshot(SEEN, LabelReading(), {}, {KEY: "secret"}, at_host=True)
+LOOK = DockerSnapshot(SEEN, LabelReading(), {}, at_host=True, fresh="fresh secret")
 ACTIONS: list[Action] = [
     CreateNetwork("0-rosproxy"),
     BOX,
@@ -50,8 +63,9 @@ ACTIONS: list[Action] = [
 @pytest.fixture(autouse=True)
 def container_on_two_networks(engine: FakeEngine) -> None:
     networks: dict[str, Any] = {"app": {}, SETTINGS.uplink: {}}
-    box = {"Config": {"Labels": own_labels(BOX)}, "NetworkSettings": {"Networks": networks}}
-    engine.knows["/containers/box/json"] = box
+    box = inspection(sandbox_config(BOX, SETTINGS), NetworkSettings={"Networks": networks})
+    for name in (BOX.name, "box"):
+        engine.knows[f"/containers/{name}/json"] = box
     engine.knows["/images/rosproxy:latest/json"] = {"Id": "sha256:1"}
 
 
@@ -75,11 +89,22 @@ async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine
     ] == []
 
 
-async def test_a_proxy_keeps_its_token_and_is_told_its_masters_address(engine: FakeEngine) -> None:
+async def test_a_proxy_gets_its_tokens_hash_and_its_masters_address(engine: FakeEngine) -> None:
     await carry_out(ACTIONS[2])
     variables = engine.calls["POST /containers/create"]["Env"]
-    assert "ROSPROXY_ADMIN_TOKEN=secret" in variables
+    expected = hash_token(proxy_token(KEY, SECRET))
+    assert f"ROSPROXY_ADMIN_TOKEN_HASH={expected}" in variables
     assert "ROSPROXY_MASTER_ADDRESS=192.0.2.7" in variables
+
+
+async def test_the_uplink_holds_the_secret(engine: FakeEngine) -> None:
+    await carry_out(ACTIONS[0])
+    labels = engine.calls["POST /networks/create"]["Labels"]
+    assert labels == {"io.rosproxy.managed": "true", "io.rosproxy.secret": "fresh secret"}
+    rows = [{"Name": "app", "Id": "1"}, {"Name": "0-rosproxy", "Id": "2", "Labels": labels}]
+    assert uplink_secret(rows, "0-rosproxy") == "fresh secret"
+    assert uplink_secret([{**rows[1], "Labels": None}], "0-rosproxy") == "2"  # made by hand
+    assert uplink_secret(rows[:1], "0-rosproxy") == ""
 
 
 async def test_what_is_removed_leaves_its_networks_but_the_uplink(engine: FakeEngine) -> None:
@@ -97,7 +122,7 @@ async def test_what_is_removed_leaves_its_networks_but_the_uplink(engine: FakeEn
     ("action", "call", "status", "said"),
     [
         (ACTIONS[0], "POST /networks/create", 409, "network 0-rosproxy already exists"),
-        (ACTIONS[1], "POST /containers/create", 409, "The name box is already in use"),
+        (ACTIONS[1], "POST /containers/create", 409, "The name is already in use"),
         (ACTIONS[3], "POST /containers/p/start", 500, "container b is not running"),
         (ACTIONS[4], "POST /containers/p/restart", 404, "No such container: p"),
         (ACTIONS[5], "POST /containers/p/unpause", 500, "Container p is not paused"),
@@ -126,6 +151,6 @@ async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> 
 
 async def test_a_name_that_a_stranger_has(engine: FakeEngine) -> None:
     engine.refuses["POST /containers/create"] = (409, "in use")
-    engine.knows["/containers/box/json"] = {"Config": {"Labels": None}}
-    with pytest.raises(EngineError, match="not this operator's is called box; rename it"):
+    engine.knows[f"/containers/{BOX.name}/json"] = {"Config": {"Labels": None}}
+    with pytest.raises(EngineError, match=f"not this operator's is called {BOX.name}; rename it"):
         await carry_out(ACTIONS[1])

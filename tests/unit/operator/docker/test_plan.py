@@ -37,6 +37,7 @@ from tests.unit.operator.docker.builders import (
     IMAGE,
     KEY,
     RANGE,
+    SECRET,
     SETTINGS,
     UPLINK,
     both,
@@ -68,7 +69,7 @@ def new_proxy(
     ports: PortRange = RANGE, replaces: str = "", image: str = IMAGE, home: str = PORTS
 ) -> Create:
     made = Create(NAME, KEY, ports, home, replaces=replaces)
-    return structs.replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image))
+    return structs.replace(made, fingerprint=proxy_fingerprint(made, SETTINGS, image, SECRET))
 
 
 def look(
@@ -107,6 +108,18 @@ def test_the_first_container_on_a_host() -> None:
     assert list(found.actions) == [CreateNetwork("0-rosproxy"), *FIRST]
     assert [group.key for group in found.groups] == [None, KEY]
     assert (found.problems, found.again_in) == ((), None)
+
+
+def test_another_secret_makes_the_process_anew_in_its_sandbox() -> None:
+    """Its nodes keep their ports, and its master's address and networks stay."""
+    found = look(observed(container(), **both(), secret="another"))
+    assert [(type(one), one.name) for one in found.actions] == [
+        (Rename, NAME),
+        (Create, NAME),
+        (Remove, f"{NAME}-old"),
+        (Start, NAME),
+    ]
+    assert [one.range for one in found.actions if isinstance(one, Create)] == [RANGE]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.settings import hash_token
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
@@ -18,6 +19,7 @@ from rosproxy_operator.docker.planner.specs import (
     own_labels,
     proxy_fingerprint,
     proxy_name,
+    proxy_token,
     read_own,
     reserved_ports,
     sandbox_config,
@@ -25,10 +27,12 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_name,
 )
 from tests.run_options import settings_of
-from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SETTINGS
+from tests.unit.operator.docker.builders import HERE, IMAGE, KEY, RANGE, SECRET, SETTINGS
 
 SANDBOX = CreateSandbox("s", KEY, PortRange(11400, 11401), "f1")
 PROXY = Create("p", KEY, PortRange(11400, 11401), "s", fingerprint="f2")
+TOKEN = proxy_token(KEY, SECRET)
+HASH = hash_token(TOKEN)
 
 
 def test_a_sandbox_holds_ports_and_network_and_does_nothing() -> None:
@@ -48,7 +52,7 @@ def test_a_sandbox_holds_ports_and_network_and_does_nothing() -> None:
 
 
 def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
-    body = container_config(PROXY, SETTINGS, "t0ken", "192.0.2.7")
+    body = container_config(PROXY, SETTINGS, SECRET, "192.0.2.7")
     assert body["HostConfig"]["NetworkMode"] == "container:s"
     assert not {"ExposedPorts", "NetworkingConfig"} & body.keys()
     assert not {"PortBindings", "Sysctls"} & body["HostConfig"].keys()
@@ -58,7 +62,7 @@ def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
         "ROSPROXY_PORT_RANGE=11400-11401",
         "ROSPROXY_MASTER_PORT=11311",
         "ROSPROXY_ADMIN_BIND=0.0.0.0:11312",
-        "ROSPROXY_ADMIN_TOKEN=t0ken",
+        f"ROSPROXY_ADMIN_TOKEN_HASH={HASH}",
         "ROSPROXY_MASTER_ADDRESS=192.0.2.7",
     ]
 
@@ -86,6 +90,17 @@ def test_an_unknown_address_is_not_given() -> None:
     assert "ROSPROXY_MASTER_ADDRESS" not in names
 
 
+def test_a_token_is_made_of_the_secret_and_the_key_and_is_nowhere() -> None:
+    """Who inspects a proxy finds the hash of its token, which opens nothing."""
+    assert proxy_token(KEY, SECRET) == TOKEN
+    assert proxy_token(KEY, "another secret") != TOKEN
+    assert proxy_token(Key(KEY.master_uri, "192.0.2.11"), SECRET) != TOKEN
+    body = str(container_config(PROXY, SETTINGS, SECRET, ""))
+    assert TOKEN not in body
+    assert SECRET not in body
+    assert SECRET not in repr(replace(SETTINGS, secret=SECRET))
+
+
 def test_ports_are_published_on_each_address_asked_for() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
@@ -99,6 +114,7 @@ def test_the_proxy_accepts_its_environment(port: int) -> None:
     body = container_config(structs.replace(PROXY, key=key), SETTINGS, "t0ken-t0ken", "192.0.2.7")
     settings = settings_of(dict(pair.split("=", 1) for pair in body["Env"]))
     assert settings.admin.port == admin_port(key)
+    assert settings.token_hash == hash_token(proxy_token(key, "t0ken-t0ken"))
     assert reserved_ports(key) == {port, settings.admin.port}
 
 
@@ -113,22 +129,23 @@ def test_what_makes_a_sandbox_anew() -> None:
 
 
 def test_what_makes_a_proxy_anew() -> None:
-    now = proxy_fingerprint(PROXY, SETTINGS, IMAGE)
+    now = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
     renamed = structs.replace(
         PROXY, name="other", sandbox="another", fingerprint="", replaces="old"
     )
     other = replace(SETTINGS, proxy_image="other", publish_address=("::",))
-    assert now == proxy_fingerprint(renamed, other, IMAGE)
-    assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2")
-    assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE)
+    assert now == proxy_fingerprint(renamed, other, IMAGE, SECRET)
+    assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2", SECRET)
+    assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE, SECRET)
+    assert now != proxy_fingerprint(PROXY, SETTINGS, IMAGE, "another secret")
     elsewhere = Key(KEY.master_uri, "192.0.2.11")
-    assert now != proxy_fingerprint(structs.replace(PROXY, key=elsewhere), SETTINGS, IMAGE)
+    assert now != proxy_fingerprint(structs.replace(PROXY, key=elsewhere), SETTINGS, IMAGE, SECRET)
 
 
 def test_fingerprints_stay_as_they_were() -> None:
     """Else an update of the operator makes all proxies anew."""
     assert sandbox_fingerprint(SANDBOX, SETTINGS) == "fc38dd94f5f167fd"
-    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE) == "bd5b2f988ae81386"
+    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET) == "810afa94aafead89"
 
 
 def test_labels_are_read_back() -> None:
