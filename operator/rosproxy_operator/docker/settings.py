@@ -15,7 +15,13 @@ from rosproxy.settings import SettingError, read_master_uri
 from rosproxy_operator.docker.planner.model import PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
+LEAST_MEMORY, MOST_MEMORY = 64 * 1024**2, 1024**4
+"""Bytes that a proxy may be bounded to: one that does nothing has 32 MiB."""
+LEAST_PIDS = 256
+"""Threads that a proxy needs for a hundred connections."""
 LEAST_SECRET = 32
+_MEMORY = re.compile(r"([0-9]{1,15})([bkmg]?)b?")
+_UNITS = {"": 1, "b": 1, "k": 1024, "m": 1024**2, "g": 1024**3}
 _NETWORK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -41,6 +47,24 @@ def read_shared_master_uri(text: str) -> str:
             "master's host, or http://host.docker.internal:PORT for this one"
         )
     return text
+
+
+def read_memory(text: str) -> int:
+    """Bytes, as ``docker run --memory`` has them: 512m, 1g; 0 for no bound. Raises ValueError."""
+    found = _MEMORY.fullmatch(text.strip().lower())
+    size = int(found[1]) * _UNITS[found[2]] if found else -1
+    if size and not LEAST_MEMORY <= size <= MOST_MEMORY:
+        raise ValueError(f"{text[:40]!r} is not a size from 64m on, such as 1g; or 0 for no bound")
+    return size
+
+
+def read_pids(text: str) -> int:
+    """How many threads and processes; 0 for no bound. Raises ValueError."""
+    digits = text.strip()
+    count = int(digits) if re.fullmatch(r"[0-9]{1,7}", digits, re.ASCII) else -1
+    if count and count < LEAST_PIDS:
+        raise ValueError(f"{text[:40]!r} is not a number from {LEAST_PIDS} on, or 0 for no bound")
+    return count
 
 
 def read_secret(path: str) -> str:

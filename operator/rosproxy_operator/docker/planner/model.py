@@ -14,6 +14,7 @@ SERVING = STARTED | {"restarting"}
 """States of a container that runs, or does again in a moment."""
 MOST_PORTS = 1000
 """Ports that one proxy may ask for: each costs rules and, by default, a process of the engine."""
+GIBIBYTE = 1024 * 1024 * 1024
 WINDOW = PortRange(11400, 65535)
 """Where ports are looked for: above the master's and the admin endpoint's."""
 
@@ -26,6 +27,11 @@ class PlanSettings:
     without a label of their own. ``ports`` is the least number that a proxy gets, ``port_window``
     where they are looked for, ``publish_address`` the host's addresses on which they are published.
     ``grace`` is in seconds: how long a proxy outlives its last container.
+
+    Each proxy may take ``proxy_memory`` bytes and have ``proxy_pids`` threads and processes; 0: any
+    number. The defaults are several times what a thousand connections take at full rate
+    (docs/performance.md): 32 MiB and 50 KiB for each in the process, 64 MiB of pipes and, where the
+    kernel counts them in, 0.7 MiB of socket buffers for each; two threads for each.
 
     ``secret`` is what the proxies' tokens are made of; empty: the one that the uplink network has.
     """
@@ -40,6 +46,8 @@ class PlanSettings:
     grace: float = 60.0
     uplink: str = "0-rosproxy"
     data_plane: DataPlane = "auto"
+    proxy_memory: int = GIBIBYTE
+    proxy_pids: int = 8192
     secret: str = field(default="", repr=False)
 
 

@@ -197,6 +197,7 @@ def container_config(
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
     }
+    limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,
         "User": _USER,
@@ -206,6 +207,7 @@ def container_config(
             **_COMMON,
             **(_KERNEL if made.data_plane == "kernel" else {}),
             "Init": False,
+            **{name: most for name, most in limits.items() if most},
             "NetworkMode": f"container:{made.sandbox}",
         },
     }

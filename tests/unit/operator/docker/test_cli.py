@@ -8,7 +8,7 @@ from click.testing import CliRunner, Result
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import PlanSettings
-from rosproxy_operator.docker.settings import DEFAULT_ADMIN, make_plan_settings
+from rosproxy_operator.docker.settings import DEFAULT_ADMIN, make_plan_settings, read_memory
 
 
 def run(*words: str, **variables: str) -> Result:
@@ -39,6 +39,10 @@ def test_the_defaults() -> None:
         ("--uplink", "-x", "'-x' is not a network's name"),
         ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
         ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
+        ("--proxy-memory", "much", "'much' is not a size from 64m on, such as 1g"),
+        ("--proxy-memory", "8m", "'8m' is not a size from 64m on"),
+        ("--proxy-pids", "9", "'9' is not a number from 256 on"),
+        ("--proxy-pids", "-1", "'-1' is not a number from 256 on"),
         ("--secret-file", "/nowhere", "/nowhere can't be read: No such file or directory"),
         ("--grace", "-1", "-1 s is not between 0 and 86400 s"),
         ("--resync", "0", "0 s is not between 1 and 86400 s"),
@@ -52,16 +56,29 @@ def test_a_bad_value_names_its_option(option: str, value: str, told: str) -> Non
     assert result.stderr.count("\n") == 1
 
 
-def test_a_secret_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("0", 0), ("64m", 64 * 1024**2), ("1G", 1024**3), ("2gb", 2 * 1024**3), ("134217728", 2**27)],
+)
+def test_sizes(text: str, size: int) -> None:
+    assert read_memory(text) == size
+
+
+def test_a_size_in_a_variable_and_a_secret_in_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "secret"
     file.write_text(f" {'s' * 32}\n")
-    for name, value in (("SECRET_FILE", str(file)),):
+    for name, value in (
+        ("PROXY_MEMORY", "512m"),
+        ("SECRET_FILE", str(file)),
+    ):
         monkeypatch.setenv(f"ROSPROXY_{name}", value)
     options = (
         main.commands["docker"].make_context("docker", [], auto_envvar_prefix="ROSPROXY").params
     )
     found = make_plan_settings(options)
-    assert found.secret == "s" * 32
+    assert (found.proxy_memory, found.secret) == (512 * 1024**2, "s" * 32)
     file.write_text("short")
     result = run("docker", "plan", ROSPROXY_SECRET_FILE=str(file))
     assert "must hold at least 32 characters: openssl rand -hex 32" in result.stderr

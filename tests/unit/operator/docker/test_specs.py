@@ -101,6 +101,14 @@ def test_a_token_is_made_of_the_secret_and_the_key_and_is_nowhere() -> None:
     assert SECRET not in repr(replace(SETTINGS, secret=SECRET))
 
 
+def test_a_proxy_is_bounded_in_memory_and_threads() -> None:
+    host = container_config(PROXY, SETTINGS, SECRET, "")["HostConfig"]
+    assert (host["Memory"], host["PidsLimit"]) == (1024**3, 8192)
+    unbounded = replace(SETTINGS, proxy_memory=0, proxy_pids=0)
+    host = container_config(PROXY, unbounded, SECRET, "")["HostConfig"]
+    assert not {"Memory", "PidsLimit"} & host.keys()
+
+
 def test_ports_are_published_on_each_address_asked_for() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
@@ -138,6 +146,8 @@ def test_what_makes_a_proxy_anew() -> None:
     assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2", SECRET)
     assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE, SECRET)
     assert now != proxy_fingerprint(PROXY, SETTINGS, IMAGE, "another secret")
+    for bound in (replace(SETTINGS, proxy_memory=0), replace(SETTINGS, proxy_pids=300)):
+        assert now != proxy_fingerprint(PROXY, bound, IMAGE, SECRET)
     elsewhere = Key(KEY.master_uri, "192.0.2.11")
     assert now != proxy_fingerprint(structs.replace(PROXY, key=elsewhere), SETTINGS, IMAGE, SECRET)
 
@@ -145,7 +155,7 @@ def test_what_makes_a_proxy_anew() -> None:
 def test_fingerprints_stay_as_they_were() -> None:
     """Else an update of the operator makes all proxies anew."""
     assert sandbox_fingerprint(SANDBOX, SETTINGS) == "fc38dd94f5f167fd"
-    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET) == "810afa94aafead89"
+    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET) == "711f77936ec9e3fc"
 
 
 def test_labels_are_read_back() -> None:
