@@ -19,6 +19,8 @@ from rosproxy.net.addresses import HostPort, Network, parse_host_port
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
+SlaveControl = Literal["any", "master"]
+"""Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
 
 _Value = TypeVar("_Value")
 _RANGE = re.compile(r"\s*([0-9]{1,5})\s*-\s*([0-9]{1,5})\s*")
@@ -60,7 +62,7 @@ class Settings:
     cleanup_after: float = 30.0
     linger: float = 30.0
     master_interval: float = 2.0
-    slave_control: Literal["any", "master"] = "any"
+    slave_control: SlaveControl = "any"
     data_plane: DataPlane = "auto"
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)

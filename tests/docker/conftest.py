@@ -109,13 +109,15 @@ def start_controller(
 
 @pytest.fixture(scope="module")
 def controller(
-    controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None
-) -> Iterator[Controller]:
-    """A controller with the usual options, for all tests of a module."""
+    controller_image: str, proxy_image: str, named: Robot, _no_other_controller: None,
+    request: pytest.FixtureRequest,
+) -> Iterator[Controller]:  # fmt: skip
+    """A controller for all tests of a module: the usual options, and those in its `OPTIONS`."""
     names = {named.name: named.address}
+    options = getattr(request.module, "OPTIONS", ())
     try:
         with running_controller(
-            controller_image, "--proxy-image", proxy_image, names=names
+            controller_image, "--proxy-image", proxy_image, *options, names=names
         ) as found:
             yield found
     finally:

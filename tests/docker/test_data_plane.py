@@ -17,6 +17,7 @@ from tests.docker.traffic import Traffic, crash, traffic
 
 KERNEL = (ENABLE, "rosproxy.data-plane=kernel", "rosproxy.ports=40")
 """Nodes of the test before hold their ports for a while, and each node is to have two."""
+OPTIONS = ("--allow-data-plane", "kernel")
 
 
 def status(proxy: Proxy) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import msgspec
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, SlaveControl
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
 
@@ -73,6 +73,7 @@ class Create(_CreateContainer, frozen=True):
     data_plane: DataPlane = "auto"
     fingerprint: str = ""
     replaces: str = ""
+    slave_control: SlaveControl = "any"
 
     def _more(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, SlaveControl
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.values import ALIAS, BUILT_IN, DATA_PLANE
@@ -59,8 +59,9 @@ def desire(
         there = {name for box in observed.sandboxes_of(key) for name in box.container.networks}
         networks = _networks(own) | (_networks(left) & there)
         plane = chosen_plane([*own, *left], settings.data_plane)
+        control = chosen_control([*own, *left], settings.slave_control)
         ports = max([settings.ports, *(member.ports for member in own)])
-        desired.append(Desired(key, bool(own), ports, networks & usable, own, plane))
+        desired.append(Desired(key, bool(own), ports, networks & usable, own, plane, control))
     told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
     return tuple(desired), (*told, *_outvoted(desired))
 
@@ -69,6 +70,15 @@ def chosen_plane(members: Iterable[Member], default: DataPlane) -> DataPlane:
     """The data plane of a proxy with these containers; ``default`` if none asks for one."""
     asked = {member.data_plane for member in members}
     return next((plane for plane in _PLANES if plane in asked), default)
+
+
+def chosen_control(members: Iterable[Member], default: SlaveControl) -> SlaveControl:
+    """Who may control the nodes of a proxy with these containers: the narrowest that one asks for.
+
+    A node is not to be open to all because of a neighbour; who asks for more only gets less.
+    """
+    asked = {default, *(member.slave_control for member in members)}
+    return "master" if "master" in asked else "any"
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:

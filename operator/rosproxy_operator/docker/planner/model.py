@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, SlaveControl
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which it is or may soon be somebody's node."""
@@ -13,7 +13,7 @@ STARTED = frozenset({"running", "paused"})
 SERVING = STARTED | {"restarting"}
 """States of a container that runs, or does again in a moment."""
 MOST_PORTS = 1000
-"""Ports that one proxy may ask for: each costs rules and, by default, a process of the engine."""
+"""Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
 GIBIBYTE = 1024 * 1024 * 1024
 WINDOW = PortRange(11400, 65535)
 """Where ports are looked for: above the master's and the admin endpoint's."""
@@ -27,6 +27,11 @@ class PlanSettings:
     without a label of their own. ``ports`` is the least number that a proxy gets, ``port_window``
     where they are looked for, ``publish_address`` the host's addresses on which they are published.
     ``grace`` is in seconds: how long a proxy outlives its last container.
+
+    What labels may ask for at most: a master that one of ``allow_master`` means (patterns as
+    `labels.bounds.read_master_pattern` gives them; none: see there), ``max_ports``, the planes of
+    ``allow_data_plane`` (none: all but kernel), and ``slave_control`` or less. The operator's own
+    options are allowed in any case.
 
     Each proxy may take ``proxy_memory`` bytes and have ``proxy_pids`` threads and processes; 0: any
     number. The defaults are several times what a thousand connections take at full rate
@@ -46,6 +51,10 @@ class PlanSettings:
     grace: float = 60.0
     uplink: str = "0-rosproxy"
     data_plane: DataPlane = "auto"
+    allow_master: tuple[str, ...] = ()
+    max_ports: int = 100
+    allow_data_plane: tuple[DataPlane, ...] = ()
+    slave_control: SlaveControl = "any"
     proxy_memory: int = GIBIBYTE
     proxy_pids: int = 8192
     secret: str = field(default="", repr=False)
@@ -206,10 +215,11 @@ class HostState:
 class Member:
     """A labelled container, and what it wants of its proxy: labels and settings put together.
 
-    ``ports`` is 0 and ``data_plane`` None without a label. ``networks`` are the names of those on
-    which it wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which
-    it looks for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help
-    it. A container that is not alive only keeps networks joined and the data plane for a while.
+    ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label. ``networks`` are
+    the names of those on which it wants to meet its proxy. ``needs`` is the host in its
+    ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
+    variable, empty where no alias can help it. A container that is not alive only keeps networks
+    joined, the data plane and the slave control for a while.
     """
 
     container: Container
@@ -218,6 +228,7 @@ class Member:
     networks: frozenset[str] = frozenset()
     needs: str = ""
     data_plane: DataPlane | None = None
+    slave_control: SlaveControl | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,3 +245,4 @@ class Desired:
     networks: frozenset[str] = frozenset()
     members: tuple[Member, ...] = ()
     data_plane: DataPlane = "auto"
+    slave_control: SlaveControl = "any"

@@ -254,7 +254,14 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
     proxies = context.observed.proxies_of(key)
     taken = context.taken(proxies)
     name = free_name(wanted, taken)
-    made = Create(name, key, context.ports, home.name, context.desired.data_plane)
+    made = Create(
+        name,
+        key,
+        context.ports,
+        home.name,
+        context.desired.data_plane,
+        slave_control=context.desired.slave_control,
+    )
     observed = context.observed
     expected = proxy_fingerprint(made, context.settings, observed.image_id, observed.secret)
     there = [one for one in proxies if one.container.name not in gone]

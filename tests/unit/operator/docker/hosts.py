@@ -31,13 +31,18 @@ from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engi
 HERE = "192.0.2.10"
 ROBOT = Key("http://robot:11311", HERE)
 SETTINGS = PlanSettings(
-    advertise_host=HERE, ports=2, port_window=PortRange(11400, 11415), grace=10.0
+    advertise_host=HERE,
+    ports=2,
+    port_window=PortRange(11400, 11415),
+    grace=10.0,
+    max_ports=3,
+    allow_data_plane=("auto", "kernel", "splice"),
 )
 EPHEMERAL = PortRange(11414, 11500)
 MASTERS = ("http://robot:11311", "http://arm:11312", "http://192.0.2.9:11402")
 NETWORKS = ("app", "lab", "inner", "0-early", "0-inner")
 COUNTS = ("2", "1", "3", "5", "nonsense")
-PLANES = ("", "kernel", "splice", "auto", "nonsense")
+PLANES = ("", "kernel", "splice", "auto", "copy", "nonsense")
 ENVS = ("", "http://rosproxy:11311", "http://robot:11311", "http://arm:11312")
 STATES = ("running", "exited", "created", "paused", "restarting", "dead", "removing")
 STRANGERS = ("robot", "rosproxy", "web", proxy_name(ROBOT), sandbox_name(ROBOT))

@@ -39,6 +39,10 @@ def test_the_defaults() -> None:
         ("--uplink", "-x", "'-x' is not a network's name"),
         ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
         ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
+        ("--allow-master", "a b", "'a b' is not of the form HOST or HOST:PORT"),
+        ("--max-ports", "1001", "1001 is not in the range 1<=x<=1000; for example 100"),
+        ("--allow-data-plane", "fast", "'fast' is not one of"),
+        ("--slave-control", "none", "'none' is not one of"),
         ("--proxy-memory", "much", "'much' is not a size from 64m on, such as 1g"),
         ("--proxy-memory", "8m", "'8m' is not a size from 64m on"),
         ("--proxy-pids", "9", "'9' is not a number from 256 on"),
@@ -64,12 +68,14 @@ def test_sizes(text: str, size: int) -> None:
     assert read_memory(text) == size
 
 
-def test_a_size_in_a_variable_and_a_secret_in_a_file(
+def test_lists_in_variables_and_a_secret_in_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "secret"
     file.write_text(f" {'s' * 32}\n")
     for name, value in (
+        ("ALLOW_MASTER", "robot arm*:11311"),
+        ("ALLOW_DATA_PLANE", "kernel copy"),
         ("PROXY_MEMORY", "512m"),
         ("SECRET_FILE", str(file)),
     ):
@@ -78,6 +84,8 @@ def test_a_size_in_a_variable_and_a_secret_in_a_file(
         main.commands["docker"].make_context("docker", [], auto_envvar_prefix="ROSPROXY").params
     )
     found = make_plan_settings(options)
+    assert found.allow_master == ("robot:*", "arm*:11311")
+    assert found.allow_data_plane == ("kernel", "copy")
     assert (found.proxy_memory, found.secret) == (512 * 1024**2, "s" * 32)
     file.write_text("short")
     result = run("docker", "plan", ROSPROXY_SECRET_FILE=str(file))

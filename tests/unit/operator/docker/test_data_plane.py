@@ -17,13 +17,13 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_fingerprint,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker import builders
 from tests.unit.operator.docker.builders import (
     ENABLED,
     IMAGE,
     KEY,
     RANGE,
     SECRET,
-    SETTINGS,
     container,
     observed,
     planned,
@@ -31,6 +31,7 @@ from tests.unit.operator.docker.builders import (
     sandbox,
 )
 
+SETTINGS = replace(builders.SETTINGS, allow_data_plane=("auto", "kernel", "splice", "copy"))
 LABEL = "rosproxy.data-plane"
 NAME = proxy_name(KEY)
 SANDBOX = CreateSandbox("s", KEY, RANGE, "f1")

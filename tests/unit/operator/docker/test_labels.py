@@ -156,7 +156,7 @@ def test_other_peoples_labels_are_not_ours(name: str) -> None:
     assert read(container(labels={name: "1"})) == (None, [])
 
 
-@pytest.mark.parametrize("value", ["1", "1000", " 32 "])
+@pytest.mark.parametrize("value", ["1", "100", " 32 "])
 def test_good_numbers_of_ports(value: str) -> None:
     assert good(container(labels={**ENABLED, "rosproxy.ports": value})).ports == int(value)
 

@@ -109,6 +109,12 @@ def test_a_proxy_is_bounded_in_memory_and_threads() -> None:
     assert not {"Memory", "PidsLimit"} & host.keys()
 
 
+def test_a_proxy_is_told_who_may_control_its_nodes() -> None:
+    narrow = structs.replace(PROXY, slave_control="master")
+    assert "ROSPROXY_SLAVE_CONTROL=master" in container_config(narrow, SETTINGS, SECRET, "")["Env"]
+    assert "SLAVE_CONTROL" not in str(container_config(PROXY, SETTINGS, SECRET, ""))
+
+
 def test_ports_are_published_on_each_address_asked_for() -> None:
     settings = replace(SETTINGS, publish_address=("192.0.2.10", "::"))
     bindings = sandbox_config(SANDBOX, settings)["HostConfig"]["PortBindings"]
@@ -146,6 +152,9 @@ def test_what_makes_a_proxy_anew() -> None:
     assert now != proxy_fingerprint(PROXY, SETTINGS, "sha256:2", SECRET)
     assert now != proxy_fingerprint(structs.replace(PROXY, range=RANGE), SETTINGS, IMAGE, SECRET)
     assert now != proxy_fingerprint(PROXY, SETTINGS, IMAGE, "another secret")
+    assert now != proxy_fingerprint(
+        structs.replace(PROXY, slave_control="master"), SETTINGS, IMAGE, SECRET
+    )
     for bound in (replace(SETTINGS, proxy_memory=0), replace(SETTINGS, proxy_pids=300)):
         assert now != proxy_fingerprint(PROXY, bound, IMAGE, SECRET)
     elsewhere = Key(KEY.master_uri, "192.0.2.11")

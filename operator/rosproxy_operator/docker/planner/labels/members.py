@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import values
+from rosproxy_operator.docker.planner.labels import bounds, values
 from rosproxy_operator.docker.planner.labels.values import (
     ADVERTISE_HOST,
     ENABLE,
@@ -54,7 +54,10 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
             if values.enabled(container.labels, _exposed(container, settings)):
-                requests.append(_request(container, observed, settings, proxies))
+                asked = _request(container, observed, settings, proxies)
+                request, texts = bounds.narrowed(asked, settings)
+                requests.append(request)
+                wrong += [_problem(container, text, False) for text in texts]
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
         problems += wrong if container.alive else []
@@ -100,6 +103,7 @@ def _request(
         ports=values.ports(container.labels),
         networks=values.networks(container, observed, settings.uplink),
         data_plane=values.data_plane(container.labels),
+        slave_control=values.slave_control(container.labels),
     )
 
 

@@ -10,8 +10,9 @@ from urllib.parse import urlsplit
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, SlaveControl
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import (
     MOST_PORTS,
     Container,
@@ -27,7 +28,8 @@ PORTS = "rosproxy.ports"
 ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
-LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE)
+SLAVE_CONTROL = "rosproxy.slave-control"
+LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, SLAVE_CONTROL)
 
 ALIAS = "rosproxy"
 """The name under which every proxy is found on the networks of its containers."""
@@ -88,6 +90,20 @@ def data_plane(labels: Labels) -> DataPlane | None:
     raise UnusableLabel(
         f"{named(DATA_PLANE, labels)} is none of {', '.join(planes)}: write {DATA_PLANE}=kernel "
         "for a proxy that lets the kernel forward, or leave it out"
+    )
+
+
+def slave_control(labels: Labels) -> SlaveControl | None:
+    """Who may call what controls a node, or None."""
+    if SLAVE_CONTROL not in labels:
+        return None
+    words: tuple[SlaveControl, ...] = get_args(SlaveControl)
+    for word in words:
+        if labels[SLAVE_CONTROL].strip().lower() == word:
+            return word
+    raise UnusableLabel(
+        f"{named(SLAVE_CONTROL, labels)} is none of {', '.join(words)}: write {SLAVE_CONTROL}="
+        "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
     )
 
 
@@ -180,11 +196,11 @@ def master_uri(container: Container, settings: PlanSettings, proxies: Collection
     """
     if MASTER_URI in container.labels:
         source = named(MASTER_URI, container.labels)
-        return _parse_master(source, container.labels[MASTER_URI], proxies)
+        return _allowed_master(source, container.labels[MASTER_URI], settings, proxies)
     where = parse_slave_uri(container.master_uri)
     if container.master_uri and not (where and _names_proxy(where.host.lower(), proxies)):
         source = f"its variable ROS_MASTER_URI={quoted(container.master_uri)}"
-        return _parse_master(source, container.master_uri, proxies)
+        return _allowed_master(source, container.master_uri, settings, proxies)
     if settings.master_uri:
         source = f"the operator's --master-uri {quoted(settings.master_uri)}"
         return _parse_master(source, settings.master_uri, proxies)
@@ -230,6 +246,14 @@ def _wrong_master(host: str, key: Key, fix: str) -> str:
 
 def _names_proxy(host: str, proxies: Collection[str]) -> bool:
     return host == ALIAS or host in proxies or is_proxy_name(host)
+
+
+def _allowed_master(source: str, uri: str, settings: PlanSettings, proxies: Collection[str]) -> str:
+    """A master that a container names: an image may carry both the label and the variable."""
+    found = _parse_master(source, uri, proxies)
+    if refusal := bounds.refused_master(found, settings):
+        raise UnusableLabel(f"{source} {refusal}")
+    return found
 
 
 def _parse_master(source: str, uri: str, proxies: Collection[str]) -> str:

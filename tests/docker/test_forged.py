@@ -1,0 +1,69 @@
+"""What an image can't get: more than the administrator allows."""
+
+import pytest
+
+from tests.docker.controller import Controller, Proxy, proxies, published_ranges, the_proxy
+from tests.docker.engine import inspect, wait_until
+from tests.docker.inside import ENABLE, Inside
+
+OPTIONS = ("--max-ports", "8")
+
+
+@pytest.fixture
+def proxy(controller: Controller, net: Inside) -> Proxy:
+    """The proxy of a container."""
+    network = net.network()
+    net.idle(network)
+    found = the_proxy()
+    wait_until(lambda: network in found.networks, 60, "the proxy has joined the network")
+    return found
+
+
+def test_labels_get_no_more_than_the_administrator_allows(
+    controller: Controller, net: Inside
+) -> None:
+    network = net.network()
+    labels = (ENABLE, "rosproxy.ports=9", "rosproxy.data-plane=kernel")
+    greedy = net.idle(network, labels=labels)
+
+    wait_until(
+        lambda: [len(ports) for ports in published_ranges()] == [8], 60, controller.logs
+    )  # fmt: skip
+
+    assert not inspect(the_proxy().name)["HostConfig"]["CapAdd"]
+    told = [line for line in controller.problems().splitlines() if greedy.name in line]
+    bounds = {"ports=9": "--max-ports 9", "data-plane=kernel": "--allow-data-plane kernel"}
+    for label, option in bounds.items():
+        assert any(f"label rosproxy.{label}" in line and option in line for line in told), told
+
+
+def test_label_takes_no_name_of_a_server_of_others(controller: Controller, net: Inside) -> None:
+    network = net.network()
+    uri = "http://api.example.com:443"
+    node = net.idle(network, uri="", labels=(ENABLE, f"rosproxy.master-uri={uri}"))
+
+    wait_until(lambda: node.name in controller.problems(), 60, controller.logs)
+
+    assert "--allow-master api.example.com:443" in controller.problems()
+    assert not [one for one in proxies() if network in one.networks]
+    assert node.resolve("api.example.com") == set()
+
+
+def test_proxy_is_bounded_and_has_no_token_and_its_controller_knows_it_anyway(
+    controller: Controller, net: Inside, proxy: Proxy
+) -> None:
+    found, before = inspect(proxy.name), proxy.id
+    host = found["HostConfig"]
+    assert (host["Memory"], host["PidsLimit"]) == (1024**3, 8192)
+    names = {word.partition("=")[0] for word in found["Config"]["Env"]}
+    assert "ROSPROXY_ADMIN_TOKEN_HASH" in names
+    assert "ROSPROXY_ADMIN_TOKEN" not in names
+
+    controller.kill()
+    controller.start()
+    network = net.network()
+    net.idle(network)
+
+    wait_until(lambda: network in proxy.networks, 60, controller.logs)
+    assert proxy.id == before
+    assert "HTTP 403" not in controller.logs()

@@ -1,0 +1,235 @@
+"""What labels may ask for: the administrator's word."""
+
+from dataclasses import replace
+
+import pytest
+
+from rosproxy.settings import SlaveControl
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.actions import Connect, Create, CreateSandbox
+from rosproxy_operator.docker.planner.labels.bounds import (
+    allowed_planes,
+    read_master_pattern,
+    refused_master,
+)
+from rosproxy_operator.docker.planner.model import Member, PlanSettings
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    ENABLED,
+    HERE,
+    SETTINGS,
+    container,
+    observed,
+    place,
+    planned,
+    read_members,
+)
+
+
+def read(settings: PlanSettings = SETTINGS, env: str = "", **labels: str) -> tuple[
+    Member | None, list[Problem]
+]:  # fmt: skip
+    """The member of one container with these labels, and what it is told."""
+    names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
+    one = container(labels={**ENABLED, **names}, env=env)
+    members, problems = read_members(observed(one), settings)
+    return next(iter(members), None), problems
+
+
+def asked(settings: PlanSettings = SETTINGS, **labels: str) -> tuple[Member, str]:
+    """What a container gets, and the one thing that it is told, if any."""
+    member, problems = read(settings, **labels)
+    assert member is not None
+    assert all(problem.subject == "container talker" for problem in problems)
+    assert not any(problem.fatal for problem in problems)
+    return member, "".join(problem.text for problem in problems)
+
+
+# masters
+
+
+def allowing(*patterns: str) -> PlanSettings:
+    return replace(SETTINGS, allow_master=tuple(map(read_master_pattern, patterns)))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "uri", "allowed"),
+    [
+        ("robot", "http://robot:11311", True),
+        ("robot", "http://robot:80", True),
+        ("Robot", "http://robot:11311", True),
+        ("robot", "http://robots:11311", False),
+        ("robot", "http://a.robot:11311", False),
+        ("robot:11311", "http://robot:11311", True),
+        ("http://robot:11311/", "http://robot:11311", True),
+        ("robot:11311", "http://robot:11312", False),
+        ("robot:113*", "http://robot:11312", True),
+        ("*:11311", "http://api.example.com:11311", True),
+        ("*:11311", "http://api.example.com:443", False),
+        ("*.lab.example", "http://robot.lab.example:11311", True),
+        ("*.lab.example", "http://lab.example:11311", False),
+        ("*.lab.example", "http://robot.lab.example.evil.com:11311", False),
+        ("arm?", "http://arm1:11311", True),
+        ("192.0.2.*", "http://192.0.2.7:11311", True),
+        ("[2001:db8::*]:11311", "http://[2001:db8::9]:11311", True),
+        ("[2001:db8::9]", "http://[2001:db8::8]:11311", False),
+        ("*", "http://whatever:1", True),
+    ],
+)
+def test_a_pattern(pattern: str, uri: str, allowed: bool) -> None:
+    assert (refused_master(uri, allowing(pattern)) == "") == allowed
+    assert refused_master(uri, allowing("nobody", pattern)) == "" or not allowed
+
+
+@pytest.mark.parametrize("text", ["", "a b", "robot:", "robot:x", "https://robot", "a/b", "[robot]",
+                                  "robot:123456", "rob[o]t"])  # fmt: skip
+def test_what_is_no_pattern(text: str) -> None:
+    with pytest.raises(ValueError, match="is not of the form HOST or HOST:PORT"):
+        read_master_pattern(text)
+
+
+def test_a_master_that_is_not_allowed() -> None:
+    for given in ({"master_uri": "http://api.example.com:8080"}, {"env": "api"}):
+        env = "http://api.example.com:8080" if "env" in given else ""
+        labels = {} if env else given
+        names = {f"rosproxy.{name.replace('_', '-')}": value for name, value in labels.items()}
+        one = container(labels={"rosproxy.enable": "true", **names}, env=env)
+        members, (problem,) = read_members(observed(one), allowing("robot", "arm*:11311"))
+        assert members == ()
+        assert (problem.subject, problem.fatal) == ("container talker", True)
+        source = "its variable ROS_MASTER_URI" if env else "label rosproxy.master-uri"
+        assert problem.text == (
+            f"{source}='http://api.example.com:8080' is none of the operator's --allow-master "
+            "(robot:*, arm*:11311): if it is one, start the operator with --allow-master "
+            "api.example.com:8080"
+        )
+
+
+def test_the_operators_own_master_needs_no_pattern() -> None:
+    settings = replace(allowing("arm"), master_uri="http://Robot:11311")
+    assert read(settings)[0] is not None
+    assert read(settings, master_uri="http://robot:11312")[0] is None
+
+
+@pytest.mark.parametrize("uri", ["http://api.example.com:443", "http://db:1023", "http://x:80"])
+def test_by_default_no_master_is_below_port_1024(uri: str) -> None:
+    """There a proxy would stand in the place of a web or mail server."""
+    member, problems = read(master_uri=uri)
+    assert member is None
+    (problem,) = problems
+    assert "names a port below 1024, where no ROS master is" in problem.text
+    assert f"--allow-master {uri.removeprefix('http://')}" in problem.text
+    assert read(allowing(uri), master_uri=uri)[0] is not None
+
+
+def test_nothing_is_made_and_no_name_taken_for_a_master_that_is_not_allowed() -> None:
+    one = container(labels={**ENABLED, "rosproxy.master-uri": "http://api.example.com:443"})
+    found = planned(observed(one), SETTINGS, DockerMemory(), 0.0)
+    assert found.actions == ()
+    assert found.members == ()
+
+
+def test_a_label_takes_no_name_that_a_neighbour_answers_to() -> None:
+    """Neither its name nor an alias, by which Compose has its services found."""
+    labels = {**ENABLED, "rosproxy.master-uri": "http://db:5432"}
+    for neighbour in (container("db", {}), container("x-db-1", {}, [place("app", "x-db-1", "DB")])):
+        seen = observed(container(labels=labels), neighbour)
+        found = planned(seen, SETTINGS, DockerMemory(), 0.0)
+        (joined,) = [one for one in found.actions if isinstance(one, Connect)]
+        assert "db" not in joined.aliases
+
+
+# ports
+
+
+@pytest.mark.parametrize(
+    ("option", "label", "gets"), [(100, 101, 100), (8, 33, 32), (40, 1000, 40)]
+)
+def test_more_ports_than_labels_may_ask_for(option: int, label: int, gets: int) -> None:
+    """It is --ports that an operator gives anyway."""
+    member, told = asked(replace(SETTINGS, max_ports=option), ports=str(label))
+    assert member.ports == gets
+    assert told == (
+        f"label rosproxy.ports={label} asks for more than labels may: its proxy gets {gets}; "
+        f"start the operator with --max-ports {label} if it is to have them"
+    )
+    seen = observed(container(labels={**ENABLED, "rosproxy.ports": str(label)}))
+    found = planned(seen, replace(SETTINGS, max_ports=option), DockerMemory(), 0.0)
+    (box,) = [one for one in found.actions if isinstance(one, CreateSandbox)]
+    assert len(box.range) == max(gets, SETTINGS.ports)
+
+
+def test_as_many_as_they_may() -> None:
+    for settings, label in (
+        (SETTINGS, 100),
+        (replace(SETTINGS, max_ports=1000), 1000),
+        (replace(SETTINGS, ports=500), 400),
+    ):
+        member, told = asked(settings, ports=str(label))
+        assert (member.ports, told) == (label, "")
+
+
+# data planes
+
+
+def test_which_data_planes_labels_may_ask_for() -> None:
+    assert allowed_planes(SETTINGS) == {"auto", "splice", "copy"}
+    assert allowed_planes(replace(SETTINGS, data_plane="kernel")) == {
+        *("auto", "kernel", "splice", "copy")
+    }
+    named = replace(SETTINGS, allow_data_plane=("kernel",), data_plane="copy")
+    assert allowed_planes(named) == {"kernel", "copy"}
+
+
+def test_a_data_plane_that_is_not_allowed() -> None:
+    member, told = asked(data_plane="kernel")
+    assert member.data_plane is None
+    assert told == (
+        "label rosproxy.data-plane=kernel asks for what labels may not: its proxy is as without "
+        "it; start the operator with --allow-data-plane kernel if it is to have that"
+    )
+    assert asked(replace(SETTINGS, allow_data_plane=("kernel",)), data_plane="kernel")[1] == ""
+
+
+# slave control
+
+
+@pytest.mark.parametrize(
+    ("option", "label", "gets", "told"),
+    [
+        ("any", None, "any", False),
+        ("any", "any", "any", False),
+        ("any", " Master", "master", False),
+        ("master", None, "master", False),
+        ("master", "master", "master", False),
+        ("master", "any", "master", True),
+    ],
+)
+def test_slave_control(option: SlaveControl, label: str | None, gets: str, told: bool) -> None:
+    settings = replace(SETTINGS, slave_control=option)
+    labels = {"slave_control": label} if label else {}
+    text = asked(settings, **labels)[1]
+    assert ("--slave-control is master, which labels can't widen" in text) == told
+    names = {"rosproxy.slave-control": label} if label else {}
+    others = container("other")
+    seen = observed(container(labels={**ENABLED, **names}), others)
+    found = planned(seen, settings, DockerMemory(), 0.0)
+    (made,) = [one for one in found.actions if isinstance(one, Create)]
+    assert made.slave_control == gets
+
+
+def test_a_slave_control_that_can_not_be() -> None:
+    member, (problem,) = read(slave_control="nobody")
+    assert member is None
+    assert problem.text.startswith("label rosproxy.slave-control='nobody' is none of any, master:")
+
+
+def test_who_has_exited_keeps_the_control_narrow_for_the_grace() -> None:
+    """A container that is restarted does not have its proxy made anew twice."""
+    narrow = {**ENABLED, "rosproxy.slave-control": "master"}
+    seen = observed(container("a"), container("b", narrow, state="exited"))
+    first = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    assert first.desired[0].slave_control == "master"
+    later = planned(seen, SETTINGS, first.memory, 60.0)
+    assert later.desired[0].slave_control == "any"
+    assert later.desired[0].key.advertise_host == HERE
