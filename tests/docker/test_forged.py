@@ -1,10 +1,12 @@
-"""What an image can't get: more than the administrator allows."""
+"""What an image can't get: to be taken for a proxy, or more than the administrator allows."""
+
+from collections.abc import Iterator
 
 import pytest
 
 from tests.docker.controller import Controller, Proxy, proxies, published_ranges, the_proxy
-from tests.docker.engine import inspect, wait_until
-from tests.docker.inside import ENABLE, Inside
+from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.inside import ENABLE, Inside, unique
 
 OPTIONS = ("--max-ports", "8")
 
@@ -17,6 +19,47 @@ def proxy(controller: Controller, net: Inside) -> Proxy:
     found = the_proxy()
     wait_until(lambda: network in found.networks, 60, "the proxy has joined the network")
     return found
+
+
+@pytest.fixture(params=["sandbox", "proxy"])
+def forged_image(
+    request: pytest.FixtureRequest, proxy: Proxy, ros_image: str
+) -> Iterator[str]:
+    """An image with all that an image can have of one of a proxy's containers."""
+    tag, made = unique("image"), docker("create", ros_image, "true")
+    name = proxy.sandbox if request.param == "sandbox" else proxy.name
+    changes = [f'LABEL {key}="{value}"' for key, value in inspect(name)["Config"]["Labels"].items()]
+    changes += ["USER 10001:10001", 'ENTRYPOINT ["sleep"]', 'CMD ["infinity"]']
+    try:
+        docker("commit", *(word for each in changes for word in ("--change", each)), made, tag)
+        yield tag
+    finally:
+        docker("rm", made)
+        docker("rmi", "--force", tag, check=False)
+
+
+def test_image_with_the_labels_of_a_proxy_is_told_and_left_alone(
+    controller: Controller, net: Inside, proxy: Proxy, forged_image: str
+) -> None:
+    before, ports = (proxy.id, inspect(proxy.sandbox)["Id"]), proxy.ports
+    alone, joined = net.network(), net.network()
+    forged = net.run(alone, image=forged_image, labels=(), uri="")
+    wait_until(lambda: forged.name in controller.problems(), 60, controller.logs)
+    text = next(line for line in controller.problems().splitlines() if forged.name in line)
+    assert "its name is not rosproxy-robot-" in text
+    assert f"docker rm -f {forged.name}" in text
+
+    net.idle(joined)
+    wait_until(lambda: joined in proxy.networks, 60, "the proxy has joined another network")
+    docker("rm", "--force", proxy.name)
+    wait_until(lambda: proxy.running, 60, lambda: docker("ps", "--all"))
+
+    assert (inspect(proxy.sandbox)["Id"], proxy.ports) == (before[1], ports)
+    found = inspect(forged.name)
+    assert found["State"]["Running"]
+    assert found["RestartCount"] == 0
+    assert set(found["NetworkSettings"]["Networks"]) == {alone}
+    assert inspect(proxy.name)["HostConfig"]["NetworkMode"] == f"container:{before[1]}"
 
 
 def test_labels_get_no_more_than_the_administrator_allows(

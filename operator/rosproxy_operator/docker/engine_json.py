@@ -12,6 +12,7 @@ import msgspec
 
 from rosproxy_operator.docker.client import Json
 from rosproxy_operator.docker.planner.model import Attachment, Container, Network
+from rosproxy_operator.docker.planner.own import Making
 from rosproxy_operator.docker.planner.specs import SECRET
 
 _NEVER = "0001-"
@@ -25,6 +26,9 @@ class _State(TypedDict, total=False):
 class _Config(TypedDict, total=False):
     Env: list[str] | None
     Hostname: str | None
+    User: str | None
+    Entrypoint: list[str] | None
+    Cmd: list[str] | None
 
 
 class _Binding(TypedDict, total=False):
@@ -33,6 +37,24 @@ class _Binding(TypedDict, total=False):
 
 class _HostConfig(TypedDict, total=False):
     PortBindings: dict[str, list[_Binding] | None] | None
+    # Only compared with what the operator gives its own: whatever these are in other containers.
+    NetworkMode: Any
+    ReadonlyRootfs: Any
+    CapAdd: list[str] | None
+    CapDrop: Any
+    SecurityOpt: Any
+    Sysctls: dict[str, Any] | None
+    Privileged: Any
+    Binds: Any
+    Mounts: Any
+    VolumesFrom: Any
+    Devices: Any
+    DeviceRequests: Any
+    GroupAdd: Any
+    PidMode: Any
+    IpcMode: Any
+    UTSMode: Any
+    UsernsMode: Any
 
 
 class _Endpoint(TypedDict, total=False):
@@ -45,6 +67,7 @@ class _NetworkSettings(TypedDict, total=False):
 
 
 class _Inspection(TypedDict, total=False):
+    Image: str | None
     State: _State | None
     Config: _Config | None
     HostConfig: _HostConfig | None
@@ -81,6 +104,17 @@ def signature(row: Json) -> tuple[tuple[str, str], ...]:
     )
 
 
+def read_making(inspected: Json | None) -> Making:
+    """How a container was made, from its inspection."""
+    words = (dig(inspected, "Config", key) or () for key in ("Entrypoint", "Cmd"))
+    return Making(
+        image=dig(inspected, "Image") or "",
+        user=dig(inspected, "Config", "User") or "",
+        command=tuple(word for each in words for word in each),
+        host=dig(inspected, "HostConfig") or {},
+    )
+
+
 def uplink_secret(rows: Iterable[Json], uplink: str) -> str:
     """The secret that the uplink network has, from the list of networks; empty if it is not there.
 
@@ -92,15 +126,20 @@ def uplink_secret(rows: Iterable[Json], uplink: str) -> str:
     return str(dig(found, "Labels", SECRET) or found["Id"]) if found else ""
 
 
+def name_of(row: Json) -> str:
+    """A container's name, from its row in the list."""
+    # One that is just being removed may have no name any more; one with a slash is a link's.
+    names = [name.lstrip("/") for name in row.get("Names") or () if name.count("/") == 1]
+    return str(names[0] if names else row["Id"][:12])
+
+
 def read_container(
     row: Json, inspected: Json | None, networks: Iterable[Network] = ()
 ) -> Container:
     """A container from its row in the engine's list and its inspection, if there is one."""
     network_names = {network.id: network.name for network in networks} | {"default": "bridge"}
     mode = dig(row, "HostConfig", "NetworkMode") or ""
-    # One that is just being removed may have no name any more; one with a slash is a link's.
-    names = [name.lstrip("/") for name in row.get("Names") or () if name.count("/") == 1]
-    name, short_id = (names or [row["Id"][:12]])[0], row["Id"][:12]
+    name, short_id = name_of(row), row["Id"][:12]
     aliases = {key: _aliases(end) for key, end in endpoints(inspected).items()}
     started = dig(inspected, "State", "StartedAt") or ""
     return Container(

@@ -17,6 +17,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.docker import engine_json
 from rosproxy_operator.docker.client import DockerClient, Json
 from rosproxy_operator.docker.errors import Conflict, EngineError, Gone, PortTaken
 from rosproxy_operator.docker.planner.actions import (
@@ -33,6 +34,7 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
+from rosproxy_operator.docker.planner.own import gives_away
 from rosproxy_operator.docker.planner.plan import Group
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
@@ -250,12 +252,13 @@ class DockerApplier:
                 labels = {MANAGED: "true", SECRET: look.fresh}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
             case CreateSandbox(name):
-                self._create(name, sandbox_config(action, self._settings))
+                config = sandbox_config(action, self._settings)
+                self._create(name, config, look.state.image_id)
             case Create(name, key):
                 secret, masters = look.state.secret, look.state.masters
                 address = masters.get(master(key).host.lower(), "")
                 config = container_config(action, self._settings, secret, address)
-                self._create(name, config)
+                self._create(name, config, look.state.image_id)
             case Start(name):
                 do("start", name)
             case Restart(name):
@@ -286,12 +289,14 @@ class DockerApplier:
                 self._do(Disconnect(name, network), look)
         self._engine.do("remove_container", name, force=True)
 
-    def _create(self, name: str, config: Json) -> None:
+    def _create(self, name: str, config: Json, image_id: str) -> None:
         try:
             self._engine.do("create_container_from_config", config, name)
         except Conflict:
-            labels = self._engine.container(name)["Config"].get("Labels") or {}
-            if read_own(labels) is None:
+            found = self._engine.container(name)
+            own = read_own(found["Config"].get("Labels") or {})
+            making = engine_json.read_making(found)
+            if own is None or gives_away(own, name, making, image_id):
                 raise EngineError(
                     f"a container that is not this operator's is called {name}; "
                     f"rename it (docker rename {name} …) or remove it"

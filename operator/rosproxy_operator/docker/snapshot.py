@@ -28,9 +28,11 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
+from rosproxy_operator.docker.planner.own import gives_away, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
     ROLE_SANDBOX,
+    OwnLabels,
     admin_port,
     proxy_token,
     read_own,
@@ -174,12 +176,12 @@ class DockerObserver:
         )
         # What is the operator's own is inspected at each look: a proxy's container has no network
         # by which to see that it was started anew, and the list is late to tell that one has ended.
-        mine = [row["Id"] for row in rows if read_own(row.get("Labels") or {})]
+        mine = [row["Id"] for row in rows if self._read_own(row)]
         await self._inspector.update(rows, mine, patience)
         networks = tuple(map(engine_json.read_network, found))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         at_host = any(map(host.has, bridges))
-        state = self._read(rows, networks, listening if at_host else frozenset())
+        state = self._read(rows, networks, image, listening if at_host else frozenset())
         secret = self._settings.secret or engine_json.uplink_secret(found, self._settings.uplink)
         state = replace(state, image_id=image, secret=secret or self._fresh)
         labels = read_labels(state, self._settings)
@@ -198,20 +200,39 @@ class DockerObserver:
             fresh=self._fresh,
         )
 
+    def _read_own(self, row: Json) -> OwnLabels | None:
+        """What the labels of a container say that may be the operator's own, by its name."""
+        own = read_own(row.get("Labels") or {})
+        nameless = not row.get("Names")  # it is just being removed
+        return own if own and (nameless or has_own_name(own, engine_json.name_of(row))) else None
+
     def _read(
-        self, rows: list[Json], networks: tuple[Network, ...], listening: frozenset[int]
+        self,
+        rows: list[Json],
+        networks: tuple[Network, ...],
+        image: str,
+        listening: frozenset[int],
     ) -> HostState:
-        """The containers, the operator's own apart from others."""
+        """The containers, the operator's own apart from others.
+
+        One that only claims to be its own is like any other. One that is not inspected yet counts
+        as own if its name is right: until it is known, nothing is done to it.
+        """
         containers, sandboxes, proxies = [], [], []
         busy: set[str] = set()
         for row in rows:
-            own = read_own(row.get("Labels") or {})
+            own, forged = self._read_own(row), ""
             inspected = self._inspector.get(row["Id"])
             if own is None and inspected is None:
                 continue
             container = engine_json.read_container(row, inspected, networks)
-            if own is None:
-                containers.append(container)
+            claimed = read_own(container.labels)
+            if claimed and inspected is not None and row.get("Names"):
+                making = engine_json.read_making(inspected)
+                forged = gives_away(claimed, container.name, making, image)
+            if own is None or forged:
+                containers.append(replace(container, forged=forged))
+                own = None
             elif own.role == ROLE_SANDBOX:
                 sandboxes.append(Sandbox(own.key, container, own.range, own.fingerprint))
             else:

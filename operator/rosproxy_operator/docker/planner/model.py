@@ -84,7 +84,8 @@ class Container:
     ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name,
     ``master_uri`` ROS_MASTER_URI of its environment or empty. ``host_ports`` are the TCP ports that
     it publishes on the host, or will once it is started. ``started_at`` is empty if it never was,
-    or if nobody asked.
+    or if nobody asked. ``forged`` says of one that has the labels of this operator's own what shows
+    that it is none; it is empty for all others.
     """
 
     id: str
@@ -97,6 +98,7 @@ class Container:
     host_ports: frozenset[int] = frozenset()
     hostname: str = ""
     started_at: str = ""
+    forged: str = ""
 
     @property
     def alive(self) -> bool:

@@ -43,7 +43,10 @@ _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 
 Said in so many words, as an engine may have no-new-privileges for its default.
 """
-_USER = "10001:10001"
+USER = "10001:10001"
+SANDBOX_COMMAND = ("sleep", "infinity")
+PROXY_COMMAND = ("rosproxy", "run")
+"""What the proxy's image does by itself (its Dockerfile): the operator gives no other command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,9 +165,9 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
     }
     return {
         "Image": settings.proxy_image,
-        "User": _USER,
-        "Entrypoint": ["sleep"],
-        "Cmd": ["infinity"],
+        "User": USER,
+        "Entrypoint": [*SANDBOX_COMMAND[:1]],
+        "Cmd": [*SANDBOX_COMMAND[1:]],
         "Healthcheck": {"Test": ["NONE"]},
         "Labels": own_labels(made),
         "ExposedPorts": {port: {} for port in bindings},
@@ -201,7 +204,7 @@ def container_config(
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,
-        "User": _USER,
+        "User": USER,
         "Env": [f"{name}={value}" for name, value in variables.items() if value],
         "Labels": own_labels(made),
         "HostConfig": {
@@ -212,6 +215,15 @@ def container_config(
             "NetworkMode": f"container:{made.sandbox}",
         },
     }
+
+
+def is_kernel_host(host: Mapping[str, Any]) -> bool:
+    """Whether a proxy's HostConfig, as the engine tells it, has the rights of the kernel plane.
+
+    Engines lead capabilities by ``CAP_`` or not.
+    """
+    added = [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()]
+    return added == _KERNEL["CapAdd"] and host.get("SecurityOpt") == _KERNEL["SecurityOpt"]
 
 
 def _digest(body: Mapping[str, Any]) -> str:

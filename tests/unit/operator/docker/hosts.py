@@ -18,6 +18,7 @@ from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
     ROLE_SANDBOX,
     OwnLabels,
+    own_labels,
     proxy_fingerprint,
     proxy_name,
     reserved_ports,
@@ -139,6 +140,18 @@ class Hosts:
         if not self.engine.conflicts(box) and n % 2:
             box.state = "running"
 
+    def forge(self, n: int, m: int) -> None:
+        """A container of an image that has the labels of what the operator makes."""
+        own = [box.labels for box in self.boxes()]
+        made = CreateSandbox("", ROBOT, PortRange(11400, 11401))
+        name = f"forged{next(self.engine.ids)}"
+        if len(self.strangers()) > 6:
+            return
+        labels = pick([own_labels(made), *own], n)
+        box = self.engine.add(name, labels=labels, state=pick(STATES[:3], m // 5))
+        if networks := sorted(self.engine.networks.keys()):
+            self.engine.join(box, pick(networks, m))
+
     # networks, ports, image
 
     def make_network(self, n: int, _: int) -> None:
@@ -210,9 +223,13 @@ class Hosts:
             self.engine.boxes.remove(pick(boxes, n))
 
     def rename_own(self, n: int, m: int) -> None:
-        name = pick(("odd", f"{proxy_name(ROBOT)}-old", f"{sandbox_name(ROBOT)}-old"), m)
-        if (boxes := self.boxes()) and not self.engine.named(name):
-            pick(boxes, n).name = name
+        """Under any other name it would be a stranger, for all that the operator knows."""
+        if boxes := self.boxes():
+            box = pick(boxes, n)
+            own = sandbox_name if box.role == ROLE_SANDBOX else proxy_name
+            name = own(box.own.key) + pick(("-old", "-2", "-old-2"), m) if box.own else ""
+            if name and not self.engine.named(name):
+                box.name = name
 
     def detach_own(self, n: int, m: int) -> None:
         if boxes := self.boxes(role=ROLE_SANDBOX):

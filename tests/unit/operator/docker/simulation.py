@@ -27,6 +27,7 @@ from rosproxy_operator.docker.planner.model import (
     Proxy,
     Sandbox,
 )
+from rosproxy_operator.docker.planner.own import has_own_name
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
     ROLE_PROXY,
@@ -73,7 +74,9 @@ class Box:
 
     @property
     def own(self) -> OwnLabels | None:
-        return read_own(self.labels)
+        """What its labels say, if its name agrees: nothing else gives one away here."""
+        found = read_own(self.labels)
+        return found if found and has_own_name(found, self.name) else None
 
     @property
     def role(self) -> str:
@@ -168,6 +171,7 @@ class Engine:
             master_uri=box.env,
             host_ports=box.ports,
             started_at=box.started_at,
+            forged="" if box.own or read_own(box.labels) is None else "its name is not its own",
         )
 
     # what the operator does

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.metrics import DockerMetrics
@@ -12,6 +13,7 @@ from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.planner.plan import plan
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     own_labels,
@@ -20,9 +22,10 @@ from rosproxy_operator.docker.planner.specs import (
     sandbox_config,
     sandbox_name,
 )
+from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.snapshot import DockerObserver
 from tests.unit.operator.docker import captured
-from tests.unit.operator.docker.builders import KEY, RANGE, inspection
+from tests.unit.operator.docker.builders import IMAGE, KEY, RANGE, inspection
 from tests.unit.operator.docker.conftest import FakeEngine
 
 SETTINGS = PlanSettings(advertise_host=KEY.advertise_host, secret="secret")
@@ -91,6 +94,45 @@ async def test_without_a_file_the_secret_is_the_uplinks(engine: FakeEngine) -> N
     engine.knows["/networks"].append(uplink | {"Labels": {"io.rosproxy.secret": "kept"}})
     assert (await looking.look(5.0)).state.secret == "kept"
     assert (await observer().look(5.0)).state.secret == "secret"
+
+
+def forged(number: str, name: str, **more: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A container of an image that has all that an image can have of a sandbox."""
+    row = own(structs.replace(BOX, name=name), number, "app", "172.29.0.66")
+    body = {**sandbox_config(BOX, SETTINGS), "HostConfig": {"NetworkMode": "app"}}
+    return row, inspection(body, State={"Status": "running", "StartedAt": "1"}, **more)
+
+
+@pytest.mark.parametrize("name", ["evil", BOX.name])
+async def test_a_forged_container_is_told_and_left_alone(engine: FakeEngine, name: str) -> None:
+    """Also by its name alone, without which nobody gets as far."""
+    del engine.rows[1:]
+    engine.knows[f"/images/{SETTINGS.proxy_image}/json"] = {"Id": IMAGE}
+    row, inspected = forged("e" * 64, name)
+    inspected["HostConfig"]["PortBindings"] = {"80/tcp": [{"HostPort": "11400"}]}
+    engine.add(row, inspected)
+    look = await observer().look(5.0)
+    assert not look.state.own
+    assert not look.state.busy
+    assert not look.access
+    found = next(one for one in look.state.containers if one.name == name)
+    assert found.host_ports == {18080, 11400}
+    planned = plan(look.state, look.labels, SETTINGS, DockerMemory(), 0.0)
+    assert CreateSandbox in map(type, planned.actions)
+    assert name not in {one.name for one in planned.actions}
+    (told,) = [one.text for one in planned.problems if one.subject == f"container {name}"]
+    assert "left alone" in told
+    assert f"docker rm -f {name}" in told
+    assert not any(11400 in ports for ports in planned.memory.planned.values())
+
+
+async def test_a_forged_container_does_not_hold_up_what_is_own(engine: FakeEngine) -> None:
+    """It claims to be another sandbox of the same key, and nobody knows yet how it was made."""
+    row, _ = forged("e" * 64, "evil")
+    engine.rows.append(row)
+    look = await observer().look(5.0)
+    assert [box.container.name for box in look.state.sandboxes] == [BOX.name]
+    assert not look.state.busy
 
 
 async def test_what_is_not_inspected_yet_is_busy_or_left_out(engine: FakeEngine) -> None:

@@ -27,6 +27,7 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.specs import (
+    own_labels,
     proxy_token,
     sandbox_config,
     sandbox_name,
@@ -149,8 +150,16 @@ async def test_anything_else_is_an_error(engine: FakeEngine, action: Action) -> 
         await carry_out(action)
 
 
-async def test_a_name_that_a_stranger_has(engine: FakeEngine) -> None:
+@pytest.mark.parametrize(
+    "found",
+    [
+        {"Config": {"Labels": None}},
+        {"Config": {"Labels": own_labels(BOX), "User": "root"}, "HostConfig": {}},
+    ],
+    ids=["without labels", "with forged ones"],
+)
+async def test_a_name_that_a_stranger_has(engine: FakeEngine, found: dict[str, Any]) -> None:
     engine.refuses["POST /containers/create"] = (409, "in use")
-    engine.knows[f"/containers/{BOX.name}/json"] = {"Config": {"Labels": None}}
+    engine.knows[f"/containers/{BOX.name}/json"] = found
     with pytest.raises(EngineError, match=f"not this operator's is called {BOX.name}; rename it"):
         await carry_out(ACTIONS[1])

@@ -15,6 +15,7 @@ from tests.unit.operator.docker.hosts import SETTINGS, Hosts
 
 CONTAINERS = (
     Hosts.run, Hosts.change, Hosts.remove, Hosts.attach, Hosts.detach, Hosts.rename, Hosts.stranger,
+    Hosts.forge,
 )  # fmt: skip
 SURROUNDINGS = (
     Hosts.make_network, Hosts.remove_network, Hosts.take_port, Hosts.take_own_port,

@@ -132,7 +132,13 @@ def _own(container: Container) -> list[str]:
 
 
 def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
-    if container.labels.get(MANAGED) == "true":
+    if container.forged:
+        yield (
+            f"has the labels of a container that this operator makes, but {container.forged}: an "
+            "image may carry labels, so it is left alone and nothing that they say is believed: "
+            f"docker rm -f {container.name}, or take them off"
+        )
+    elif container.labels.get(MANAGED) == "true":
         yield (
             f"has the label {MANAGED}, which is for proxies made by this operator, but not the "
             f"others that go with it, so it is left alone: docker rm -f {container.name}, or take "

@@ -1,0 +1,130 @@
+"""Which containers are this operator's own: their labels say so, and nothing gives them away.
+
+The operator has no disk, so it knows its containers by their labels; but an image may carry labels
+as well, together with variables, a command and a user. What an image has no say in is the
+container's name and its HostConfig: these belong to whoever creates the container. So one is own
+only if both are as this operator makes them, and nothing is read of one that is not: neither its
+range nor its key.
+
+There is no mark besides that only the operator could compute (an HMAC in a label). Who can create
+containers with a name and a HostConfig of his choice speaks to the engine, and is root on its host:
+he can read any secret of the operator's, and needs no forged container. And an operator that has
+lost its secret still has to know its containers, to make them anew on the same ports.
+
+What ``docker update`` may change on a running container (memory, threads, restart policy) is not
+looked at, nor what options of the operator decide, as the uplink or the published addresses: these
+make a container anew, and must not make a stranger of it.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from rosproxy_operator.docker.planner.specs import (
+    PROXY_COMMAND,
+    ROLE_SANDBOX,
+    SANDBOX_COMMAND,
+    USER,
+    OwnLabels,
+    is_kernel_host,
+    proxy_name,
+    sandbox_name,
+)
+
+_TEMPORARY = r"(-\d+)?(-old(-\d+)?)?"
+"""What stands behind a name while another container takes over, or has it: `selection.free_name`"""
+_NEVER = (
+    *("Privileged", "Binds", "Mounts", "VolumesFrom", "Devices", "DeviceRequests", "GroupAdd"),
+    *("PidMode", "UTSMode", "UsernsMode"),
+)
+"""Of the HostConfig what the operator never sets."""
+_OWN_IPC = (None, "", "private", "shareable")
+"""What engines have for IpcMode where nothing was said."""
+_SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
+
+
+@dataclass(frozen=True, slots=True)
+class Making:
+    """How a container was made, in the engine's words.
+
+    ``image`` is the id of its image, ``host`` its HostConfig. ``command`` are entry point and
+    command, whether given or the image's.
+    """
+
+    image: str = ""
+    user: str = ""
+    command: tuple[str, ...] = ()
+    host: Mapping[str, Any] = field(default_factory=dict)
+
+
+def has_own_name(own: OwnLabels, name: str) -> bool:
+    """Whether a name is one that a container with these labels can have."""
+    return re.fullmatch(re.escape(_name(own)) + _TEMPORARY, name) is not None
+
+
+def gives_away(own: OwnLabels, name: str, making: Making, image_id: str) -> str:
+    """What shows that a container is none of this operator's, though its labels say so.
+
+    Empty if nothing does. ``image_id`` is that of the proxies' image now. A container of a former
+    image must at least have the user and the command of one.
+    """
+    if not has_own_name(own, name):
+        return f"its name is not {_name(own)}"
+    if making.user != USER:
+        return f"its user is not {USER}"
+    sandbox = own.role == ROLE_SANDBOX
+    command = SANDBOX_COMMAND if sandbox else PROXY_COMMAND
+    if making.command != command and (sandbox or making.image != image_id):
+        return f"its command is not {' '.join(command)}"
+    odd = _odd_sandbox(own, making.host) if sandbox else _odd_proxy(making.host)
+    return next((f"its HostConfig.{name} is none that it gives" for name in odd), "")
+
+
+def _name(own: OwnLabels) -> str:
+    return sandbox_name(own.key) if own.role == ROLE_SANDBOX else proxy_name(own.key)
+
+
+def _odd(host: Mapping[str, Any]) -> Iterator[str]:
+    """The fields of a HostConfig that are otherwise on each container of the operator's."""
+    if host.get("ReadonlyRootfs") is not True:
+        yield "ReadonlyRootfs"
+    if host.get("CapDrop") != ["ALL"]:
+        yield "CapDrop"
+    yield from (name for name in _NEVER if host.get(name))
+    if host.get("IpcMode") not in _OWN_IPC:
+        yield "IpcMode"
+
+
+def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
+    yield from _odd(host)
+    if host.get("CapAdd"):
+        yield "CapAdd"
+    if host.get("SecurityOpt") != ["no-new-privileges:true"]:
+        yield "SecurityOpt"
+    mode = str(host.get("NetworkMode"))
+    if mode in ("host", "none") or mode.startswith("container:"):
+        yield "NetworkMode"
+    bindings = host.get("PortBindings") or {}
+    wanted = {f"{port}/tcp": {str(port)} for port in own.range.ports()}
+    found = {
+        port: {str(each.get("HostPort")) for each in bound or ()}
+        for port, bound in bindings.items()
+    }
+    if found != wanted:
+        yield "PortBindings"
+    sysctls = (host.get("Sysctls") or {}).keys()
+    if "net.ipv4.ip_local_port_range" not in sysctls or not sysctls <= _SYSCTLS:
+        yield "Sysctls"
+
+
+def _odd_proxy(host: Mapping[str, Any]) -> Iterator[str]:
+    yield from _odd(host)
+    if not is_kernel_host(host):
+        if host.get("CapAdd"):
+            yield "CapAdd"
+        if host.get("SecurityOpt") != ["no-new-privileges:true"]:
+            yield "SecurityOpt"
+    if not str(host.get("NetworkMode")).startswith("container:"):
+        yield "NetworkMode"
+    yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
