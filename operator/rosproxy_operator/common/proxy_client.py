@@ -1,7 +1,7 @@
 """Asking and telling running proxies, over their admin endpoints."""
 
 import errno
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import aiohttp
@@ -51,6 +51,10 @@ class ProxyClient:
         """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
         text = await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
         return _read(text, where)
+
+    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
+        """Tell which addresses may use it as their master: those of what its labels select."""
+        await self._ask("POST", where, "/containers", token, {"selected": sorted(addresses)})
 
     async def retire(self, where: HostPort, token: str) -> Json:
         """Let it unregister everything it holds at the master."""

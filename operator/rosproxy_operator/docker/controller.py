@@ -132,10 +132,10 @@ class DockerController:
         self._memory, self._last = planned.memory, (look, planned)
         if look.state.busy and not self._observer.waiting:
             self._loop.wake_in(SETTLED)  # nobody is going to tell when the list is right
+        self._proxy_sync.update(look, planned.members)  # first: calls of new containers wait for it
         self._executor.start(
             planned.groups, lambda action: self._applier.carry_out(action, look), started
         )
-        self._proxy_sync.update(look, planned.members)
         problems = self._current(look, planned)
         self._log.update(problems)
         metrics = self._metrics

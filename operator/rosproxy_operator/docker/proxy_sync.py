@@ -1,4 +1,8 @@
-"""Keeping the proxies up to date about the containers on their networks, each apart."""
+"""Keeping the proxies up to date about the containers on their networks, each apart.
+
+Who may use a proxy as its master goes to it by itself and first: the call of a new container waits
+for that, while all other news may take a proxy long (it asks nodes and its master).
+"""
 
 import asyncio
 import contextlib
@@ -25,7 +29,8 @@ STARTING = 8.0
 class ProxyUpdater:
     """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
-    The proxy is asked for its nodes after each look, and told what is new (`ProxyNews`).
+    After each look the proxy is told who may use it as its master, whether or not that has changed,
+    asked for its nodes, and told what is new (`ProxyNews`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
     """
 
@@ -37,15 +42,41 @@ class ProxyUpdater:
         self.silent_since: float | None = time.monotonic()
         self._name, self._proxies, self._answered = name, proxies, answered
         self._news = ProxyNews()
-        self._looked = asyncio.Event()
+        self._looked, self._selecting = asyncio.Event(), asyncio.Event()
 
     def update(self, known: NetworkFacts) -> None:
         """Take note of what a look has found."""
         self._news.look(known, time.monotonic())
         self._looked.set()
+        self._selecting.set()
 
     async def run(self) -> None:
         """Tell what there is to be told, for good."""
+        async with asyncio.TaskGroup() as both:
+            both.create_task(self._keep_selected())
+            both.create_task(self._keep_told())
+
+    async def _keep_selected(self) -> None:
+        """Tell after each look who may use the proxy as its master."""
+        failures, told = 0, ""
+        while True:
+            await self._selecting.wait()
+            self._selecting.clear()
+            addresses = self._news.facts.selected
+            try:
+                await self._proxies.selected(self.access.admin, self.access.token, addresses)
+                failures, told = 0, ""
+            except ProxyError as error:
+                if not error.away and failures >= len(PAUSES) and str(error) != told:
+                    told = str(error)
+                    text = "%s could not be told who may use it: %s"
+                    log.warning(text, self._name, error, extra={"proxy": self._name})
+                self._selecting.set()
+                await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
+                failures += 1
+
+    async def _keep_told(self) -> None:
+        """Tell what else is new."""
         failures = 0
         while True:
             pause = self._news.next_due(time.monotonic())

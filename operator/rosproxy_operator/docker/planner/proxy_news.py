@@ -6,7 +6,7 @@ is forgotten until the proxy has heard it. Times are seconds of a monotonic cloc
 """
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 from typing import Any
@@ -54,7 +54,8 @@ class NetworkFacts:
     ``addresses`` are those of running containers on its networks, by container id and network;
     ``taken`` those of all containers and gateways. ``subnets`` are those of its networks,
     ``running`` the ids of all containers that run. ``master_address`` is empty if there is nothing
-    to be told.
+    to be told. ``selected`` are the addresses, on its networks, of all containers whose labels mean
+    this proxy: those that may use it as their master.
     """
 
     master_address: str = ""
@@ -63,6 +64,7 @@ class NetworkFacts:
     subnets: tuple[IPv4Network, ...] = ()
     arrivals: frozenset[ContainerArrival] = frozenset()
     running: frozenset[str] = frozenset()
+    selected: frozenset[str] = frozenset()
 
 
 class Places:
@@ -185,7 +187,7 @@ class ProxyNews:
         return max(min(times) - now, 0.0) if times else None
 
 
-def facts(observed: HostState, proxy: Proxy, members: Iterable[Member]) -> NetworkFacts:
+def facts(observed: HostState, proxy: Proxy, members: Collection[Member]) -> NetworkFacts:
     """What a look says to a proxy. ``members`` are those of all proxies."""
     host, box = master(proxy.key).host.lower(), observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
@@ -212,6 +214,12 @@ def facts(observed: HostState, proxy: Proxy, members: Iterable[Member]) -> Netwo
             for arrival in _arrivals(member.container, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
+        selected=frozenset(
+            place.address
+            for member in members
+            if member.key == proxy.key and member.container.alive
+            for place in _places(_host(member.container, by_id), joined)
+        ),
     )
 
 
@@ -219,11 +227,16 @@ def _places(container: Container, networks: Collection[str]) -> list[Attachment]
     return [each for each in container.attachments if each.network in networks and each.address]
 
 
+def _host(container: Container, by_id: Mapping[str, Container]) -> Container:
+    """The container in whose network namespace another one is: itself, if it has its own."""
+    return by_id.get(container.shares or container.id, container)
+
+
 def _arrivals(
     container: Container, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
-    host = by_id.get(container.shares or container.id, container)
+    host = _host(container, by_id)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}

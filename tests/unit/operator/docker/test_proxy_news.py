@@ -95,6 +95,21 @@ def test_the_masters_address_is_only_told_for_a_name() -> None:
     assert facts(seen, process, ()).master_address == ""
 
 
+def test_selected_are_all_that_may_use_it_on_its_networks() -> None:
+    """Also those that are just starting, and those in the network of another container."""
+    starting = Container("s" * 20, "soon", "created", attachments=(at("172.18.0.7"),))
+    ended = Container("e" * 20, "ended", "exited", attachments=(at("172.18.0.8"),))
+    pod = Container("q" * 20, "pod", "running", attachments=(at("172.18.0.9"),))
+    guest = Container("g" * 20, "guest", "running", network_mode=f"container:{'q' * 20}")
+    away = Container("a" * 20, "away", "running", attachments=(at("172.19.0.5", "other"),))
+    plain = Container("n" * 20, "plain", "running", attachments=(at("172.18.0.10"),))
+    others = Container("o" * 20, "others", "running", attachments=(at("172.18.0.11"),))
+    seen = look(talker(), starting, ended, pod, guest, away, plain, others)
+    members = [member(one) for one in (talker(), starting, ended, guest, away)]
+    known = told(seen, *members, Member(others, Key("http://other:11311", "192.0.2.10")))
+    assert known.selected == {"172.18.0.5", "172.18.0.7", "172.18.0.9"}
+
+
 def test_gone_are_addresses_of_nobody_on_its_networks() -> None:
     nodes = {"172.18.0.5", "172.18.0.6", "172.18.0.1", "10.0.0.9", "talker"}
     for known, addresses in (

@@ -1,0 +1,101 @@
+"""Telling proxies who may use them as their master, whatever else there is to be told."""
+
+import asyncio
+from collections.abc import AsyncIterator, Collection
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.tasks import Tasks
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.docker import proxy_sync
+from rosproxy_operator.docker.planner.labels.members import LabelReading
+from rosproxy_operator.docker.planner.model import Attachment, Member
+from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
+from tests.unit.operator.docker.builders import KEY, both, container, observed
+
+WHERE = HostPort("172.30.0.2", 11312)
+FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token", "run 2")
+
+
+class Proxies(ProxyClient):
+    """A proxy that notes whom it is told of, and never answers anything else."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[list[str]] = []
+        self.heard = asyncio.Event()
+        self.errors: list[ProxyError] = []
+
+    async def status(self, where: HostPort) -> Any:
+        await asyncio.Event().wait()
+
+    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
+        assert (where, token) == (WHERE, "token")
+        if self.errors:
+            raise self.errors.pop()
+        self.told.append(sorted(addresses))
+        self.heard.set()
+
+    async def next(self) -> list[str]:
+        await asyncio.wait_for(self.heard.wait(), 30)
+        self.heard.clear()
+        return self.told[-1]
+
+
+@pytest.fixture
+async def tasks() -> AsyncIterator[Tasks]:
+    tasks = Tasks()
+    yield tasks
+    await tasks.cancel()
+
+
+def look(*addresses: str, access: ProxyAccess = FIRST) -> tuple[DockerSnapshot, list[Member]]:
+    """Containers at these addresses, which a proxy's labels select, on its network."""
+    nodes = [
+        container(f"node{number}", networks=[Attachment("app", address)])
+        for number, address in enumerate(addresses)
+    ]
+    own = both()
+    box = own["sandboxes"][0]
+    home = Attachment("app", "172.18.0.2")
+    own["sandboxes"] = [replace(box, container=replace(box.container, attachments=(home,)))]
+    state = observed(*nodes, **own)
+    name = state.proxies[0].container.name
+    seen = DockerSnapshot(state, LabelReading(), {name: access}, at_host=True)
+    return seen, [Member(node, KEY) for node in nodes]
+
+
+async def test_who_may_use_it_is_told_though_the_proxy_is_busy_with_all_else(tasks: Tasks) -> None:
+    proxies = Proxies()
+    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    sync.update(*look("172.18.0.5"))
+    assert await proxies.next() == ["172.18.0.5"]
+    sync.update(*look("172.18.0.5", "172.18.0.6"))
+    assert await proxies.next() == ["172.18.0.5", "172.18.0.6"]
+    sync.update(*look())
+    assert await proxies.next() == []
+
+
+async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: Tasks) -> None:
+    proxies = Proxies()
+    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    for access in (FIRST, FIRST, SECOND):
+        sync.update(*look("172.18.0.5", access=access))
+        assert await proxies.next() == ["172.18.0.5"]
+
+
+async def test_what_was_not_heard_is_told_again(
+    tasks: Tasks, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(proxy_sync, "PAUSES", (0.0, 0.0))
+    proxies = Proxies()
+    proxies.errors = [ProxyError("answers HTTP 400: selected: unknown field")] * 5
+    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    sync.update(*look("172.18.0.5"))
+    assert await proxies.next() == ["172.18.0.5"]
+    (told,) = caplog.messages
+    assert "could not be told who may use it: answers HTTP 400" in told
