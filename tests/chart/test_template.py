@@ -105,7 +105,8 @@ def test_arguments(combination: str) -> None:
 def check_webhook(webhook: WebhookSettings | None, ports: Any, found: list[Json]) -> None:
     configurations = of_kind(found, "MutatingWebhookConfiguration")
     assert bool(webhook) == ("webhook" in ports) == bool(configurations)
-    secrets = [one["metadata"]["name"] for one in of_kind(found, "Secret")]
+    key, *secrets = sorted(one["metadata"]["name"] for one in of_kind(found, "Secret"))
+    assert key.endswith("-key")
     if webhook is None:
         assert secrets == []
     elif webhook.directory:
@@ -190,11 +191,11 @@ def test_webhook_of_some_namespaces() -> None:
     ]
 
 
-def test_secret_is_empty() -> None:
-    """Helm leaves alone what it has never set: upgrades keep the certificate."""
-    (secret,) = of_kind(objects(), "Secret")
-    assert "data" not in secret
-    assert "stringData" not in secret
+def test_secrets_are_empty() -> None:
+    """Helm leaves alone what it has never set: upgrades keep the certificate and the key."""
+    secrets = of_kind(objects(), "Secret")
+    assert len(secrets) == 2
+    assert not [secret for secret in secrets if {"data", "stringData"} & secret.keys()]
     (configuration,) = of_kind(objects(), "MutatingWebhookConfiguration")
     assert "caBundle" not in configuration["webhooks"][0]["clientConfig"]
 

@@ -61,6 +61,11 @@ app.kubernetes.io/part-of: rosproxy
 {{ include "rosproxy.fullname" . }}-webhook
 {{- end -}}
 
+{{/* The Secret with the key of the proxies' tokens. */}}
+{{- define "rosproxy.keySecret" -}}
+{{ include "rosproxy.fullname" . }}-key
+{{- end -}}
+
 {{/* Not empty if the operator makes the webhook's certificate itself. */}}
 {{- define "rosproxy.selfSigned" -}}
 {{- if and .Values.webhook.enabled (eq .Values.webhook.certificate.source "self-signed") -}}

@@ -6,7 +6,6 @@ vanished meanwhile: that is no error, the next look sees what is left to do.
 
 import asyncio
 import logging
-import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
 
@@ -25,8 +24,8 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
-from rosproxy_operator.kubernetes.proxy_sync import address_of
+from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
+from rosproxy_operator.kubernetes.proxy_sync import address_of, token_for
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
@@ -122,7 +121,7 @@ class ClusterApplier:
             case CreateService():
                 _create(api, "services", action.body)
             case CreateProxy():
-                _create(api, "pods", with_token(action.body, secrets.token_hex(16)))
+                _create(api, "pods", action.body)
             case DeleteService():
                 api.delete("services", action.id, action.uid)
             case DeleteProxy():
@@ -154,7 +153,8 @@ class ClusterApplier:
             proxy = next((p for p in observed.proxies if p.pod.uid == action.uid), None)
             if proxy is not None and proxy.pod.ip:
                 async with asyncio.timeout(RETIRING):
-                    told = await self._proxies.retire(address_of(proxy), proxy.token)
+                    token = token_for(proxy, observed.key)
+                    told = await self._proxies.retire(address_of(proxy), token)
                 log.info("%s has unregistered its nodes: %s", action.id, told, extra=about)
         except (ProxyError, TimeoutError) as error:
             reason = str(error) or f"no answer in {RETIRING:g} s"

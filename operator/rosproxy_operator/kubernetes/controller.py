@@ -28,6 +28,7 @@ from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyP
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader
 from rosproxy_operator.kubernetes.status.events import stamp
+from rosproxy_operator.kubernetes.token_key import TokenKey
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,8 @@ class KubernetesController:
         self._loop = loop = ControlLoop(pace, metrics)
         self.wake, self.dead, self.unready = loop.wake_threadsafe, loop.dead, loop.unready
         self._tasks, self._proxies = Tasks(), ProxyClient()
-        self._snapshots = SnapshotReader(api)
+        self._key = TokenKey(api, settings.key_secret)
+        self._snapshots = SnapshotReader(api, self._key)
         self._applier = ClusterApplier(api, self._proxies, self._tasks, metrics.count)
         self._proxy_sync = ClusterProxySync(self._tasks, self._proxies, loop.wake)
         self.event_filter = EventFilter()
@@ -80,7 +82,7 @@ class KubernetesController:
     async def _look(self) -> float | None:
         started = time.monotonic()
         seen = await self._snapshots.read()
-        self._proxy_sync.follow(seen.proxies)
+        self._proxy_sync.follow(seen.proxies, seen.key)
         seen = replace(seen, reports=self._proxy_sync.reports, failures=self._applier.failures)
         planned = plan(seen, self._settings.plan, self._state, time.monotonic(), stamp(time.time()))
         self._state = planned.state
@@ -88,6 +90,7 @@ class KubernetesController:
         self._metrics.look_time.observe(took)
         log.debug("looked in %.3f s", took)
         self.event_filter.last = seen
+        self._proxy_sync.report_callers(planned.callers)
         self._proxy_sync.report_gone(planned.gone)
         await self._applier.carry_out(planned.actions, seen)
         if self._applier.failures != seen.failures:
@@ -101,7 +104,8 @@ class KubernetesController:
         return planned.again_in
 
     def _report(self, seen: ClusterSnapshot, planned: ClusterPlan) -> None:
-        problems: list[Problem] = [*planned.problems, *self._applier.problems.values()]
+        own = (*self._applier.problems.values(), *self._key.problems)
+        problems: list[Problem] = [*planned.problems, *own]
         self._log.update(problems)
         metrics = self._metrics
         metrics.rosproxies.set(len(seen.rosproxies))

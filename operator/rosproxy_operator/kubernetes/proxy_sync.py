@@ -1,9 +1,10 @@
 """Keeping proxies and operator in step, over the proxies' admin endpoints.
 
 Each proxy's pod that has an address is asked for its ``/status`` every few seconds, by a
-`ProxyPoller` of its own, and told which pods on its node are gone (``/containers``) until it has
-confirmed that. What it says lands in `ClusterProxySync.reports`, from where the operator takes it
-with each look; a report that is another one than before wakes the operator.
+`ProxyPoller` of its own, and told (``/containers``) which pods may use it as their master and
+which are gone, until it has confirmed that. What it says lands in `ClusterProxySync.reports`, from
+where the operator takes it with each look; a report that is another one than before wakes the
+operator.
 """
 
 import asyncio
@@ -20,7 +21,7 @@ from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.kubernetes.resources.model import ProxyPod, ProxyReport
-from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT
+from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,8 @@ SILENT = 2
 """Unanswered questions in a row before a proxy counts as silent."""
 AT_ONCE = 32
 """Proxies that are asked at the same time."""
+REPEATED = 30.0
+"""Seconds after which a proxy is told anew which pods may use it, though nothing has changed."""
 RECENT = 300.0
 """Seconds that a problem counts: a proxy tells the last ones, however old they are."""
 _LONGEST = 300
@@ -41,7 +44,7 @@ _LONGEST = 300
 
 
 class ProxyPoller:
-    """Asks one proxy again and again, and tells it which pods are gone until it confirms that.
+    """Asks one proxy again and again, and tells it what it is to know until it confirms that.
 
     ``changed`` is called when what is known of it has changed.
     """
@@ -52,11 +55,16 @@ class ProxyPoller:
         proxies: ProxyClient,
         room: asyncio.Semaphore,
         changed: Callable[[], None],
+        key: bytes,
     ) -> None:
-        self.where, self._token = address_of(proxy), proxy.token
+        self.where, self.token = address_of(proxy), token_for(proxy, key)
         self.report: ProxyReport | None = None
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
+        self._restarts = proxy.restarts
+        self._callers: tuple[str, ...] | None = None
+        self._known: tuple[str, ...] | None = None
+        self._known_at = 0.0
         self._pending = asyncio.Event()
         self._recheck, self._failures = False, 0
         self._since = time.monotonic()
@@ -67,10 +75,24 @@ class ProxyPoller:
         if self._gone:
             self._pending.set()
 
+    def report_callers(self, callers: tuple[str, ...]) -> None:
+        """Let it know the addresses of all pods that may use it as their master."""
+        self._callers = callers
+        if callers != self._known:
+            self._pending.set()
+
+    def restarted(self, restarts: int) -> None:
+        """Take notice of how often its container was started again: it knows nothing then."""
+        if restarts != self._restarts:
+            self._restarts, self._known = restarts, None
+            self._pending.set()
+
     async def run(self) -> None:
         """Ask and tell until cancelled."""
         while True:
             async with self._room:
+                self._pending.clear()
+                await self._tell_callers()
                 told = await self._tell_gone()
                 await self._ask()
                 self._recheck = told
@@ -85,6 +107,7 @@ class ProxyPoller:
             found = report(await self._proxies.status(self.where))
             self._failures = 0
         except ProxyError as error:
+            self._known = None  # who answers next may have been started meanwhile
             self._failures += 1
             if self._failures < SILENT or not (self.report or self._waited(STARTING)):
                 return
@@ -97,14 +120,28 @@ class ProxyPoller:
             self.report = found
             self._changed()
 
+    async def _tell_callers(self) -> None:
+        """Tell which pods may use it, if it does not know.
+
+        In a call of its own, before the others: those may wait for the master, but pods wait here.
+        """
+        callers, recent = self._callers, time.monotonic() - self._known_at < REPEATED
+        if callers is None or (callers == self._known and recent):
+            return
+        try:
+            await self._proxies.selected(self.where, self.token, callers)
+        except ProxyError as error:
+            log.debug("%s was not told that %s may use it: %s", self.where, callers, error)
+            return
+        self._known, self._known_at = callers, time.monotonic()
+
     async def _tell_gone(self) -> bool:
         """Tell which pods are gone, if any are; whether it has confirmed that."""
-        self._pending.clear()
         gone = sorted(self._gone)
         if not gone:
             return False
         try:
-            told = await self._proxies.containers(self.where, self._token, {"gone": gone})
+            told = await self._proxies.containers(self.where, self.token, {"gone": gone})
         except ProxyError as error:
             # It may just be without its master; it is told again with the next question.
             log.debug("%s was not told that %s are gone: %s", self.where, gone, error)
@@ -130,19 +167,28 @@ class ClusterProxySync:
         """What is known, by the uid of the proxy's pod; of one that is just starting, nothing."""
         return {uid: one.report for uid, (one, _) in self._all.items() if one.report is not None}
 
-    def follow(self, proxies: Iterable[ProxyPod]) -> None:
-        """Poll these and no others."""
+    def follow(self, proxies: Iterable[ProxyPod], key: bytes = b"") -> None:
+        """Poll these and no others, with tokens made from this key."""
         wanted = {each.pod.uid: each for each in proxies if each.pod.ip and not each.pod.ended}
         for uid in [*self._all]:
             poller, task = self._all[uid]
-            if uid not in wanted or address_of(wanted[uid]) != poller.where:
+            known = wanted.get(uid)
+            if known is None or _way(known, key) != (poller.where, poller.token):
                 task.cancel()
                 del self._all[uid]
+            else:
+                poller.restarted(known.restarts)
         for uid, proxy in wanted.items():
             if uid not in self._all:
-                one = ProxyPoller(proxy, self._proxies, self._room, self._changed)
+                one = ProxyPoller(proxy, self._proxies, self._room, self._changed, key)
                 task = self._tasks.spawn(one.run(), f"polling {proxy.pod.id}")
                 self._all[uid] = one, task
+
+    def report_callers(self, callers: Mapping[str, tuple[str, ...]]) -> None:
+        """Let proxies know, by the uid of their pod, which addresses may use them."""
+        for uid, addresses in callers.items():
+            if uid in self._all:
+                self._all[uid][0].report_callers(addresses)
 
     def report_gone(self, gone: Mapping[str, Iterable[str]]) -> None:
         """Let proxies know, by the uid of their pod, which addresses are no pod's any more."""
@@ -154,6 +200,18 @@ class ClusterProxySync:
 def address_of(proxy: ProxyPod) -> HostPort:
     """Where a proxy answers the operator."""
     return HostPort(proxy.pod.ip, ADMIN_PORT)
+
+
+def token_for(proxy: ProxyPod, key: bytes) -> str:
+    """The token of a proxy's admin endpoint, by the operator's key.
+
+    One that a former operator has made has it in its pod.
+    """
+    return proxy.token or token_of(key, proxy.pod.id, proxy.on)
+
+
+def _way(proxy: ProxyPod, key: bytes) -> tuple[HostPort, str]:
+    return address_of(proxy), token_for(proxy, key)
 
 
 def report(status: ProxyStatus) -> ProxyReport:

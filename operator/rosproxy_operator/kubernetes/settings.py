@@ -59,6 +59,8 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     ``namespaces`` are those that are looked after, all if there are none. ``resync`` is in seconds:
     how long it waits at most between two looks. ``admin`` is where it serves its own health and
     metrics, ``liveness`` where it tells that it is alive. Without ``webhook`` pods are not wired.
+    ``key_secret`` is the Secret that holds the key of the proxies' tokens; None: it is made anew
+    with each start.
     """
 
     plan: ClusterSettings = ClusterSettings()
@@ -67,6 +69,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     admin: HostPort = DEFAULT_ADMIN
     liveness: HostPort = DEFAULT_LIVENESS
     webhook: WebhookSettings | None = None
+    key_secret: Name | None = None
 
 
 def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
@@ -86,6 +89,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
         admin=options["admin_bind"],
         liveness=options["liveness_bind"],
         webhook=_make_webhook(options) if options["webhook_bind"] else None,
+        key_secret=options["key_secret"],
     )
 
 

@@ -1,6 +1,6 @@
 """A look at the cluster: everything that matters is listed anew, so that nothing is ever missed.
 
-First the RosProxies, then side by side nodes, the operator's own pods and Services, masters'
+First the RosProxies, then side by side nodes, the operator's own pods, Services and key, masters'
 Services and selected pods, then all pods on the nodes that matter. All of it or nothing.
 """
 
@@ -29,6 +29,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.resources.values import part, parts, word
+from rosproxy_operator.kubernetes.token_key import TokenKey
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -43,8 +44,8 @@ _LONGEST = 300
 class SnapshotReader:
     """Lists what matters in a cluster."""
 
-    def __init__(self, api: Api) -> None:
-        self._api = api
+    def __init__(self, api: Api, key: TokenKey) -> None:
+        self._api, self._key = api, key
         self._room = asyncio.Semaphore(AT_ONCE)
 
     async def read(self) -> ClusterSnapshot:
@@ -55,10 +56,11 @@ class SnapshotReader:
         """
         usable, unusable = await self._ask(self._rosproxies)
         api, ports = self._api, _master_ports(usable.values())
-        nodes, proxies, services, masters, selected = await asyncio.gather(
+        nodes, proxies, services, key, masters, selected = await asyncio.gather(
             self._ask(lambda: [*map(objects.node, api.nodes())]),
             self._ask(lambda: [*filter(None, map(objects.proxy_pod, api.own("pods")))]),
             self._ask(lambda: [*filter(None, map(objects.service, api.own("services")))]),
+            self._ask(self._key.read),
             self._each(ports, lambda id: master_service(api, id, ports[id])),
             self._each(usable, lambda id: self._selected(usable[id])),
         )
@@ -78,6 +80,7 @@ class SnapshotReader:
             services={service.of: service for service in services},
             masters=masters,
             selected=frozenset(pod.uid for pod in found if not pod.ended),
+            key=key,
         )
 
     async def _ask(self, question: Callable[..., T], *about: object) -> T:
@@ -149,7 +152,7 @@ def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str
 
 
 def read_master(service: Json, id: Name, ports: Collection[int]) -> tuple[str, str]:
-    """The same, from a Service as the API server gives it."""
+    """The first of it, from a Service as the API server gives it."""
     spec = part(service, "spec")
     address = word(spec, "clusterIP")
     if not is_address(address):

@@ -1,6 +1,5 @@
 """What the operator creates in a cluster, as the API server takes it."""
 
-import copy
 import hashlib
 import json
 from collections.abc import Mapping
@@ -23,11 +22,11 @@ from rosproxy_operator.kubernetes.resources.names import (
     API_VERSION,
     CONTAINER,
     FINGERPRINT,
+    HASH_VARIABLE,
     KIND,
     MASTER_PORT,
     NODE,
     PORT_RANGE,
-    TOKEN_VARIABLE,
     own_labels,
     proxy_id,
     service_id,
@@ -69,6 +68,7 @@ class Site(msgspec.Struct, frozen=True):
     advertise_host: str
     ports: PortRange
     master: MasterSpec
+    token_hash: str = ""
 
 
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
@@ -77,7 +77,7 @@ def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
 
 
 def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
-    """A proxy's pod. Its token is empty: see `with_token`.
+    """A proxy's pod.
 
     The fingerprint says what the pod is made of, but for its image, which can be exchanged; then
     as what its nodes know it, see `finds_again`.
@@ -128,15 +128,6 @@ def finds_again(old: str, new: str) -> bool:
 def fingerprint_of(body: Json) -> str:
     """The fingerprint that is written on an object."""
     return str(body["metadata"]["annotations"][FINGERPRINT])
-
-
-def with_token(body: Json, token: str) -> Json:
-    """A proxy's pod with the token that its admin endpoint asks for."""
-    whole: dict[str, Any] = copy.deepcopy(dict(body))
-    for variable in whole["spec"]["containers"][0]["env"]:
-        if variable["name"] == TOKEN_VARIABLE:
-            variable["value"] = token
-    return whole
 
 
 def without_cluster_ip(body: Json) -> Json:
@@ -256,8 +247,9 @@ def _environment(site: Site) -> Mapping[str, str]:
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
         "ROSPROXY_SLAVE_CONTROL": spec.slave_control,
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
+        HASH_VARIABLE: site.token_hash,
     }
-    return {name: value for name, value in variables.items() if value} | {TOKEN_VARIABLE: ""}
+    return {name: value for name, value in variables.items() if value}
 
 
 def _probe(path: str, period: int) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
+from rosproxy_operator.kubernetes.planner.callers import callers
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
@@ -22,7 +23,7 @@ from rosproxy_operator.kubernetes.planner.reconcile import (
     ends,
     master_of,
     reconcile_orphans,
-    reconcile_proxy,
+    reconcile_proxies,
     reconcile_service,
     site_of,
 )
@@ -49,14 +50,16 @@ class ClusterPlan(msgspec.Struct, frozen=True):
     """What to do, in this order, and what to remember.
 
     One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
-    proxy's pod, the addresses of pods that are no more: the proxy is to be told. ``again_in`` is
-    in how many seconds to look again even if nothing happens; None: no need.
+    proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that may use the
+    proxy: it is to be told. ``again_in`` is in how many seconds to look again even if nothing
+    happens; None: no need.
     """
 
     actions: tuple[Action, ...] = ()
     problems: tuple[ClusterFinding, ...] = ()
     state: ClusterState = ClusterState()
     gone: Mapping[str, tuple[str, ...]] = {}
+    callers: Mapping[str, tuple[str, ...]] = {}
     again_in: float | None = None
 
 
@@ -81,10 +84,8 @@ def plan(
     actions = list(reconcile_orphans(context))
     problems = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
-    for of, rosproxy in sorted(seen.rosproxies.items()):
-        own = list(reconcile_service(context, rosproxy))
-        for place in seen.places.get(of, ()):
-            own += reconcile_proxy(context, place)
+    for _, rosproxy in sorted(seen.rosproxies.items()):
+        own = [*reconcile_service(context, rosproxy), *reconcile_proxies(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
         master, _ = master_of(rosproxy, observed)
@@ -104,6 +105,7 @@ def plan(
         problems=every,
         state=replace(gone.state, attempts=retries.noted, reported=new.reported),
         gone=gone.gone,
+        callers=callers(observed),
         again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
     )
 

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.settings import hash_token
 from rosproxy_operator.common.allocation import RETRY_FOR
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import (
@@ -39,12 +40,14 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyService,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id
+from rosproxy_operator.kubernetes.resources.names import proxy_id, service_id, token_of
 from rosproxy_operator.kubernetes.resources.values import host_problem
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 LOST_FOR = 10.0
 """Seconds for which a node must be missing before its proxies are deleted."""
+IN_TURN = 1.0
+"""Seconds after which it is looked again whether the next proxy can be made anew."""
 
 
 class ClusterContext(msgspec.Struct, frozen=True):
@@ -124,7 +127,9 @@ def site_of(context: ClusterContext, place: ProxyPlace) -> Site | Obstacle:
         text = "is there already, and is not the operator's: delete or rename it"
         return Obstacle("NameTaken", f"a pod called {name} {text}")
     publish = master.publish if place in context.ranges.published else 0
-    return Site(of, node, host, context.ranges.given[place], replace(master, publish=publish))
+    token = token_of(context.observed.key, name, node.name)
+    ports, told = context.ranges.given[place], replace(master, publish=publish)
+    return Site(of, node, host, ports, told, hash_token(token) if token else "")
 
 
 def reconcile_service(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
@@ -151,15 +156,39 @@ def _delete_service(context: ClusterContext, there: ProxyService, why: str) -> I
         yield DeleteService(there.of, name, there.uid, why)
 
 
-def reconcile_proxy(context: ClusterContext, place: ProxyPlace) -> Iterator[Action]:
-    """The next actions for a RosProxy's proxy on a node."""
+def reconcile_proxies(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
+    """The next actions for a RosProxy's proxies.
+
+    What is made anew for another setting alone, on the same ports and with the same master, is so
+    one after the other: a proxy waits until the others are there again. If they can't be made any
+    more, by a new rule of the cluster for one, those that are left go on.
+    """
+    places = context.view.places.get(of.id, ())
+    busy = any(_comes(context, place) for place in places)
+    for place in places:
+        actions = [*_reconcile_proxy(context, place, busy)]
+        wanted = place in context.view.wanted
+        busy = busy or (wanted and any(isinstance(one, DeleteProxy) for one in actions))
+        yield from actions
+
+
+def _comes(context: ClusterContext, place: ProxyPlace) -> bool:
+    """Whether a proxy is wanted that can be had, and does not run yet."""
+    current = context.view.current.get(place)
+    if place not in context.view.wanted or isinstance(site_of(context, place), Obstacle):
+        return False
+    return current is None or not (serves(current) or current.stuck)
+
+
+def _reconcile_proxy(context: ClusterContext, place: ProxyPlace, busy: bool) -> Iterator[Action]:
+    """The next actions for a proxy on a node; ``busy`` if another one is to come first."""
     node, proxies = context.observed.nodes.get(place.node), context.view.proxies.get(place, ())
     if place in context.view.wanted:
         site = site_of(context, place)
         if isinstance(site, Obstacle):
             _note(context, place)
         else:
-            yield from _wanted(context, place, site)
+            yield from _wanted(context, place, site, busy)
     elif node is None:
         for one in proxies if context.lost(place.node) <= 0 else ():
             yield from _delete_proxy(context, one, "its node is gone")
@@ -170,7 +199,7 @@ def reconcile_proxy(context: ClusterContext, place: ProxyPlace) -> Iterator[Acti
             yield from _delete_proxy(context, one, why, retire=True)
 
 
-def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[Action]:
+def _wanted(context: ClusterContext, place: ProxyPlace, site: Site, busy: bool) -> Iterator[Action]:
     """The next action for a proxy that is wanted, and can be had as the site says."""
     name, current = proxy_id(place.of, place.node), context.view.current.get(place)
     misplaced = [one for one in context.view.proxies.get(place, ()) if one.pod.id != name]
@@ -180,12 +209,12 @@ def _wanted(context: ClusterContext, place: ProxyPlace, site: Site) -> Iterator[
     elif any(one.pod.id == name for one in context.observed.proxies):
         _note(context, place)
         if current is not None:  # else it is about to go
-            yield from _tended(context, current, site)
+            yield from _tended(context, current, site, busy)
     elif context.retries.ask(_creation(place)):
         yield CreateProxy(place.of, manifests.proxy_pod(site, context.settings))
 
 
-def _tended(context: ClusterContext, one: ProxyPod, site: Site) -> Iterator[Action]:
+def _tended(context: ClusterContext, one: ProxyPod, site: Site, busy: bool) -> Iterator[Action]:
     image = manifests.image_of(site.rosproxy, context.settings)
     fingerprint = manifests.fingerprint_of(manifests.proxy_pod(site, context.settings))
     task = Task(one.of, "image", one.pod.id, f"{one.pod.uid} {image}")
@@ -197,6 +226,9 @@ def _tended(context: ClusterContext, one: ProxyPod, site: Site) -> Iterator[Acti
         what = "its RosProxy, its node or the operator's options have changed"
         if one.range != site.ports:
             what = f"its ports are to be {site.ports} instead of {one.range}"
+        elif busy and serves(one) and not lost:
+            context.retries.later(IN_TURN)
+            return
         yield from _delete_proxy(context, one, f"made anew: {what}", retire=serves(one) and lost)
     elif one.image != image and context.retries.ask(task):
         yield SetImage(one.of, one.pod.id, one.pod.uid, image)

@@ -71,6 +71,7 @@ class Retries:
         }
         self._now = now
         self.noted: dict[Task, RetryRecord] = {}
+        self._later: list[float] = []
 
     def ask(self, task: Task) -> bool:
         """Whether a task is to be done now; if so, that is noted."""
@@ -81,6 +82,10 @@ class Retries:
         count, error = (tried.count, tried.error) if tried else (0, "")
         self.noted[task] = RetryRecord(count + 1, self._now, error=error)
         return True
+
+    def later(self, seconds: float) -> None:
+        """Note that something else has to come first, which is to be looked for in a while."""
+        self._later.append(seconds)
 
     def effect(self, task: Task) -> None:
         """Note that what a task does is there, though not well yet."""
@@ -94,6 +99,7 @@ class Retries:
 
     def waits(self) -> Iterator[float]:
         """In how many seconds there is something to be tried again."""
+        yield from self._later
         for tried in self.noted.values():
             if not tried.effect:
                 yield max(tried.at + tried.pause - self._now, 0.0)

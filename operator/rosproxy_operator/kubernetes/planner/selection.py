@@ -47,7 +47,7 @@ def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFindin
     Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
     says why it has none though it was selected; None: it was not.
     """
-    taking = sorted((one for one in rosproxies if _selects(one, pod)), key=lambda one: one.id)
+    taking = sorted((one for one in rosproxies if selects(one, pod)), key=lambda one: one.id)
     named = [one for one in taking if one.id.name == pod.labels.get(INJECT)]
     if not taking:
         return None
@@ -99,7 +99,8 @@ def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
     return matches(Selector(rosproxy.spec.node_selector), node.labels)
 
 
-def _selects(rosproxy: RosProxy, pod: Pod) -> bool:
+def selects(rosproxy: RosProxy, pod: Pod) -> bool:
+    """Whether a RosProxy that is not being deleted selects a pod, be it with others."""
     label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
     here = rosproxy.id.namespace == pod.id.namespace
     if not here or rosproxy.deleting or label in OFF or _is_ours(pod.labels):

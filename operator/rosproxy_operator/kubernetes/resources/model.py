@@ -130,7 +130,7 @@ ELSEWHERE = "$()"
 
 
 class Pod(msgspec.Struct, frozen=True):
-    """A pod. ``node`` and ``ip`` are empty until it has them.
+    """A pod. ``node`` and ``ip`` are empty until it has them; ``ips`` are all of its addresses.
 
     ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
     the ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that
@@ -149,6 +149,7 @@ class Pod(msgspec.Struct, frozen=True):
     deleting: bool = False
     own_masters: tuple[str, ...] = ()
     wired: str = ""
+    ips: tuple[str, ...] = ()
 
     @property
     def ended(self) -> bool:
@@ -172,7 +173,8 @@ class ProxyPod(msgspec.Struct, frozen=True):
     ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
     (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
     say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
-    condition Ready. ``restarts`` counts those of its container.
+    condition Ready. ``restarts`` counts those of its container. ``token`` is that of its admin
+    endpoint where it stands in the pod, as former operators wrote it.
     """
 
     pod: Pod
@@ -292,6 +294,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     selected: frozenset[str] = frozenset()
+    key: bytes = b""
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}
     failures: Mapping[Name, Mapping[Name, str]] = {}

@@ -1,6 +1,7 @@
 """What the operator calls things in a cluster: names, labels, annotations, ports."""
 
 import hashlib
+import hmac
 import re
 from collections.abc import Mapping
 
@@ -39,7 +40,9 @@ MASTER_PORT = 11311
 ADMIN_PORT = 11312
 CONTAINER = "proxy"
 """Name of the container in a proxy's pod."""
+HASH_VARIABLE = "ROSPROXY_ADMIN_TOKEN_HASH"
 TOKEN_VARIABLE = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
+"""Where former operators wrote the token itself."""
 
 _PREFIX = "rosproxy-"
 _DIGITS = 6
@@ -70,6 +73,15 @@ def proxy_id(of: Name, node: str) -> Name:
     slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
     parts = (f"{_PREFIX}{of.name}", slug, digest)
     return Name(of.namespace, "-".join(part for part in parts if part))
+
+
+def token_of(key: bytes, proxy: Name, node: str) -> str:
+    """The token of a proxy's admin endpoint, which only who has the operator's key can tell.
+
+    It stands nowhere: the pod has its hash alone. Empty if there is no key.
+    """
+    about = f"{proxy} {node}".encode()
+    return hmac.new(key, about, hashlib.sha256).hexdigest() if key else ""
 
 
 def master_uri(cluster_ip: str) -> str:

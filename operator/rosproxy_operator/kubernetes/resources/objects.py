@@ -61,6 +61,7 @@ def pod(obj: Json) -> Pod:
         deleting=is_deleted(meta),
         own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
         wired=wired,
+        ips=tuple(filter(None, (word(one, "ip") for one in parts(status, "podIPs")))),
     )
 
 

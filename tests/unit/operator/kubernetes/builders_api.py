@@ -85,7 +85,6 @@ def proxy_obj(of: str = "arm", node: str = "node1", status: Obj | None = None) -
                 {
                     "name": "proxy",
                     "image": "rosproxy:1",
-                    "env": [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}],
                     "ports": [
                         {"containerPort": port, "hostPort": port, "protocol": "TCP"}
                         for port in RANGE.ports()

@@ -172,6 +172,10 @@ class Clusters(World):
                 with contextlib.suppress(Refused):
                     self.cluster.create_service({**other, "spec": where})
 
+    def change_key(self, n: int, _: int) -> None:
+        """Somebody takes the key of the proxies' tokens out of its Secret."""
+        self.cluster.key = bytes([n]) * 32
+
     def forbid(self, n: int, _: int) -> None:
         self.cluster.forbidden = bool(n % 2)
 

@@ -21,7 +21,7 @@ from rosproxy_operator.kubernetes.planner.actions import (
     PatchStatus,
     SetImage,
 )
-from rosproxy_operator.kubernetes.planner.manifests import with_token, without_cluster_ip
+from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
@@ -105,6 +105,7 @@ class Cluster:
         self.ros: dict[str, set[str]] = {}
         self.master_ip = "10.96.0.7"
         self.made = 0
+        self.key = b"k" * 32
 
     # what users do
 
@@ -272,6 +273,7 @@ class Cluster:
             pods=tuple(pods),
             proxies=tuple(own),
             services={one.of: one for one in services},
+            key=self.key,
             masters=dict.fromkeys(masters, there),
             reports={
                 uid: ProxyReport(True, True, nodes={ip: (f"/node_{ip}",) for ip in sorted(known)})
@@ -296,7 +298,7 @@ class Cluster:
                     self.create_service(dict(without_cluster_ip(body)))
             case CreateProxy(body=body):
                 self.made += 1
-                self.create_pod(dict(with_token(body, "t0ken-t0ken")))
+                self.create_pod(dict(body))
             case DeleteProxy(id=id, uid=uid):
                 if pod := self._own(self.state.pods, id, uid):
                     self.delete_pod(pod)

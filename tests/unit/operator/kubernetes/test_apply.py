@@ -26,12 +26,13 @@ from rosproxy_operator.kubernetes.resources.model import (
     Reference,
     RosProxy,
 )
-from rosproxy_operator.kubernetes.resources.names import own_labels
+from rosproxy_operator.kubernetes.resources.names import own_labels, token_of
 from rosproxy_operator.kubernetes.resources.spec import rosproxy
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import NAMESPACE, proxy_obj, rosproxy_obj
 
 OF = Name(NAMESPACE, "arm")
+KEY = b"k" * 32
 OWNER = {"apiVersion": "rosproxy.io/v1alpha1", "kind": "RosProxy", "name": "arm", "uid": "uid-arm"}
 ABOUT = Reference("RosProxy", Name(NAMESPACE, "arm"), "uid-arm")
 
@@ -79,15 +80,12 @@ def body(kind: str, name: str, **spec: Any) -> dict[str, Any]:
 
 
 def create_pod(name: str = "proxy") -> CreateProxy:
-    env = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": ""}]
-    return CreateProxy(OF, body("Pod", name, containers=[{"name": "proxy", "env": env}]))
+    return CreateProxy(OF, body("Pod", name, containers=[{"name": "proxy"}]))
 
 
-async def test_a_proxy_gets_a_secret_token(server: ApiServer, carry: Carried) -> None:
+async def test_proxies_are_created(server: ApiServer, carry: Carried) -> None:
     await carry.out(create_pod("one"), create_pod("two"))
-    tokens = {pod["spec"]["containers"][0]["env"][0]["value"] for pod in server.all("pods")}
-    assert len(tokens) == 2
-    assert all(len(token) == 32 for token in tokens)
+    assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["one", "two"]
     assert carry.applier.failures == {OF: {}}
     assert carry.counted == [("CreateProxy", "ok")] * 2
 
@@ -226,9 +224,10 @@ async def test_failures_of_a_deleted_rosproxy_are_forgotten(
 
 
 async def test_a_mistake_of_ours_is_a_failure_like_any(server: ApiServer, carry: Carried) -> None:
-    await carry.out(CreateProxy(OF, body("Pod", "broken")), create_pod())
+    broken = {"kind": "Pod", "metadata": {"name": "broken"}}
+    await carry.out(CreateProxy(OF, broken), create_pod())
     (text,) = carry.applier.failures[OF].values()
-    assert "the operator failed: KeyError('containers')" in text
+    assert "the operator failed: KeyError('namespace')" in text
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["proxy"]
 
 
@@ -264,7 +263,8 @@ async def test_a_retired_proxy_unregisters_first(server: ApiServer, carry: Carri
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.77", 11312).start()
     await _retire(server, carry, "127.0.0.77")
-    assert told == ["Bearer secret"]
+    token = token_of(KEY, Name(NAMESPACE, proxy_obj()["metadata"]["name"]), "node1")
+    assert told == [f"Bearer {token}"]
     assert not server.all("pods")
     await runner.cleanup()
 
@@ -280,12 +280,11 @@ async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
     from rosproxy_operator.kubernetes.resources.objects import proxy_pod
 
     obj = proxy_obj(status={"phase": "Running", "podIP": ip})
-    obj["spec"]["containers"][0]["env"] = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}]
     server.put("pods", obj, NAMESPACE)
     proxy = proxy_pod(obj)
     assert proxy is not None
     action = DeleteProxy(OF, proxy.pod.id, proxy.pod.uid, "RosProxy deleted", retire=True)
-    await carry.out(action, action, proxies=(proxy,))
+    await carry.out(action, action, proxies=(proxy,), key=KEY)
     for task in [*carry.tasks._tasks]:
         await task
     await carry.out(action, proxies=(proxy,))  # a pod that ends slowly is told once

@@ -38,6 +38,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--node-port-range=31000-31999",
         "--ephemeral-range=40000-50000",
         "--resync=5",
+        "--key-secret=ns/key",
         *HOOK,
         "--webhook-service=ns/wh",
         "--webhook-secret=ns/secret",
@@ -51,6 +52,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
     assert settings.plan.image_pull_policy == "Never"
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)
+    assert settings.key_secret == Name("ns", "key")
     assert settings.resync == 5.0
     assert settings.admin == HostPort("127.0.0.1", 1)
     assert settings.liveness == HostPort("127.0.0.1", 2)
@@ -84,6 +86,7 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
         (["--admin-bind=x"], "--admin-bind: 'x' is not of the form 0.0.0.0:11313"),
         (["--liveness-bind=x"], "--liveness-bind: 'x' is not of the form 0.0.0.0:8080"),
         (["--webhook-bind=x"], "--webhook-bind: 'x' is not of the form 0.0.0.0:9443"),
+        (["--key-secret=key"], "--key-secret: 'key' is not of the form NAMESPACE/NAME"),
         (HOOK, "--webhook-service: NAMESPACE/NAME is needed"),
         ([*HOOK, "--webhook-service=wh"], "--webhook-service: 'wh' is not of the form NAMESPACE/"),
         (

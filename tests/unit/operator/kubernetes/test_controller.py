@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 from aiohttp import web
+from msgspec import structs
 
+from rosproxy.settings import hash_token
 from rosproxy_operator.common import control_loop
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module
@@ -192,8 +194,10 @@ async def test_a_proxy_is_asked_and_told(
         return web.json_response({"settings": {}, "master": {"up": True}, "nodes": []})
 
     async def containers(request: web.Request) -> web.Response:
-        told.append((request.headers["Authorization"], await request.json()))
-        return web.json_response({}, status=503 if len(told) == 1 else 200)
+        body = await request.json()
+        told.append((request.headers["Authorization"], body))
+        first = "gone" in body and not any("gone" in one for _, one in told[:-1])
+        return web.json_response({}, status=503 if first else 200)
 
     application = web.Application()
     application.router.add_get("/status", status)
@@ -206,7 +210,7 @@ async def test_a_proxy_is_asked_and_told(
 
     def planned(observed: ClusterSnapshot, *rest: Any) -> ClusterPlan:
         found = real(observed, *rest)
-        return ClusterPlan(found.actions, found.problems, found.state, {**gone}, found.again_in)
+        return structs.replace(found, gone={**gone})
 
     monkeypatch.setattr(module, "plan", planned)
     put_all(server)
@@ -221,9 +225,12 @@ async def test_a_proxy_is_asked_and_told(
     )
     gone[proxy["metadata"]["uid"]] = ("10.244.1.9",)
     running.controller.wake()
-    await until(lambda: len(told) == 2)
+    await until(lambda: len([1 for _, body in told if "gone" in body]) == 2)
     gone.clear()
     env = proxy["spec"]["containers"][0]["env"]
-    token = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN")
-    assert told == [(f"Bearer {token}", {"gone": ["10.244.1.9"]})] * 2
+    hashed = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN_HASH")
+    (who,) = {who for who, _ in told}
+    assert hash_token(who.removeprefix("Bearer ")) == hashed
+    assert [body for _, body in told if "gone" in body] == [{"gone": ["10.244.1.9"]}] * 2
+    assert told[0][1] == {"selected": ["10.244.1.5"]}
     await runner.cleanup()

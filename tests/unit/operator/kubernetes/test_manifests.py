@@ -6,10 +6,11 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.settings import hash_token
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import Site
-from rosproxy_operator.kubernetes.resources import objects
-from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name
 from tests.run_options import settings_of
 from tests.unit.operator.kubernetes.objects import RANGE, SETTINGS, node, rosproxy, site
 
@@ -27,7 +28,11 @@ def container(place: Site | None = None, **changes: Any) -> Json:
 
 
 def env(place: Site | None = None, **changes: Any) -> dict[str, str]:
-    return {one["name"]: one["value"] for one in container(place, **changes)["env"]}
+    return env_of(body(place, **changes))
+
+
+def env_of(made: Json) -> dict[str, str]:
+    return {one["name"]: one["value"] for one in made["spec"]["containers"][0]["env"]}
 
 
 def test_the_proxy_understands_all_of_its_variables() -> None:
@@ -160,19 +165,27 @@ def test_the_master_in_the_cluster_counts_too() -> None:
 
 
 def test_a_pod_is_read_back_as_it_was_made() -> None:
-    made = manifests.with_token(body(), "t0ken-t0ken")
+    made = body(replace(site(rosproxy(), node()), token_hash="5e884898da28"))
     found = objects.proxy_pod({**made, "metadata": {**made["metadata"], "uid": "u"}, "status": {}})
     assert found is not None
     assert (found.of, found.owner, found.on) == (rosproxy().id, "uid-robot", "one")
-    assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "t0ken-t0ken")
-    assert found.fingerprint == manifests.fingerprint_of(body())
+    assert (found.range, found.image, found.token) == (RANGE, "rosproxy:1", "")
+    assert found.fingerprint == manifests.fingerprint_of(made)
     assert found.pod.host_ports == set(RANGE.ports())
 
 
-def test_the_token_changes_nothing_but_itself() -> None:
-    one = manifests.with_token(body(), "one")
-    assert one != body()
-    assert manifests.with_token(one, "") == body()
+def test_it_is_told_the_hash_of_its_token_alone() -> None:
+    token = names.token_of(b"k" * 32, names.proxy_id(rosproxy().id, "one"), "one")
+    made = body(replace(site(rosproxy(), node()), token_hash=hash_token(token)))
+    assert settings_of(env_of(made)).token_hash == hash_token(token)
+    assert token not in str(made)
+
+
+def test_each_proxy_has_a_token_of_its_own() -> None:
+    proxies = [(Name("ros", "a"), "one"), (Name("ros", "a"), "two"), (Name("arm", "a"), "one")]
+    tokens = {names.token_of(key, *one) for one in proxies for key in (b"k" * 32, b"l" * 32)}
+    assert len(tokens) == 6
+    assert names.token_of(b"", *proxies[0]) == ""
 
 
 def test_a_fingerprint_tells_whether_nodes_are_found_again() -> None:
@@ -190,8 +203,8 @@ def test_it_goes_on_for_a_moment_after_its_deletion() -> None:
     assert spec()["terminationGracePeriodSeconds"] > 2
 
 
-def test_the_fingerprint_does_not_depend_on_image_and_token() -> None:
-    bodies = [body(), body(image="rosproxy:2"), manifests.with_token(body(), "t")]
+def test_the_fingerprint_does_not_depend_on_the_image() -> None:
+    bodies = [body(), body(image="rosproxy:2")]
     assert len({manifests.fingerprint_of(one) for one in bodies}) == 1
 
 
@@ -209,6 +222,7 @@ def test_the_fingerprint_does_not_depend_on_image_and_token() -> None:
         site(rosproxy(master=MasterSpec("http://robot:11311", "192.0.2.7")), node()),
         site(rosproxy(cleanup_after=1.0), node()),
         site(rosproxy(image_pull_policy="Never"), node()),
+        replace(site(rosproxy(), node()), token_hash="other"),
     ],
 )
 def test_the_fingerprint_depends_on_all_else(other: Site) -> None:

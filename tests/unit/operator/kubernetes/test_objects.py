@@ -182,7 +182,7 @@ def test_a_proxy_is_read_back_from_its_pod():
         "0123456789abcdef",
         "rosproxy:1",
     )
-    assert (found.token, found.ready, found.stuck, found.restarts) == ("secret", True, None, 2)
+    assert (found.token, found.ready, found.stuck, found.restarts) == ("", True, None, 2)
     assert found.pod.host_ports == set(RANGE.ports())
 
 

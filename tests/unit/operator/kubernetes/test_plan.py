@@ -22,7 +22,9 @@ from rosproxy_operator.kubernetes.resources.model import (
     InvalidRosProxy,
     MasterSpec,
     Name,
+    ProxyPod,
     Reference,
+    Stuck,
 )
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
@@ -388,3 +390,56 @@ def test_the_default_image_is_that_of_the_settings() -> None:
     (changed,) = done(found)
     assert isinstance(changed, SetImage)
     assert changed.image == "rosproxy:9"
+
+
+# proxies that are made anew one after the other
+
+
+KEY = b"k" * 32
+
+
+def two(*proxies: ProxyPod, key: bytes = KEY) -> ClusterSnapshot:
+    """Two nodes with a pod each, and these proxies, which were made without that key."""
+    pods = pod("a", ip="10.244.1.5"), pod("b", on="two", ip="10.244.2.5")
+    nodes = node(), node("two")
+    return observed(rosproxy(), service(), *nodes, *pods, *proxies, key=key)
+
+
+def test_another_key_makes_one_proxy_anew_at_a_time() -> None:
+    found = look(two(proxy(), proxy(on=node("two"))))
+    (action,) = done(found)
+    assert isinstance(action, DeleteProxy)
+    assert (action.id, action.retire) == (PROXY, False)
+    assert action.why.startswith("made anew: its RosProxy, its node or the operator's options")
+    assert found.again_in == 1.0
+
+
+@pytest.mark.parametrize("first", [(), (proxy(stuck=None, phase="Pending"),)])
+def test_the_next_waits_until_the_one_before_runs(first: tuple[ProxyPod, ...]) -> None:
+    found = look(two(*first, proxy(on=node("two"))))
+    assert DeleteProxy not in kinds(found) or first
+    assert not [one for one in done(found) if getattr(one, "id", PROXY) != PROXY]
+    assert found.again_in == 1.0
+
+
+def test_one_that_can_never_come_holds_up_nobody() -> None:
+    bad = proxy(stuck=Stuck.IMAGE)
+    found = look(two(replace(bad, fingerprint="x"), proxy(on=node("two"))))
+    assert {one.id for one in done(found) if isinstance(one, DeleteProxy)} == {PROXY}
+    settled = replace(bad, fingerprint=fingerprint(two()))
+    (action,) = done(look(two(settled, proxy(on=node("two")))))
+    assert isinstance(action, DeleteProxy)
+    assert action.id == names.proxy_id(ROBOT, "two")
+
+
+def fingerprint(seen: ClusterSnapshot) -> str:
+    """That of the proxy of node one, as it is made now."""
+    (body,) = [one.body for one in done(look(seen)) if isinstance(one, CreateProxy)
+               and one.body["metadata"]["name"] == PROXY.name]  # fmt: skip
+    return str(body["metadata"]["annotations"][names.FINGERPRINT])
+
+
+def test_what_has_to_move_waits_for_nobody() -> None:
+    of = rosproxy(window=PortRange(12000, 12099))
+    seen = replace(two(proxy(), proxy(on=node("two")), key=b""), rosproxies=(of,))
+    assert kinds(look(seen)) == [DeleteProxy, DeleteProxy]

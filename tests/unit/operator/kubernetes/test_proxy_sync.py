@@ -1,7 +1,7 @@
 """What is known of proxies that start, answer, fall silent and go."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from typing import Any
 
 import pytest
@@ -12,12 +12,14 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.kubernetes import proxy_sync
-from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync
+from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync, token_for
 from rosproxy_operator.kubernetes.resources.model import ProxyPod
+from rosproxy_operator.kubernetes.resources.names import token_of
 from rosproxy_operator.kubernetes.resources.objects import proxy_pod
 from tests.unit.operator.kubernetes.api_server import until
 from tests.unit.operator.kubernetes.builders_api import proxy_obj
 
+KEY = b"k" * 32
 UP = {"master": {"up": True}, "nodes": []}
 DOWN = {"master": {"up": False, "error": "refused"}, "nodes": []}
 
@@ -31,6 +33,8 @@ class Told(ProxyClient):
         self.hears = True
         self.asked = self.failing = 0
         self.told: list[Any] = []
+        self.callers: list[Any] = []
+        self.deaf = False
 
     async def status(self, where: HostPort) -> ProxyStatus:
         self.asked += 1
@@ -44,6 +48,11 @@ class Told(ProxyClient):
         if not self.hears:
             raise ProxyError("its master is away", later=True)
         return {}
+
+    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
+        self.callers.append((token, *addresses))
+        if self.deaf:
+            raise ProxyError("unknown field selected")
 
 
 class Talk:
@@ -162,3 +171,68 @@ async def test_no_address_no_poller(talk: Talk) -> None:
     talk.all.follow([proxy(""), ended])
     await asyncio.sleep(0.05)
     assert talk.proxies.asked == 0
+
+
+async def test_it_is_told_who_may_call(talk: Talk) -> None:
+    """When that changes, and not over and over again."""
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    await talk.asked()
+    assert talk.proxies.callers == []  # nobody knows yet
+    talk.all.report_callers({UID: ("10.244.1.5",), "nobody": ()})
+    await until(lambda: bool(talk.proxies.callers))
+    token = token_of(KEY, proxy().pod.id, "node1")
+    assert talk.proxies.callers == [(token, "10.244.1.5")]
+    talk.all.report_callers({UID: ("10.244.1.5",)})
+    await talk.asked()
+    assert len(talk.proxies.callers) == 1
+    talk.all.report_callers({UID: ()})
+    await until(lambda: len(talk.proxies.callers) == 2)
+    assert talk.proxies.callers[-1] == (token,)
+
+
+async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
+    """And what a proxy does not understand keeps nothing else from it."""
+    talk.proxies.says, talk.proxies.deaf = UP, True
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await until(lambda: len(talk.proxies.callers) > 2)
+    assert talk.proxies.told == [{"gone": ["10.0.0.1"]}]
+    assert talk.all.reports[UID].answered
+
+
+async def test_a_proxy_that_was_started_again_is_told_anew(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_callers({UID: ("10.244.1.5",)})
+    await until(lambda: len(talk.proxies.callers) == 1)
+    talk.all.follow([replace(proxy(), restarts=1)], KEY)
+    await until(lambda: len(talk.proxies.callers) == 2)
+    talk.proxies.failing = 1  # or it did not answer for a moment
+    await until(lambda: len(talk.proxies.callers) == 3)
+
+
+async def test_it_is_told_now_and_then(talk: Talk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(proxy_sync, "REPEATED", 0.02)
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_callers({UID: ("10.244.1.5",)})
+    await until(lambda: len(talk.proxies.callers) > 2)
+
+
+async def test_another_key_is_another_token(talk: Talk) -> None:
+    talk.proxies.says = UP
+    for key in (KEY, b"l" * 32):
+        talk.all.follow([proxy()], key)
+        talk.all.report_callers({UID: ("10.244.1.5",)})
+        said = token_of(key, proxy().pod.id, "node1")
+        await until(lambda said=said: (said, "10.244.1.5") in talk.proxies.callers)  # type: ignore[misc]
+
+
+def test_a_former_operators_token_is_in_the_pod() -> None:
+    obj = proxy_obj()
+    obj["spec"]["containers"][0]["env"] = [{"name": "ROSPROXY_ADMIN_TOKEN", "value": "secret"}]
+    found = proxy_pod(obj)
+    assert found is not None
+    assert token_for(found, KEY) == "secret"

@@ -7,6 +7,7 @@ import pytest
 from rosproxy_operator.kubernetes.api import Api, ApiError, ApiGone, ApiInvalid
 from rosproxy_operator.kubernetes.resources.model import Name, Stuck
 from rosproxy_operator.kubernetes.snapshot import SnapshotReader, read_master
+from rosproxy_operator.kubernetes.token_key import TokenKey
 from tests.unit.operator.kubernetes.api_server import ApiServer
 from tests.unit.operator.kubernetes.builders_api import (
     INJECT,
@@ -16,7 +17,12 @@ from tests.unit.operator.kubernetes.builders_api import (
     rosproxy_obj,
 )
 
+SERVICE = {"service": {"name": "roscore", "namespace": "ros", "port": 11311}}
 SANDBOX = 'Failed to create pod sandbox: plugin "portmap" (id "{}"): cannot open hostport 11400'
+
+
+def reader(api: Api) -> SnapshotReader:
+    return SnapshotReader(api, TokenKey(api, None))
 
 
 def node(name: str) -> dict[str, Any]:
@@ -39,7 +45,7 @@ def put_all(server: ApiServer) -> None:
 
 async def test_a_look(server: ApiServer, api: Api) -> None:
     put_all(server)
-    found = await SnapshotReader(api).read()
+    found = await reader(api).read()
     assert [each.id.name for each in found.rosproxies] == ["arm"]
     assert set(found.nodes) == {"node1", "node2", "node3"}
     assert {pod.id.name for pod in found.pods} >= {"talker", "stranger"}
@@ -54,7 +60,7 @@ async def test_a_look(server: ApiServer, api: Api) -> None:
 
 async def test_rosproxies_come_first(server: ApiServer, api: Api) -> None:
     put_all(server)
-    await SnapshotReader(api).read()
+    await reader(api).read()
     assert server.requests[0][1].endswith("/rosproxies")
 
 
@@ -63,14 +69,14 @@ async def test_all_or_nothing(server: ApiServer, api: Api) -> None:
     put_all(server)
     server.refuse("GET", "nodes", 500, "etcd")
     with pytest.raises(ApiError):
-        await SnapshotReader(api).read()
+        await reader(api).read()
 
 
 async def test_one_bad_rosproxy_does_not_stop_the_others(server: ApiServer, api: Api) -> None:
     put_all(server)
     server.put("rosproxies", rosproxy_obj({"master": {}}, "bad"), NAMESPACE)
     server.put("rosproxies", {"metadata": {"name": "worse"}, "spec": 3}, NAMESPACE)
-    found = await SnapshotReader(api).read()
+    found = await reader(api).read()
     assert [each.id.name for each in found.rosproxies] == ["arm"]
     assert {id.name for id in found.unusable} == {"bad", "worse"}
 
@@ -90,7 +96,7 @@ async def test_a_selector_that_the_api_server_refuses_is_that_rosproxys_problem(
         return real(namespace, selector)
 
     api.pods = pods  # type: ignore[method-assign]
-    found = await SnapshotReader(api).read()
+    found = await reader(api).read()
     (bad,) = found.unusable.values()
     assert bad.text == "spec.podSelector: unable to parse requirement"
     assert [each.id.name for each in found.rosproxies] == ["arm"]
@@ -99,7 +105,7 @@ async def test_a_selector_that_the_api_server_refuses_is_that_rosproxys_problem(
 async def test_a_missing_crd_is_told(server: ApiServer, api: Api) -> None:
     server.refuse("GET", "rosproxies", 404, "the server could not find the requested resource")
     with pytest.raises(ApiError, match="install the CustomResourceDefinition") as caught:
-        await SnapshotReader(api).read()
+        await reader(api).read()
     assert type(caught.value) is ApiGone
 
 
@@ -117,7 +123,7 @@ async def test_what_only_an_event_tells(server: ApiServer, api: Api) -> None:
             "lastTimestamp": stamp,
         }
         server.put("events", event, NAMESPACE)
-    found = await SnapshotReader(api).read()
+    found = await reader(api).read()
     (proxy,) = found.proxies
     assert proxy.stuck is Stuck.PORTS
     assert proxy.message == SANDBOX.format("…")
@@ -129,13 +135,11 @@ def _digest(server: ApiServer) -> str:
 
 
 async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
-    master = {"service": {"name": "roscore", "namespace": "ros", "port": 11311}}
-    spec = {"master": master}
     obj = rosproxy_obj()
-    obj["spec"] = spec
+    obj["spec"] = {"master": SERVICE}
     server.put("rosproxies", obj, NAMESPACE)
     id = Name("ros", "roscore")
-    assert (await SnapshotReader(api).read()).masters == {
+    assert (await reader(api).read()).masters == {
         id: ("", "there is no Service roscore in the namespace ros: create it")
     }
     ports = [{"port": 11311}]
@@ -144,7 +148,8 @@ async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
         {"metadata": {"name": "roscore"}, "spec": {"clusterIP": "10.96.1.1", "ports": ports}},
         "ros",
     )
-    assert (await SnapshotReader(api).read()).masters == {id: ("10.96.1.1", "")}
+    found = await reader(api).read()
+    assert found.masters == {id: ("10.96.1.1", "")}
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import copy
 from collections.abc import Iterator
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.settings import hash_token
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
@@ -230,6 +231,8 @@ class World:
                 found, place, "PortsExhausted"
             )
             env = {one["name"]: one["value"] for one in container["env"]}
+            token = names.token_of(self.cluster.key, proxy.pod.id, place.node)
+            assert env["ROSPROXY_ADMIN_TOKEN_HASH"] == hash_token(token)
             service = "http://roscore.ros.svc:11311"
             assert env["ROS_MASTER_URI"] == rosproxy["master"].get("uri", service)
             publish = rosproxy["master"].get("publish")
