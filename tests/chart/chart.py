@@ -65,7 +65,10 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "nameOverride": "proxies",
             "commonLabels": {"team": "arms"},
             "image": {"repository": "mine/operator", "digest": f"sha256:{'0' * 64}"},
-            "proxy": {"image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"}},
+            "proxy": {
+                "image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"},
+                "networkPolicy": {"metricsFrom": [{"podSelector": {"matchLabels": {"a": "b"}}}]},
+            },
             "imagePullSecrets": [{"name": "registry"}],
             "serviceAccount": {"annotations": {"a.example/role": "x"}},
             "podAnnotations": {"a": "b"},

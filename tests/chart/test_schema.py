@@ -17,6 +17,8 @@ BAD: list[tuple[Json, str]] = [
     ({"image": {"digest": "sha256:12"}}, "image/digest"),
     ({"image": {"pullPolicy": "Sometimes"}}, "image/pullPolicy"),
     ({"proxy": {"image": {"pullPolicy": "never"}}}, "proxy/image/pullPolicy"),
+    ({"proxy": {"networkPolicy": {"metricsFrom": [{"pods": {}}]}}}, "metricsFrom/0"),
+    ({"proxy": {"networkPolicy": {"metricsFrom": [{}]}}}, "metricsFrom/0"),
     ({"imagePullSecrets": ["registry"]}, "imagePullSecrets/0"),
     ({"namespaces": "robots"}, "namespaces"),
     ({"namespaces": ["Robots"]}, "namespaces/0"),

@@ -1,5 +1,6 @@
 """What the chart makes of its values, alone and in combination."""
 
+import json
 import shutil
 from functools import cache
 from pathlib import Path
@@ -198,6 +199,21 @@ def test_secrets_are_empty() -> None:
     assert not [secret for secret in secrets if {"data", "stringData"} & secret.keys()]
     (configuration,) = of_kind(objects(), "MutatingWebhookConfiguration")
     assert "caBundle" not in configuration["webhooks"][0]["clientConfig"]
+
+
+def test_the_operator_may_reach_its_proxies() -> None:
+    """The peer that proxies' NetworkPolicies let in is the operator's pod."""
+    found = objects({"podLabels": {"x": "y"}})
+    (deployment,) = [one for one in of_kind(found, "Deployment")
+                     if one["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
+    (pod,) = operator(found)
+    (text,) = [one for one in pod["containers"][0]["args"] if one.startswith("--admin-from=")]
+    (peer,) = json.loads(text.removeprefix("--admin-from="))
+    labels = deployment["spec"]["template"]["metadata"]["labels"]
+    assert peer["podSelector"]["matchLabels"].items() <= labels.items()
+    assert "--no-network-policy" not in pod["containers"][0]["args"]
+    off = objects({"proxy": {"networkPolicy": {"enabled": False}}})
+    assert "--no-network-policy" in operator(off)[0]["containers"][0]["args"]
 
 
 def test_cert_manager() -> None:

@@ -66,6 +66,14 @@ app.kubernetes.io/part-of: rosproxy
 {{ include "rosproxy.fullname" . }}-key
 {{- end -}}
 
+{{/* Who may reach the proxies' admin port, as JSON: the operator's pod, and whom the values name. */}}
+{{- define "rosproxy.adminFrom" -}}
+{{- $namespace := dict "matchLabels" (dict "kubernetes.io/metadata.name" .Release.Namespace) -}}
+{{- $pod := dict "matchLabels" (include "rosproxy.selectorLabels" . | fromYaml) -}}
+{{- $operator := dict "namespaceSelector" $namespace "podSelector" $pod -}}
+{{- concat (list $operator) .Values.proxy.networkPolicy.metricsFrom | toJson -}}
+{{- end -}}
+
 {{/* Not empty if the operator makes the webhook's certificate itself. */}}
 {{- define "rosproxy.selfSigned" -}}
 {{- if and .Values.webhook.enabled (eq .Values.webhook.certificate.source "self-signed") -}}

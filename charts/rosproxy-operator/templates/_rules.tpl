@@ -9,6 +9,10 @@
 - apiGroups: [""]
   resources: [services]
   verbs: [create, delete]
+# One NetworkPolicy for each RosProxy: who may connect to its proxies.
+- apiGroups: [networking.k8s.io]
+  resources: [networkpolicies]
+  verbs: [list, create, patch, delete]
 # Events on RosProxies and on pods; one that comes again is read and counted. And the kubelet's events
 # on a proxy that does not start: they alone say that a port is taken.
 - apiGroups: [""]

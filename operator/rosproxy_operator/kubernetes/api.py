@@ -6,6 +6,7 @@ for single objects, by name::
     nodes                   list watch
     pods                    get list watch create delete patch
     services                get list watch create delete
+    networkpolicies         list create patch delete
     events                  get list create patch
     rosproxies              list watch
     rosproxies/status       patch
@@ -42,9 +43,11 @@ WITHIN: Timeout = (3.0, 15.0)
 SOON: Timeout = (1.0, 2.0)
 """The same while somebody waits for a pod to be admitted."""
 WEBHOOKS = "mutatingwebhookconfigurations"
+POLICIES = "networkpolicies"
 _ROOTS = {
     PLURAL: f"/apis/{GROUP}/{VERSION}",
     WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
+    POLICIES: "/apis/networking.k8s.io/v1",
 }
 """Where kinds are found that are not of the core group."""
 _CONNECTIONS = 16
@@ -127,7 +130,7 @@ class Api:
         return self._cached("", "nodes", {})
 
     def own(self, kind: str) -> list[Found]:
-        """The ``pods`` or ``services`` that the operator has made."""
+        """The ``pods``, ``services`` or ``networkpolicies`` that the operator has made."""
         query = {"labelSelector": OWN_SELECTOR}
         return [found for place in self._places for found in self._cached(place, kind, query)]
 

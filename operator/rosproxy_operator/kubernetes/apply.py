@@ -13,16 +13,27 @@ from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiConflict, ApiError, ApiGone, ApiInvalid
+from rosproxy_operator.kubernetes.api import (
+    POLICIES,
+    Api,
+    ApiConflict,
+    ApiError,
+    ApiGone,
+    ApiInvalid,
+)
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreatePolicy,
     CreateProxy,
     CreateService,
+    DeletePolicy,
     DeleteProxy,
     DeleteService,
     Emit,
+    ObjectAction,
     PatchStatus,
     SetImage,
+    SetPolicy,
 )
 from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
 from rosproxy_operator.kubernetes.proxy_sync import address_of, token_for
@@ -39,6 +50,15 @@ AT_ONCE = 8
 RETIRING = 10.0
 """Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
 
+_KINDS: Mapping[type, tuple[str, str]] = {
+    CreateService: ("Service", "services"),
+    DeleteService: ("Service", "services"),
+    CreatePolicy: ("NetworkPolicy", POLICIES),
+    DeletePolicy: ("NetworkPolicy", POLICIES),
+    CreateProxy: ("Pod", "pods"),
+    DeleteProxy: ("Pod", "pods"),
+}
+"""What is created and deleted: its kind, and the same as the API's paths have it."""
 Count = Callable[[Action, str], None]
 
 
@@ -118,31 +138,21 @@ class ClusterApplier:
     def _do(self, action: Action) -> None:
         api = self._api
         match action:
-            case CreateService():
-                _create(api, "services", action.body)
-            case CreateProxy():
-                _create(api, "pods", action.body)
-            case DeleteService():
-                api.delete("services", action.id, action.uid)
-            case DeleteProxy():
-                api.delete("pods", action.id, action.uid)
+            case CreateService() | CreatePolicy() | CreateProxy():
+                _create(api, _KINDS[type(action)][1], action.body)
+            case DeleteService() | DeletePolicy() | DeleteProxy():
+                api.delete(_KINDS[type(action)][1], action.id, action.uid)
             case SetImage():
                 container = "/spec/containers/0"
-                api.patch(
-                    "pods",
-                    action.id,
-                    [
-                        {"op": "test", "path": "/metadata/uid", "value": action.uid},
-                        {"op": "test", "path": f"{container}/name", "value": CONTAINER},
-                        {"op": "replace", "path": f"{container}/image", "value": action.image},
-                    ],
-                )
+                named = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
+                image = {"op": "replace", "path": f"{container}/image", "value": action.image}
+                api.patch("pods", action.id, [_still(action.uid), named, image])
+            case SetPolicy():
+                spec = {"op": "replace", "path": "/spec", "value": action.spec}
+                api.patch(POLICIES, action.id, [_still(action.uid), spec])
             case PatchStatus():
-                operations: list[Json] = [
-                    {"op": "test", "path": "/metadata/uid", "value": action.uid},
-                    {"op": "add", "path": "/status", "value": action.status},
-                ]
-                api.patch(f"{PLURAL}/status", action.of, operations)
+                status = {"op": "add", "path": "/status", "value": action.status}
+                api.patch(f"{PLURAL}/status", action.of, [_still(action.uid), status])
             case Emit():
                 _emit(api, action)
 
@@ -166,16 +176,22 @@ class ClusterApplier:
             await self._one(action, observed)
 
 
+def _still(uid: str) -> Json:
+    """The first operation of a JSON patch: it changes nothing if the object is another one."""
+    return {"op": "test", "path": "/metadata/uid", "value": uid}
+
+
 def line(action: Action) -> str:
     """An action in one line."""
     match action:
-        case CreateService() | CreateProxy():
-            return f"create {action.body.get('kind')} {_subject(action)}"
-        case DeleteService() | DeleteProxy():
-            kind = "Service" if isinstance(action, DeleteService) else "Pod"
-            return f"delete {kind} {action.id}: {action.why}"
+        case CreateService() | CreatePolicy() | CreateProxy():
+            return f"create {_KINDS[type(action)][0]} {_subject(action)}"
+        case DeleteService() | DeletePolicy() | DeleteProxy():
+            return f"delete {_KINDS[type(action)][0]} {action.id}: {action.why}"
         case SetImage():
             return f"set image of Pod {action.id} to {action.image}"
+        case SetPolicy():
+            return f"mend NetworkPolicy {action.id}"
         case PatchStatus():
             return f"write status of RosProxy {action.of}"
         case Emit():
@@ -185,9 +201,9 @@ def line(action: Action) -> str:
 def _subject(action: Action) -> Name:
     """The object that an action is about."""
     match action:
-        case CreateService() | CreateProxy():
+        case CreateService() | CreatePolicy() | CreateProxy():
             return name_of(action.body["metadata"])
-        case DeleteService() | DeleteProxy() | SetImage():
+        case ObjectAction():
             return action.id
         case _:
             return action.of
@@ -204,7 +220,7 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
 
     The object is gone, or its whole namespace is about to be; or it is another one by now.
     """
-    if isinstance(action, DeleteService | DeleteProxy | SetImage | PatchStatus):
+    if isinstance(action, ObjectAction | PatchStatus):
         return ApiGone, ApiConflict
     return (ApiGone,)
 

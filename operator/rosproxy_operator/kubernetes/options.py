@@ -8,13 +8,24 @@ from collections.abc import Callable
 import click
 
 from rosproxy.cli.options import Command, Parsed
-from rosproxy_operator.kubernetes.settings import read_name
+from rosproxy_operator.kubernetes.settings import read_name, read_peers
 
 
 def own_options(command: Command) -> Command:
-    """How the operator proves to proxies who it is."""
+    """Who may reach the proxies, and how the operator proves to them who it is."""
     return _with(
         command,
+        click.option(
+            "--network-policy/--no-network-policy",
+            default=True,
+            help="Whether the proxies of each RosProxy get a NetworkPolicy.",
+        ),
+        click.option(
+            "--admin-from",
+            type=Parsed("JSON", read_peers),
+            help="Who may reach proxies' admin endpoints, as a JSON list of NetworkPolicyPeers. "
+            "Default: everybody.",
+        ),
         click.option(
             "--key-secret",
             type=Parsed("namespace/name", read_name),

@@ -11,7 +11,7 @@ import msgspec
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import SettingError
-from rosproxy_operator.kubernetes.resources.model import Name
+from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
@@ -29,13 +29,16 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     ``image`` and ``image_pull_policy`` are those of proxies whose RosProxy names none; an empty
     policy leaves it to Kubernetes. ``node_ports`` is the API server's --service-node-port-range,
     ``ephemeral`` the range from which the nodes' kernels take ports for connections: no hostPort
-    is taken from either.
+    is taken from either. ``network_policy``: whether RosProxies get one; ``admin_from`` are the
+    NetworkPolicyPeers that it lets reach the proxies' admin endpoints, everybody if it is None.
     """
 
     image: str = "rosproxy:latest"
     image_pull_policy: str = ""
     node_ports: PortRange = NODE_PORTS
     ephemeral: PortRange = EPHEMERAL
+    network_policy: bool = True
+    admin_from: tuple[Json, ...] | None = None
 
 
 class WebhookSettings(msgspec.Struct, frozen=True):
@@ -83,6 +86,8 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
             image_pull_policy=options["proxy_image_pull_policy"] or "",
             node_ports=options["node_port_range"],
             ephemeral=options["ephemeral_range"],
+            network_policy=options["network_policy"],
+            admin_from=options["admin_from"],
         ),
         namespaces=tuple(dict.fromkeys(options["namespace"])),
         resync=options["resync"],
@@ -115,6 +120,44 @@ def read_name(text: str) -> Name | None:
     if not slash or not is_label(namespace) or not is_subdomain(name):
         raise ValueError(f"{text!r} is not of the form NAMESPACE/NAME")
     return Name(namespace, name)
+
+
+def read_peers(text: str) -> tuple[Json, ...] | None:
+    """A JSON list of NetworkPolicyPeers (networking.k8s.io/v1); None for no text.
+
+    Raises ValueError. What the API server does not know it would drop without a word, and the
+    operator would write it again and again: so it is refused here.
+    """
+    if not text:
+        return None
+    try:
+        return tuple(msgspec.to_builtins(msgspec.json.decode(text, type=list[_Peer])))
+    except msgspec.DecodeError as error:
+        raise ValueError(f"is no JSON list of NetworkPolicyPeers: {error}") from None
+
+
+class _Requirement(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    key: str
+    operator: str
+    values: list[str] = []
+
+
+class _Selector(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    matchLabels: dict[str, str] = {}  # noqa: N815 - the API's names
+    matchExpressions: list[_Requirement] = []  # noqa: N815
+
+
+class _Block(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    cidr: str
+    excepted: list[str] = msgspec.field(default_factory=list, name="except")
+
+
+class _Peer(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """A NetworkPolicyPeer, as k8s.io/api, networking/v1/types.go, has it."""
+
+    podSelector: _Selector | None = None  # noqa: N815
+    namespaceSelector: _Selector | None = None  # noqa: N815
+    ipBlock: _Block | None = None  # noqa: N815
 
 
 def _make_webhook(options: Mapping[str, Any]) -> WebhookSettings:

@@ -30,6 +30,24 @@ class DeleteService(ObjectAction, frozen=True):
     why: str
 
 
+class CreatePolicy(ClusterAction, frozen=True):
+    """Create the NetworkPolicy of a RosProxy. ``body`` is the whole object."""
+
+    body: Json
+
+
+class SetPolicy(ObjectAction, frozen=True):
+    """Give a NetworkPolicy the spec that it ought to have."""
+
+    spec: Json
+
+
+class DeletePolicy(ObjectAction, frozen=True):
+    """Delete a NetworkPolicy that is not to be there."""
+
+    why: str
+
+
 class CreateProxy(ClusterAction, frozen=True):
     """Create a proxy's pod. ``body`` is the whole object."""
 
@@ -71,4 +89,15 @@ class Emit(ClusterAction, frozen=True):
     message: str
 
 
-Action = CreateService | DeleteService | CreateProxy | DeleteProxy | SetImage | PatchStatus | Emit
+Action = (
+    CreateService
+    | DeleteService
+    | CreatePolicy
+    | SetPolicy
+    | DeletePolicy
+    | CreateProxy
+    | DeleteProxy
+    | SetImage
+    | PatchStatus
+    | Emit
+)

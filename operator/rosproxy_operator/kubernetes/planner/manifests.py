@@ -88,9 +88,9 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
         PORT_RANGE: str(site.ports),
         ADVERTISE_HOST: site.advertise_host,
     }
-    metadata = _metadata(of, proxy_id(of.id, site.node.name), notes)
+    meta = metadata(of, proxy_id(of.id, site.node.name), notes)
     spec = {**_spec(site), "containers": [{**container, "image": ""}]}
-    body = {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec}
+    body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
     notes[FINGERPRINT] = f"{_fingerprint(body)}-{known_as}"
     return {**body, "spec": {**spec, "containers": [container]}}
@@ -99,10 +99,10 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     """A RosProxy's Service, under one address the proxy on each pod's own node."""
     notes: dict[str, str] = {}
-    metadata = _metadata(rosproxy, service_id(rosproxy.id), notes)
+    meta = metadata(rosproxy, service_id(rosproxy.id), notes)
     spec: dict[str, Any] = {
         "type": "ClusterIP",
-        "selector": metadata["labels"],
+        "selector": meta["labels"],
         "internalTrafficPolicy": "Local",
         # A proxy that does not reach its master must still be there to say so.
         "publishNotReadyAddresses": True,
@@ -110,7 +110,7 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
             {"name": "master", "port": MASTER_PORT, "targetPort": MASTER_PORT, "protocol": "TCP"}
         ],
     }
-    body = {"apiVersion": "v1", "kind": "Service", "metadata": metadata, "spec": spec}
+    body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
     notes[FINGERPRINT] = _fingerprint(body)
     if cluster_ip:
         spec["clusterIP"] = cluster_ip
@@ -144,7 +144,8 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _metadata(of: RosProxy, id: Name, annotations: dict[str, str]) -> dict[str, Any]:
+def metadata(of: RosProxy, id: Name, annotations: dict[str, str]) -> dict[str, Any]:
+    """The metadata of an object that belongs to a RosProxy and goes with it."""
     owner = {
         "apiVersion": API_VERSION,
         "kind": KIND,

@@ -17,6 +17,10 @@ from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
 from rosproxy_operator.kubernetes.planner.callers import callers
 from rosproxy_operator.kubernetes.planner.injection import unwired
+from rosproxy_operator.kubernetes.planner.network_policy import (
+    reconcile_orphaned_policies,
+    reconcile_policy,
+)
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
     advertise_host,
@@ -81,11 +85,12 @@ def plan(
     decided = decide(learned, ranges.given, now)
     retries = Retries(decided.attempts, observed.failures, now)
     context = ClusterContext(seen, settings, decided, ranges, retries, now)
-    actions = list(reconcile_orphans(context))
+    actions = [*reconcile_orphans(context), *reconcile_orphaned_policies(context)]
     problems = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
     for _, rosproxy in sorted(seen.rosproxies.items()):
-        own = [*reconcile_service(context, rosproxy), *reconcile_proxies(context, rosproxy)]
+        own = [*reconcile_service(context, rosproxy), *reconcile_policy(context, rosproxy)]
+        own += reconcile_proxies(context, rosproxy)
         states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
         master, _ = master_of(rosproxy, observed)
@@ -140,7 +145,10 @@ def _problems(
     address = context.cluster_ip(of)
     pods = context.view.taken.get(of.id, ()) if address else ()
     others = (*context.view.findings, *moved, *context.ranges.findings)
+    unlisted = context.observed.no_policies if context.settings.network_policy else ""
+    text = f"the NetworkPolicies can't be listed, so none is made for it: {unlisted}"
     return (
+        *((finding(of, "NoNetworkPolicy", text),) if unlisted else ()),
         *findings(of, states, context.retries.failures(of.id)),
         *(one for one in others if one.of == of.id),
         *filter(None, (unwired(pod, of, address) for pod in pods)),

@@ -31,11 +31,16 @@ def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
     return all(_fits(*one, labels) for one in selector.expressions)
 
 
+def own_values(name: str) -> tuple[str, str]:
+    """The values of the label with which the RosProxy ``name`` is asked for."""
+    return _ANY, name
+
+
 def label_selector(spec: RosProxySpec, name: str) -> str:
     """The selector of the pods of the RosProxy ``name`` as the API server takes it."""
     selector = spec.pod_selector
     if selector is None:
-        return f"{INJECT} in {_listed((_ANY, name))}"
+        return f"{INJECT} in {_listed(own_values(name))}"
     equal = (f"{key}={value}" for key, value in sorted(selector.labels.items()))
     others = (_TEXTS[how].format(key, _listed(values)) for key, how, values in selector.expressions)
     return ",".join([*equal, *others, f"{INJECT} notin {_listed(OFF)}"])
@@ -105,7 +110,9 @@ def selects(rosproxy: RosProxy, pod: Pod) -> bool:
     here = rosproxy.id.namespace == pod.id.namespace
     if not here or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
         return False
-    return label in (_ANY, rosproxy.id.name) if selector is None else matches(selector, pod.labels)
+    if selector is None:
+        return label in own_values(rosproxy.id.name)
+    return matches(selector, pod.labels)
 
 
 def _is_ours(labels: Mapping[str, str]) -> bool:

@@ -202,6 +202,16 @@ class ProxyService(msgspec.Struct, frozen=True):
     deleting: bool = False
 
 
+class ProxyPolicy(msgspec.Struct, frozen=True):
+    """A NetworkPolicy of the operator: who may connect to a RosProxy's proxies."""
+
+    of: Name
+    owner: str
+    uid: str
+    spec: Json
+    deleting: bool = False
+
+
 class ProxyReport(msgspec.Struct, frozen=True):
     """What a proxy says of itself (``/status``), as far as it matters here.
 
@@ -294,6 +304,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
     selected: frozenset[str] = frozenset()
+    policies: Mapping[Name, ProxyPolicy] = {}
+    no_policies: str = ""
     key: bytes = b""
     reports: Mapping[str, ProxyReport] = {}
     unusable: Mapping[Name, InvalidRosProxy] = {}

@@ -75,6 +75,11 @@ def proxy_id(of: Name, node: str) -> Name:
     return Name(of.namespace, "-".join(part for part in parts if part))
 
 
+def policy_id(of: Name) -> Name:
+    """The namespace and name of the NetworkPolicy of a RosProxy's proxies."""
+    return Name(of.namespace, f"{_PREFIX}{of.name}")
+
+
 def token_of(key: bytes, proxy: Name, node: str) -> str:
     """The token of a proxy's admin endpoint, which only who has the operator's key can tell.
 

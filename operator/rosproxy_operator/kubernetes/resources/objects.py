@@ -14,6 +14,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Name,
     Pod,
     ProxyPod,
+    ProxyPolicy,
     ProxyService,
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck
@@ -108,6 +109,16 @@ def service(obj: Json) -> ProxyService | None:
         fingerprint=word(part(meta, "annotations"), names.FINGERPRINT),
         deleting=is_deleted(meta),
     )
+
+
+def policy(obj: Json) -> ProxyPolicy | None:
+    """A NetworkPolicy; None if the object is not one that this operator made."""
+    meta = part(obj, "metadata")
+    labels, owner = words(meta, "labels"), _owner(meta)
+    of = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
+    if not names.is_own(labels) or not owner or names.policy_id(of) != name_of(meta):
+        return None
+    return ProxyPolicy(of, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
 
 
 def name_of(metadata: Json) -> Name:

@@ -25,10 +25,12 @@ PLURALS = {
     "events": "Event",
     "secrets": "Secret",
     "rosproxies": "RosProxy",
+    "networkpolicies": "NetworkPolicy",
     "mutatingwebhookconfigurations": "MutatingWebhookConfiguration",
 }
 GROUPS = {
     "rosproxies": "rosproxy.io/v1alpha1",
+    "networkpolicies": "networking.k8s.io/v1",
     "mutatingwebhookconfigurations": "admissionregistration.k8s.io/v1",
 }
 

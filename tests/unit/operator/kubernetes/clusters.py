@@ -16,6 +16,7 @@ from tests.unit.operator.kubernetes.simulation import (
     deleting,
     is_own,
     meta,
+    name_of,
     node_of,
 )
 from tests.unit.operator.kubernetes.worlds import FIRST, NODES, World, spec
@@ -171,6 +172,15 @@ class Clusters(World):
                 where = {"clusterIP": gone["spec"]["clusterIP"]}
                 with contextlib.suppress(Refused):
                     self.cluster.create_service({**other, "spec": where})
+
+    def meddle_with_policy(self, n: int, m: int) -> None:
+        """A NetworkPolicy is deleted, or changed."""
+        if every := sorted(self.cluster.state.policies):
+            policy = self.cluster.state.policies[pick(every, n)]
+            if m % 2:
+                del self.cluster.state.policies[name_of(policy)]
+            else:
+                policy["spec"]["ingress"] = []
 
     def change_key(self, n: int, _: int) -> None:
         """Somebody takes the key of the proxies' tokens out of its Secret."""

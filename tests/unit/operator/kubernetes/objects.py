@@ -27,7 +27,8 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
-SETTINGS = ClusterSettings(image="rosproxy:1")
+SETTINGS = ClusterSettings(image="rosproxy:1", network_policy=False)
+"""Nobody gets a NetworkPolicy: that has tests of its own."""
 STAMP = "2026-01-01T00:00:00Z"
 RANGE = PortRange(11400, 11403)
 ROBOT = Name("ros", "robot")

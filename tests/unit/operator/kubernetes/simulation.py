@@ -13,13 +13,16 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreatePolicy,
     CreateProxy,
     CreateService,
+    DeletePolicy,
     DeleteProxy,
     DeleteService,
     Emit,
     PatchStatus,
     SetImage,
+    SetPolicy,
 )
 from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
@@ -88,6 +91,7 @@ class State:
     nodes: dict[str, Object] = field(default_factory=dict)
     pods: dict[Name, Object] = field(default_factory=dict)
     services: dict[Name, Object] = field(default_factory=dict)
+    policies: dict[Name, Object] = field(default_factory=dict)
 
 
 class Cluster:
@@ -177,6 +181,13 @@ class Cluster:
         service["metadata"]["uid"] = self.uid("service")
         self.state.services[name_of(service)] = service
 
+    def create_policy(self, body: Object) -> None:
+        if name_of(body) in self.state.policies:
+            raise Refused("AlreadyExists")
+        policy = copy.deepcopy(body)
+        policy["metadata"]["uid"] = self.uid("policy")
+        self.state.policies[name_of(policy)] = policy
+
     # what goes on by itself
 
     def step(self) -> None:
@@ -197,9 +208,10 @@ class Cluster:
                 node_of(pod) and node_of(pod) not in self.state.nodes
             ):
                 self.delete_pod(pod)
-        for name, service in list(self.state.services.items()):
-            if any(ref["uid"] not in uids for ref in meta(service).get("ownerReferences", ())):
-                del self.state.services[name]
+        for kind in (self.state.services, self.state.policies):
+            for name, one in list(kind.items()):
+                if any(ref["uid"] not in uids for ref in meta(one).get("ownerReferences", ())):
+                    del kind[name]
 
     def schedule(self) -> None:
         for pod in self.state.pods.values():
@@ -264,6 +276,7 @@ class Cluster:
         pods = [parse.pod(one) for one in seen.pods.values()]
         own = [found for one in seen.pods.values() if (found := parse.proxy_pod(one))]
         services = filter(None, map(parse.service, seen.services.values()))
+        policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(one) for one in self.state.rosproxies.values())
         masters = {one.spec.master.service for one in of if one.spec.master.service}
         there = (self.master_ip, "") if self.master_ip else ("", "does not exist")
@@ -273,6 +286,7 @@ class Cluster:
             pods=tuple(pods),
             proxies=tuple(own),
             services={one.of: one for one in services},
+            policies={one.of: one for one in filter(None, map(parse.policy, policies))},
             key=self.key,
             masters=dict.fromkeys(masters, there),
             reports={
@@ -299,6 +313,15 @@ class Cluster:
             case CreateProxy(body=body):
                 self.made += 1
                 self.create_pod(dict(body))
+            case CreatePolicy(body=body):
+                self.made += 1
+                self.create_policy(dict(body))
+            case DeletePolicy(id=id, uid=uid):
+                if self._own(self.state.policies, id, uid):
+                    del self.state.policies[id]
+            case SetPolicy(id=id, uid=uid, spec=spec):
+                if policy := self._own(self.state.policies, id, uid):
+                    policy["spec"] = copy.deepcopy(dict(spec))
             case DeleteProxy(id=id, uid=uid):
                 if pod := self._own(self.state.pods, id, uid):
                     self.delete_pod(pod)
@@ -359,10 +382,10 @@ class Controller:
         try:
             self.cluster.apply(action)
         except Refused as error:
-            assert isinstance(action, CreateProxy | CreateService)
-            name = name_of(dict(action.body))
-            kind = self.cluster.state.pods if isinstance(action, CreateProxy) else None
-            there = (self.cluster.state.services if kind is None else kind).get(name)
+            assert isinstance(action, CreateProxy | CreateService | CreatePolicy)
+            name, state = name_of(dict(action.body)), self.cluster.state
+            kinds = {CreateProxy: state.pods, CreateService: state.services}
+            there = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and there is not None:
                 text = "a Pod of this name that is not the operator's is there"
                 return {} if is_own(there) else {name: text}

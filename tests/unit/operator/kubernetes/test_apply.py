@@ -12,13 +12,16 @@ from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreatePolicy,
     CreateProxy,
     CreateService,
+    DeletePolicy,
     DeleteProxy,
     DeleteService,
     Emit,
     PatchStatus,
     SetImage,
+    SetPolicy,
 )
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
@@ -88,6 +91,23 @@ async def test_proxies_are_created(server: ApiServer, carry: Carried) -> None:
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["one", "two"]
     assert carry.applier.failures == {OF: {}}
     assert carry.counted == [("CreateProxy", "ok")] * 2
+
+
+async def test_a_policy_is_made_mended_and_deleted(server: ApiServer, carry: Carried) -> None:
+    made = {**body("NetworkPolicy", "rosproxy-arm"), "apiVersion": "networking.k8s.io/v1"}
+    id = Name(NAMESPACE, "rosproxy-arm")
+    await carry.out(CreatePolicy(OF, made))
+    await carry.out(CreatePolicy(OF, made))  # it is there by now
+    assert carry.applier.failures == {OF: {}}
+    (there,) = server.all("networkpolicies")
+    uid = there["metadata"]["uid"]
+    await carry.out(SetPolicy(OF, id, uid, {"policyTypes": ["Ingress"]}))
+    assert server.get("networkpolicies", id.name, NAMESPACE)["spec"] == {"policyTypes": ["Ingress"]}
+    await carry.out(SetPolicy(OF, id, "another", {}), DeletePolicy(OF, id, "another", "old"))
+    assert server.get("networkpolicies", id.name, NAMESPACE)["spec"] == {"policyTypes": ["Ingress"]}
+    await carry.out(DeletePolicy(OF, id, uid, "--no-network-policy"))
+    assert server.all("networkpolicies") == []
+    assert carry.applier.failures == {OF: {}}
 
 
 async def test_one_that_is_there_already_is_no_failure(server: ApiServer, carry: Carried) -> None:

@@ -38,6 +38,8 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--node-port-range=31000-31999",
         "--ephemeral-range=40000-50000",
         "--resync=5",
+        "--no-network-policy",
+        '--admin-from=[{"podSelector":{}},{"ipBlock":{"cidr":"192.0.2.0/24"}}]',
         "--key-secret=ns/key",
         *HOOK,
         "--webhook-service=ns/wh",
@@ -52,6 +54,8 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
     assert settings.plan.image_pull_policy == "Never"
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)
+    assert not settings.plan.network_policy
+    assert settings.plan.admin_from == ({"podSelector": {}}, {"ipBlock": {"cidr": "192.0.2.0/24"}})
     assert settings.key_secret == Name("ns", "key")
     assert settings.resync == 5.0
     assert settings.admin == HostPort("127.0.0.1", 1)
@@ -86,6 +90,8 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
         (["--admin-bind=x"], "--admin-bind: 'x' is not of the form 0.0.0.0:11313"),
         (["--liveness-bind=x"], "--liveness-bind: 'x' is not of the form 0.0.0.0:8080"),
         (["--webhook-bind=x"], "--webhook-bind: 'x' is not of the form 0.0.0.0:9443"),
+        (["--admin-from=all"], "--admin-from: is no JSON list of NetworkPolicyPeers"),
+        (['--admin-from=[{"pods":{}}]'], "--admin-from: is no JSON list of NetworkPolicyPeers"),
         (["--key-secret=key"], "--key-secret: 'key' is not of the form NAMESPACE/NAME"),
         (HOOK, "--webhook-service: NAMESPACE/NAME is needed"),
         ([*HOOK, "--webhook-service=wh"], "--webhook-service: 'wh' is not of the form NAMESPACE/"),

@@ -20,7 +20,7 @@ NODES = (
 ROSPROXIES = (Clusters.change, Clusters.create, Clusters.delete, Clusters.replace)
 MEDDLING = (
     Clusters.delete_proxy, Clusters.reject, Clusters.delete_service, Clusters.forbid,
-    Clusters.toggle_master, Clusters.change_key,
+    Clusters.toggle_master, Clusters.meddle_with_policy, Clusters.change_key,
 )  # fmt: skip
 CONTROLLER = (
     Clusters.look, Clusters.look_and_be_killed, Clusters.look_and_stall, Clusters.step,

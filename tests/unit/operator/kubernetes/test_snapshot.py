@@ -152,6 +152,23 @@ async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
     assert found.masters == {id: ("10.96.1.1", "")}
 
 
+async def test_a_role_without_the_right_to_policies_stops_nothing(
+    server: ApiServer, api: Api
+) -> None:
+    put_all(server)
+    refusal = (
+        'networkpolicies.networking.k8s.io is forbidden: User "x" cannot list resource '
+        '"networkpolicies" in API group "networking.k8s.io" at the cluster scope'
+    )
+    server.refuse("GET", "networkpolicies", 403, refusal)
+    found = await reader(api).read()
+    assert 'resources ["networkpolicies"], verbs ["list"]' in found.no_policies
+    assert [each.id.name for each in found.rosproxies] == ["arm"]
+    server.refuse("GET", "networkpolicies", 503, "starting")
+    with pytest.raises(ApiError):
+        await reader(api).read()
+
+
 @pytest.mark.parametrize(
     ("spec", "told"),
     [

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
+from rosproxy_operator.kubernetes.planner.network_policy import policy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -213,6 +214,12 @@ class World:
         services = [one for one in state.services.values() if is_own(one)]
         owners = sorted(one["metadata"]["ownerReferences"][0]["uid"] for one in services)
         assert owners == sorted(one.uid for one in rosproxies)
+        policies = state.policies.values()
+        assert sorted(one["metadata"]["ownerReferences"][0]["uid"] for one in policies) == owners
+        for one in rosproxies:
+            there = objects.policy(state.policies[names.policy_id(one.id)])
+            assert there is not None
+            assert there.spec == policy(one, SETTINGS)["spec"]
         self.check_addresses(unready)
 
     def check_proxies(self, found: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:

@@ -1,0 +1,178 @@
+"""The NetworkPolicy of a RosProxy's proxies."""
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.planner import manifests
+from rosproxy_operator.kubernetes.planner.actions import CreatePolicy, DeletePolicy, SetPolicy
+from rosproxy_operator.kubernetes.planner.network_policy import policy
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterSnapshot,
+    Json,
+    MasterSpec,
+    Name,
+    ProxyPolicy,
+    Selector,
+)
+from tests.unit.operator.kubernetes.objects import (
+    ROBOT,
+    SETTINGS,
+    complete,
+    done,
+    node,
+    observed,
+    rosproxy,
+    service,
+    site,
+    told,
+)
+from tests.unit.operator.kubernetes.objects import look as look_at
+
+PEERS: tuple[Json, ...] = ({"podSelector": {"matchLabels": {"a": "b"}}},)
+ON = replace(SETTINGS, network_policy=True, admin_from=PEERS)
+INSIDE = MasterSpec(service=Name("ros", "roscore"), publish=11321)
+
+
+def look(seen: ClusterSnapshot, memory: ClusterState | None = None) -> ClusterPlan:
+    return look_at(seen, memory, settings=ON)
+
+
+def there(spec: Json | None = None, **changes: Any) -> dict[Name, ProxyPolicy]:
+    own = policy(rosproxy(), ON)["spec"] if spec is None else spec
+    found = ProxyPolicy(ROBOT, "uid-robot", "uid-policy", own)
+    return {ROBOT: replace(found, **changes)}
+
+
+def rules(**changes: Any) -> list[Json]:
+    return list(policy(rosproxy(**changes), ON)["spec"]["ingress"])
+
+
+def test_it_is_about_the_proxies_of_its_rosproxy() -> None:
+    made = policy(rosproxy(), ON)
+    assert made["metadata"]["name"] == "rosproxy-robot"
+    (owner,) = made["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["uid"], owner["controller"]) == ("RosProxy", "uid-robot", True)
+    proxy = manifests.proxy_pod(site(rosproxy(), node()), ON)
+    selected = made["spec"]["podSelector"]["matchLabels"]
+    assert selected.items() <= proxy["metadata"]["labels"].items()
+    assert made["spec"]["policyTypes"] == ["Ingress"]
+
+
+def test_ros_nodes_ports_are_for_everybody() -> None:
+    first, *_ = rules(master=INSIDE)
+    assert first == {
+        "ports": [
+            {"protocol": "TCP", "port": 11400, "endPort": 11499},
+            {"protocol": "TCP", "port": 11321},
+        ]
+    }
+
+
+@pytest.mark.parametrize(
+    ("window", "ports"),
+    [
+        (PortRange(11306, 11315), [(11306, 11310), (11313, 11315)]),
+        (PortRange(11311, 11313), [(11313, None)]),
+        (PortRange(11300, 11312), [(11300, 11310)]),
+        (PortRange(11312, 11320), [(11313, 11320)]),
+    ],
+)
+def test_the_proxys_own_ports_are_not_among_them(window: PortRange, ports: list[Any]) -> None:
+    first, *_ = rules(window=window, ports=1)
+    assert [(one["port"], one.get("endPort")) for one in first["ports"]] == ports
+
+
+def test_the_masters_port_is_for_selected_pods() -> None:
+    _, second, _ = rules()
+    assert second["ports"] == [{"protocol": "TCP", "port": 11311}]
+    (peer,) = second["from"]
+    expression = {"key": names.INJECT, "operator": "In", "values": ["robot", "true"]}
+    assert peer == {"podSelector": {"matchExpressions": [expression]}}
+
+
+def test_a_pod_selector_is_taken_over() -> None:
+    tier, x = ("tier", "In", frozenset({"b", "a"})), ("x", "Exists", frozenset[str]())
+    _, second, _ = rules(pod_selector=Selector({"app": "x"}, (tier, x)))
+    assert second["from"] == [
+        {
+            "podSelector": {
+                "matchLabels": {"app": "x"},
+                "matchExpressions": [
+                    {"key": "tier", "operator": "In", "values": ["a", "b"]},
+                    {"key": "x", "operator": "Exists"},
+                    {"key": names.INJECT, "operator": "NotIn", "values": ["", "false"]},
+                ],
+            }
+        }
+    ]
+
+
+def test_the_admin_port_is_for_the_operator() -> None:
+    *_, last = rules()
+    assert last == {"ports": [{"protocol": "TCP", "port": 11312}], "from": [*PEERS]}
+    everybody = policy(rosproxy(), replace(ON, admin_from=None))["spec"]["ingress"][-1]
+    assert "from" not in everybody
+
+
+def test_it_is_read_back_as_it_was_made() -> None:
+    made = policy(rosproxy(), ON)
+    found = objects.policy({**made, "metadata": {**made["metadata"], "uid": "uid-policy"}})
+    assert found == there()[ROBOT]
+    other = {**made["metadata"], "name": "other"}
+    assert objects.policy({**made, "metadata": other}) is None
+
+
+def test_it_is_made_before_the_proxies() -> None:
+    found = look(observed(rosproxy(), service()))
+    (created,) = done(found)
+    assert isinstance(created, CreatePolicy)
+    assert done(look(complete(policies=there()))) == []
+
+
+@pytest.mark.parametrize("spec", [{}, {"podSelector": {}, "policyTypes": ["Ingress"]}])
+def test_it_is_mended(spec: Json) -> None:
+    (mended,) = done(look(complete(policies=there(spec))))
+    assert isinstance(mended, SetPolicy)
+    assert (mended.uid, mended.spec) == ("uid-policy", policy(rosproxy(), ON)["spec"])
+
+
+def test_mending_that_does_not_help_is_not_repeated_at_once() -> None:
+    seen = complete(policies=there({}))
+    first = look(seen)
+    assert done(look(seen, first.state)) == []
+
+
+@pytest.mark.parametrize(
+    ("policies", "rosproxies"),
+    [(there(owner="uid-old"), (rosproxy(),)), (there(), ()), (there(owner="uid-old"), ())],
+)
+def test_that_of_a_rosproxy_that_is_gone_is_deleted(
+    policies: dict[Name, ProxyPolicy], rosproxies: Any
+) -> None:
+    found = look(replace(observed(), policies=policies, rosproxies=rosproxies))
+    (deleted,) = [one for one in done(found) if isinstance(one, DeletePolicy)]
+    assert deleted.uid == "uid-policy"
+
+
+def test_one_that_goes_already_is_left_alone() -> None:
+    assert done(look(observed(policies=there(deleting=True)))) == []
+
+
+def test_switched_off_it_is_deleted() -> None:
+    (deleted,) = done(look_at(complete(policies=there())))
+    assert isinstance(deleted, DeletePolicy)
+    assert done(look_at(complete())) == []
+
+
+def test_a_role_that_lacks_the_right_is_told() -> None:
+    seen = complete(no_policies="the operator's role lacks a rule")
+    found = look(seen)
+    assert done(found) == []
+    assert "the operator's role lacks a rule" in told(found, "NoNetworkPolicy")[0]
+    assert told(look_at(seen), "NoNetworkPolicy") == []
