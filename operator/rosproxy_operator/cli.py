@@ -33,7 +33,7 @@ from rosproxy_operator.docker.settings import (
     read_shared_master_uri,
     read_uplink,
 )
-from rosproxy_operator.kubernetes.options import own_options
+from rosproxy_operator.kubernetes.options import administrators_options, own_options
 from rosproxy_operator.kubernetes.settings import DEFAULT_ADMIN as CLUSTER_ADMIN
 from rosproxy_operator.kubernetes.settings import (
     DEFAULT_LIVENESS,
@@ -276,6 +276,7 @@ def plan(settings: PlanSettings) -> None:
     metavar="A-B",
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
+@administrators_options
 @own_options
 @_resync_option
 @_bind_option(

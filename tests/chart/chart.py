@@ -67,7 +67,14 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "image": {"repository": "mine/operator", "digest": f"sha256:{'0' * 64}"},
             "proxy": {
                 "image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"},
+                "slaveControl": "Master",
                 "networkPolicy": {"metricsFrom": [{"podSelector": {"matchLabels": {"a": "b"}}}]},
+            },
+            "allow": {
+                "masters": ["http://192.0.2.*:11311", "http://[fd00::*]:*"],
+                "maxPorts": 64,
+                "dataPlanes": ["Auto", "Kernel"],
+                "images": ["registry.example/*"],
             },
             "imagePullSecrets": [{"name": "registry"}],
             "serviceAccount": {"annotations": {"a.example/role": "x"}},

@@ -10,7 +10,13 @@ import pytest
 
 from rosproxy import __version__
 from rosproxy_operator.cli import main
-from rosproxy_operator.kubernetes.settings import WebhookSettings, make_kubernetes_settings
+from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
+from rosproxy_operator.kubernetes.settings import (
+    Bounds,
+    KubernetesSettings,
+    WebhookSettings,
+    make_kubernetes_settings,
+)
 from tests.chart.chart import (
     CHART,
     NAMESPACE,
@@ -100,7 +106,27 @@ def test_arguments(combination: str) -> None:
     assert settings.admin.port == ports["metrics"]
     assert settings.liveness.port == ports["liveness"]
     assert settings.resync == (10 if "extraArgs" in values else 30)
+    check_bounds(settings, values, pod)
     check_webhook(settings.webhook, ports, list(rendered(combination)))
+
+
+def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
+    """What RosProxies may ask for, and who may reach their proxies."""
+    allow = values.get("allow", {})
+    assert settings.plan.bounds == Bounds(
+        masters=tuple(allow.get("masters", ())),
+        max_ports=allow.get("maxPorts", MOST_PORTS),
+        data_planes=("auto", "kernel") if allow else ("auto", "splice", "copy"),
+        images=tuple(allow.get("images", ())),
+        slave_control="master" if allow else "any",
+    )
+    assert settings.plan.network_policy
+    operator, *others = settings.plan.admin_from or ()
+    own = {"matchLabels": {"kubernetes.io/metadata.name": NAMESPACE}}
+    assert operator["namespaceSelector"] == own
+    assert list(others) == ([{"podSelector": {"matchLabels": {"a": "b"}}}] if allow else [])
+    assert settings.key_secret is not None
+    assert settings.key_secret.namespace == NAMESPACE
 
 
 def check_webhook(webhook: WebhookSettings | None, ports: Any, found: list[Json]) -> None:

@@ -19,6 +19,7 @@ OPERATORS = "app.kubernetes.io/component=operator"
 _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
     "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
+    "allow": {"dataPlanes": ["Auto", "Kernel", "Splice", "Copy"], "images": ["rosproxy:*"]},
     "tests": {
         "image": "rosproxy-test-ros:latest",
         "imagePullPolicy": "Never",

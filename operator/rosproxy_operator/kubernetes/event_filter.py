@@ -52,7 +52,8 @@ class EventFilter:
         masters = self.last.masters if self.last else {}
         meta = part(body, "metadata")
         matters = is_own(words(meta, "labels")) or objects.name_of(meta) in masters
-        return matters and self._new(type, body, body.get("spec"))
+        found = body.get("spec"), objects.allowed_from(body)
+        return matters and self._new(type, body, found)
 
     def _new(self, type: str | None, body: Json, found: object) -> bool:
         """Whether what a look would read of an object is another than when it was told last."""

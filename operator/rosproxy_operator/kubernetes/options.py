@@ -1,4 +1,4 @@
-"""Options of ``rosproxy-operator kubernetes`` that say who reaches proxies.
+"""Options of ``rosproxy-operator kubernetes`` that bound what RosProxies get and who reaches them.
 
 The rest is in `rosproxy_operator.cli`.
 """
@@ -8,7 +8,50 @@ from collections.abc import Callable
 import click
 
 from rosproxy.cli.options import Command, Parsed
-from rosproxy_operator.kubernetes.settings import read_name, read_peers
+from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
+from rosproxy_operator.kubernetes.settings import read_glob, read_name, read_peers
+
+GLOB = Parsed("glob", read_glob)
+
+
+def administrators_options(command: Command) -> Command:
+    """What a RosProxy may ask for: the administrator's word."""
+    return _with(
+        command,
+        click.option(
+            "--allow-master",
+            type=GLOB,
+            multiple=True,
+            help="Masters that a RosProxy may name, as http://192.0.2.*:11311 (repeatable). "
+            "Default: any.",
+        ),
+        click.option(
+            "--max-ports",
+            type=click.IntRange(1, MOST_PORTS),
+            default=MOST_PORTS,
+            metavar="N",
+            help="Most ports that a RosProxy may ask for.",
+        ),
+        click.option(
+            "--allow-data-plane",
+            type=click.Choice(["auto", "kernel", "splice", "copy"]),
+            multiple=True,
+            default=("auto", "splice", "copy"),
+            help="Data planes that a RosProxy may ask for (repeatable); kernel takes NET_ADMIN.",
+        ),
+        click.option(
+            "--allow-image",
+            type=GLOB,
+            multiple=True,
+            help="Images that a RosProxy may name besides --proxy-image (repeatable).",
+        ),
+        click.option(
+            "--slave-control",
+            type=click.Choice(["any", "master"]),
+            default="any",
+            help="Who may control ROS nodes from outside; a RosProxy may only narrow it.",
+        ),
+    )
 
 
 def own_options(command: Command) -> Command:

@@ -10,8 +10,9 @@ import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.settings import SettingError
+from rosproxy.settings import DataPlane, SettingError
 from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
 
 DEFAULT_ADMIN = HostPort("0.0.0.0", 11313)
@@ -21,6 +22,21 @@ NODE_PORTS = PortRange(30000, 32767)
 """The API server's own default of --service-node-port-range."""
 EPHEMERAL = PortRange(32768, 60999)
 """Linux's own default of net.ipv4.ip_local_port_range."""
+
+
+class Bounds(msgspec.Struct, frozen=True):
+    """What a RosProxy may ask for: the administrator's word, which no RosProxy can widen.
+
+    ``masters`` are globs of the masters' URIs, any if there are none; ``images`` globs of the
+    images that ``spec.image`` may name besides the operator's own. ``slave_control`` is what holds
+    for all: a RosProxy may only narrow it.
+    """
+
+    masters: tuple[str, ...] = ()
+    max_ports: int = MOST_PORTS
+    data_planes: tuple[DataPlane, ...] = ("auto", "splice", "copy")
+    images: tuple[str, ...] = ()
+    slave_control: str = "any"
 
 
 class ClusterSettings(msgspec.Struct, frozen=True):
@@ -37,6 +53,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     image_pull_policy: str = ""
     node_ports: PortRange = NODE_PORTS
     ephemeral: PortRange = EPHEMERAL
+    bounds: Bounds = Bounds()
     network_policy: bool = True
     admin_from: tuple[Json, ...] | None = None
 
@@ -86,6 +103,13 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
             image_pull_policy=options["proxy_image_pull_policy"] or "",
             node_ports=options["node_port_range"],
             ephemeral=options["ephemeral_range"],
+            bounds=Bounds(
+                masters=options["allow_master"],
+                max_ports=options["max_ports"],
+                data_planes=options["allow_data_plane"],
+                images=options["allow_image"],
+                slave_control=options["slave_control"],
+            ),
             network_policy=options["network_policy"],
             admin_from=options["admin_from"],
         ),
@@ -120,6 +144,13 @@ def read_name(text: str) -> Name | None:
     if not slash or not is_label(namespace) or not is_subdomain(name):
         raise ValueError(f"{text!r} is not of the form NAMESPACE/NAME")
     return Name(namespace, name)
+
+
+def read_glob(text: str) -> str:
+    """A pattern with ``*`` and ``?``. Raises ValueError."""
+    if not text or any(c.isspace() for c in text):
+        raise ValueError(f"{text!r} is no pattern such as http://192.0.2.*:11311")
+    return text
 
 
 def read_peers(text: str) -> tuple[Json, ...] | None:

@@ -87,7 +87,8 @@ class SnapshotReader:
             pods=tuple(pods.values()),
             proxies=tuple(await asyncio.gather(*map(self._with_event, proxies))),
             services={service.of: service for service in services},
-            masters=masters,
+            masters={id: found for id, (found, _) in masters.items()},
+            consents={id: allowed for id, (_, allowed) in masters.items()},
             selected=frozenset(pod.uid for pod in found if not pod.ended),
             policies=policies if isinstance(policies, dict) else {},
             no_policies=policies if isinstance(policies, str) else "",
@@ -164,15 +165,19 @@ def _master_ports(rosproxies: Iterable[RosProxy]) -> dict[Name, set[int]]:
     return ports
 
 
-def master_service(api: Api, id: Name, ports: Collection[int]) -> tuple[str, str]:
-    """A Service's cluster IP and what is wrong with it; one of them is empty. Raises ApiError.
+def master_service(
+    api: Api, id: Name, ports: Collection[int]
+) -> tuple[tuple[str, str], frozenset[str]]:
+    """A Service's cluster IP and what is wrong with it, one of them empty; and who may name it.
 
-    ``ports`` are those that RosProxies name; one of them has to be there.
+    ``ports`` are those that RosProxies name; one of them has to be there. Raises ApiError.
     """
     try:
-        return read_master(api.get("services", id), id, ports)
+        found = api.get("services", id)
     except ApiGone:
-        return "", f"there is no Service {id.name} in the namespace {id.namespace}: create it"
+        text = f"there is no Service {id.name} in the namespace {id.namespace}: create it"
+        return ("", text), frozenset()
+    return read_master(found, id, ports), objects.allowed_from(found)
 
 
 def read_master(service: Json, id: Name, ports: Collection[int]) -> tuple[str, str]:

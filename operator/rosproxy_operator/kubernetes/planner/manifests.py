@@ -76,6 +76,12 @@ def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
     return rosproxy.spec.image or settings.image
 
 
+def slave_control_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
+    """Who may control a RosProxy's nodes: the operator's word, which it may only narrow."""
+    both = (settings.bounds.slave_control, rosproxy.spec.slave_control)
+    return "master" if "master" in both else "any"
+
+
 def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     """A proxy's pod.
 
@@ -211,12 +217,13 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
     publish = [site.master.publish] if site.master.publish else []
+    variables = _environment(site, settings)
     forwards = spec.data_plane == "kernel"
     return {
         "name": CONTAINER,
         "image": image_of(site.rosproxy, settings),
         **({"imagePullPolicy": policy} if policy else {}),
-        "env": [{"name": name, "value": value} for name, value in _environment(site).items()],
+        "env": [{"name": name, "value": value} for name, value in variables.items()],
         "ports": [
             {"containerPort": port, "hostPort": port, "protocol": "TCP"}
             for port in [*site.ports.ports(), *publish]
@@ -234,7 +241,7 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
     }
 
 
-def _environment(site: Site) -> Mapping[str, str]:
+def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
     spec = site.rosproxy.spec
     variables = {
         "ROS_MASTER_URI": site.master.uri,
@@ -246,7 +253,7 @@ def _environment(site: Site) -> Mapping[str, str]:
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{ADMIN_PORT}",
         "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
-        "ROSPROXY_SLAVE_CONTROL": spec.slave_control,
+        "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
     }

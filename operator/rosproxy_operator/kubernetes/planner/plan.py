@@ -1,9 +1,10 @@
 """From what is seen in a cluster to what is to be done there: the way of a RosProxy.
 
-`plan` is a function of what is seen, the state before and the time. `view` puts in order what is
-seen: who is wanted where. `state.learn` draws conclusions from it, `allocation.allocate` gives each
-wanted proxy its ports, `reconcile` says what is to be done to Services and proxies, `status` and
-`events` what users are told of it, `departures` what proxies are told.
+`plan` is a function of what is seen, the state before and the time. `bounds` sets aside who asks
+for more than he may. `view` puts in order what is seen: who is wanted where. `state.learn` draws
+conclusions from it, `allocation.allocate` gives each wanted proxy its ports, `reconcile` and
+`network_policy` say what is to be done to Services, proxies and NetworkPolicies, `status` and
+`events` what users are told of it, `departures` and `callers` what proxies are told.
 """
 
 import json
@@ -15,6 +16,7 @@ from msgspec.structs import replace
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
+from rosproxy_operator.kubernetes.planner.bounds import within_bounds
 from rosproxy_operator.kubernetes.planner.callers import callers
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.network_policy import (
@@ -79,6 +81,7 @@ def plan(
     ``state`` is that of the plan before, or an empty one. ``now`` is in seconds of a monotonic
     clock that goes on as long as the state does; ``stamp`` is the time of day in RFC 3339.
     """
+    whole, observed = observed, within_bounds(observed, settings)
     seen = view(observed)
     learned = learn(seen, state, now)
     ranges = allocate(seen, settings, learned)
@@ -99,7 +102,7 @@ def plan(
         problems += found
         actions += [*own, *_patch(context, rosproxy, status), *events.results(rosproxy, own)]
     for bad in observed.unusable.values():
-        problems.append(finding(bad, "Invalid", bad.text, fatal=True))
+        problems.append(finding(bad, bad.reason, bad.text, fatal=True))
         actions += _patch(context, bad, status_of_invalid(bad, stamp))
     every = tuple(dict.fromkeys(problems))
     new = events.warnings(every, decided.reported, now)
@@ -110,7 +113,7 @@ def plan(
         problems=every,
         state=replace(gone.state, attempts=retries.noted, reported=new.reported),
         gone=gone.gone,
-        callers=callers(observed),
+        callers=callers(whole),
         again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
     )
 

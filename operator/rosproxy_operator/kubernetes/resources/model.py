@@ -276,13 +276,17 @@ class ClusterFinding(Problem):
 
 
 class InvalidRosProxy(msgspec.Struct, frozen=True):
-    """A RosProxy that can't be read: ``text`` says why, the rest is as it is there."""
+    """A RosProxy that can't be read, or asks for more than it may.
+
+    ``text`` says why, ``reason`` the same in one CamelCase word; the rest is as it is there.
+    """
 
     id: Name
     uid: str
     generation: int
     text: str
     status: Json = {}
+    reason: str = "Invalid"
 
 
 class ClusterSnapshot(msgspec.Struct, frozen=True):
@@ -290,7 +294,10 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
 
     ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
-    wrong; one of them is empty. ``selected`` are the uids of the pods that a RosProxy selects.
+    wrong; one of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies
+    may name it, besides its own. ``selected`` are the uids of the pods that a RosProxy selects.
+    ``policies`` are the operator's own NetworkPolicies; ``no_policies`` is why they can't be
+    listed. ``key`` is that from which the proxies' tokens are made.
     ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
     ``reports`` are what the proxies say of themselves, by the uid of the pod; ``failures`` are, by
     RosProxy and object, what the API server said of the actions that failed at the last try:
@@ -303,6 +310,7 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     proxies: tuple[ProxyPod, ...] = ()
     services: Mapping[Name, ProxyService] = {}
     masters: Mapping[Name, tuple[str, str]] = {}
+    consents: Mapping[Name, frozenset[str]] = {}
     selected: frozenset[str] = frozenset()
     policies: Mapping[Name, ProxyPolicy] = {}
     no_policies: str = ""

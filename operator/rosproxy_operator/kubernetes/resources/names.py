@@ -24,6 +24,8 @@ ADVERTISE_HOST = "rosproxy.io/advertise-host"
 """Annotation of nodes, which users set, and of proxies' pods."""
 MASTER_URI = "rosproxy.io/master-uri"
 """Annotation of users' pods: the ROS_MASTER_URI that the webhook has set."""
+ALLOW_FROM = "rosproxy.io/allow-from"
+"""Annotation of masters' Services: namespaces whose RosProxies may name them."""
 
 NAME_LABEL = "app.kubernetes.io/name"
 COMPONENT_LABEL = "app.kubernetes.io/component"

@@ -19,6 +19,7 @@ from rosproxy_operator.kubernetes.resources.model import (
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck
 from rosproxy_operator.kubernetes.resources.values import (
+    is_label,
     number,
     part,
     parts,
@@ -119,6 +120,13 @@ def policy(obj: Json) -> ProxyPolicy | None:
     if not names.is_own(labels) or not owner or names.policy_id(of) != name_of(meta):
         return None
     return ProxyPolicy(of, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
+
+
+def allowed_from(service: Json) -> frozenset[str]:
+    """The namespaces whose RosProxies may name a Service as their master; ``*`` for all."""
+    text = word(part(service, "metadata", "annotations"), names.ALLOW_FROM)
+    named = (one.strip() for one in text.split(","))
+    return frozenset(one for one in named if one == "*" or is_label(one))
 
 
 def name_of(metadata: Json) -> Name:

@@ -38,7 +38,7 @@ _NAME = 100
 _MESSAGE = 300
 _PORTS = 400
 _REASON = re.compile(r"[A-Za-z]([A-Za-z0-9_,:]{0,1022}[A-Za-z0-9_])?")
-_NO_PODS, _INVALID = "NoPods", "Invalid"
+_NO_PODS = "NoPods"
 
 
 class Condition(msgspec.Struct, frozen=True):
@@ -97,16 +97,16 @@ def status_of(
 
 
 def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
-    """The status of a RosProxy that can't be read: as it was, but not Ready.
+    """The status of a RosProxy that can't be used: as it was, but not Ready.
 
     What it has goes on as it is, so that the other conditions stay.
     """
     former, text = rosproxy.status, rosproxy.text
     others = [_read(one) for one in parts(former, "conditions")]
     judged = [
-        Condition(READY, "False", _INVALID, text),
+        Condition(READY, "False", rosproxy.reason, text),
         *(one for one in others if one.type not in (READY, DEGRADED)),
-        Condition(DEGRADED, "True", _INVALID, text),
+        Condition(DEGRADED, "True", rosproxy.reason, text),
     ]
     return {
         **former,

@@ -25,10 +25,11 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
     Stuck,
 )
-from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
-SETTINGS = ClusterSettings(image="rosproxy:1", network_policy=False)
-"""Nobody gets a NetworkPolicy: that has tests of its own."""
+BOUNDS = Bounds(data_planes=("auto", "kernel", "splice", "copy"), images=("*",))
+SETTINGS = ClusterSettings(image="rosproxy:1", bounds=BOUNDS, network_policy=False)
+"""Everything is allowed, and nobody gets a NetworkPolicy: those have tests of their own."""
 STAMP = "2026-01-01T00:00:00Z"
 RANGE = PortRange(11400, 11403)
 ROBOT = Name("ros", "robot")

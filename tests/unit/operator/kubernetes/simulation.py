@@ -31,7 +31,7 @@ from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources import objects as parse
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name, ProxyReport
-from rosproxy_operator.kubernetes.settings import ClusterSettings
+from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
 NAMESPACE = "ros"
 BAD_IMAGE = "no-such-image"
@@ -396,4 +396,4 @@ class Controller:
         self.state, self.failures, self.old = ClusterState(), {}, None
 
 
-SETTINGS = replace(ClusterSettings(), image="rosproxy:1")
+SETTINGS = replace(ClusterSettings(), image="rosproxy:1", bounds=Bounds(images=("*",)))

@@ -7,7 +7,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator import cli
 from rosproxy_operator.kubernetes.resources.model import Name
-from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.settings import Bounds, KubernetesSettings
 
 HOOK = ["--webhook-bind=0.0.0.0:9443"]
 
@@ -38,6 +38,13 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--node-port-range=31000-31999",
         "--ephemeral-range=40000-50000",
         "--resync=5",
+        "--allow-master=http://192.0.2.*:11311",
+        "--allow-master=http://robot:11311",
+        "--max-ports=64",
+        "--allow-data-plane=auto",
+        "--allow-data-plane=kernel",
+        "--allow-image=registry.example/*",
+        "--slave-control=master",
         "--no-network-policy",
         '--admin-from=[{"podSelector":{}},{"ipBlock":{"cidr":"192.0.2.0/24"}}]',
         "--key-secret=ns/key",
@@ -54,6 +61,13 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
     assert settings.plan.image_pull_policy == "Never"
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)
+    assert settings.plan.bounds == Bounds(
+        masters=("http://192.0.2.*:11311", "http://robot:11311"),
+        max_ports=64,
+        data_planes=("auto", "kernel"),
+        images=("registry.example/*",),
+        slave_control="master",
+    )
     assert not settings.plan.network_policy
     assert settings.plan.admin_from == ({"podSelector": {}}, {"ipBlock": {"cidr": "192.0.2.0/24"}})
     assert settings.key_secret == Name("ns", "key")
@@ -90,6 +104,9 @@ def test_every_option_has_a_variable(given: list[KubernetesSettings]) -> None:
         (["--admin-bind=x"], "--admin-bind: 'x' is not of the form 0.0.0.0:11313"),
         (["--liveness-bind=x"], "--liveness-bind: 'x' is not of the form 0.0.0.0:8080"),
         (["--webhook-bind=x"], "--webhook-bind: 'x' is not of the form 0.0.0.0:9443"),
+        (["--allow-master= "], "--allow-master: ' ' is no pattern such as http://192.0.2.*:11311"),
+        (["--max-ports=501"], "--max-ports: "),
+        (["--allow-data-plane=Kernel"], "--allow-data-plane: "),
         (["--admin-from=all"], "--admin-from: is no JSON list of NetworkPolicyPeers"),
         (['--admin-from=[{"pods":{}}]'], "--admin-from: is no JSON list of NetworkPolicyPeers"),
         (["--key-secret=key"], "--key-secret: 'key' is not of the form NAMESPACE/NAME"),

@@ -188,6 +188,18 @@ def test_each_proxy_has_a_token_of_its_own() -> None:
     assert names.token_of(b"", *proxies[0]) == ""
 
 
+@pytest.mark.parametrize(
+    ("everywhere", "own", "holds"),
+    [("any", "any", "any"), ("any", "master", "master"), ("master", "any", "master")],
+)
+def test_a_rosproxy_may_only_narrow_who_controls_its_nodes(
+    everywhere: str, own: str, holds: str
+) -> None:
+    settings = replace(SETTINGS, bounds=replace(SETTINGS.bounds, slave_control=everywhere))
+    made = manifests.proxy_pod(site(rosproxy(slave_control=own), node()), settings)
+    assert settings_of(env_of(made)).slave_control == holds
+
+
 def test_a_fingerprint_tells_whether_nodes_are_found_again() -> None:
     own = manifests.fingerprint_of(body())
     same = manifests.fingerprint_of(body(cleanup_after=1.0))

@@ -150,6 +150,15 @@ async def test_the_service_of_a_master(server: ApiServer, api: Api) -> None:
     )
     found = await reader(api).read()
     assert found.masters == {id: ("10.96.1.1", "")}
+    assert found.consents == {id: frozenset()}
+
+
+async def test_who_may_name_a_service(server: ApiServer, api: Api) -> None:
+    server.put("rosproxies", rosproxy_obj({"master": SERVICE}), NAMESPACE)
+    notes = {"rosproxy.io/allow-from": f"{NAMESPACE}, arms ,No Name,"}
+    server.put("services", {"metadata": {"name": "roscore", "annotations": notes}}, "ros")
+    found = await reader(api).read()
+    assert found.consents == {Name("ros", "roscore"): {NAMESPACE, "arms"}}
 
 
 async def test_a_role_without_the_right_to_policies_stops_nothing(

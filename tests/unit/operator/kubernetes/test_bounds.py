@@ -1,0 +1,176 @@
+"""What RosProxies may not ask for, and what becomes of those that do."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy_operator.kubernetes.planner.bounds import may_name, objection, within_bounds
+from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, MasterSpec, Name
+from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
+from tests.unit.operator.kubernetes.objects import (
+    ROBOT,
+    creation,
+    done,
+    look,
+    node,
+    observed,
+    pod,
+    proxy,
+    rosproxy,
+    scene,
+    service,
+    status,
+    told,
+)
+
+OWN = ClusterSettings(image="rosproxy:1", network_policy=False)
+"""As the operator is without options."""
+ROSCORE = Name("other", "roscore")
+THEIRS = MasterSpec(service=ROSCORE)
+
+
+def bounded(**bounds: Any) -> ClusterSettings:
+    return replace(OWN, bounds=Bounds(**bounds))
+
+
+def asks(settings: ClusterSettings = OWN, **changes: Any) -> str:
+    return objection(rosproxy(**changes), observed(), settings)
+
+
+def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, str]:
+    (one,) = [one for one in found["conditions"] if one["type"] == kind]
+    return one["status"], one["reason"], one["message"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "changes", "refused"),
+    [
+        (OWN, {"ports": 500}, ""),
+        (bounded(max_ports=8), {"ports": 8}, ""),
+        (bounded(max_ports=8), {"ports": 9}, "spec.ports: 9 is not what the operator allows: ask "
+         "for 8 at most, or have its administrator allow it (chart value allow.maxPorts)"),
+        (OWN, {"data_plane": "splice"}, ""),
+        (OWN, {"data_plane": "kernel"}, "spec.dataPlane: 'Kernel' is not what the operator allows: "
+         "choose Auto or Splice or Copy, or have its administrator allow it (chart value "
+         "allow.dataPlanes)"),
+        (bounded(data_planes=("auto", "kernel")), {"data_plane": "kernel"}, ""),
+        (OWN, {"image": "rosproxy:1"}, ""),
+        (OWN, {"image": "evil:1"}, "spec.image: 'evil:1' is not what the operator allows: leave it "
+         "out, or have its administrator allow it (chart value allow.images)"),
+        (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/ros/a:1"}, ""),
+        (bounded(images=("registry.example/ros/*",)), {"image": "registry.example/b:1"},
+         "allow.images"),
+    ],
+)  # fmt: skip
+def test_what_the_administrator_allows(
+    settings: ClusterSettings, changes: dict[str, Any], refused: str
+) -> None:
+    said = asks(settings, **changes)
+    assert refused in said
+    assert bool(refused) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("master", "pattern", "allowed"),
+    [
+        ("http://robot:11311", "http://robot:11311", True),
+        ("http://robot:11311/", "http://robot:11311/", True),
+        ("http://robot:11311", "http://*:11311", True),
+        ("http://robot:443", "http://*:11311", False),
+        ("http://api.example.com:80/:11311", "http://*:11311", False),  # a path hides no port
+        ("http://192.0.2.7:11311", "http://192.0.2.*:11311", True),
+        ("http://192.0.2.evil.example:11311", "http://192.0.2.*:11311", False),
+        ("http://192.0.2.evil.example:11311", "http://192.0.2.*", False),
+        ("http://192.0.3.7:11311", "http://192.0.2.*:11311", False),
+        ("http://[fd00::7]:11311", "http://[fd00::*]:11311", True),
+        ("http://f:11311", "http://[fd00::*]:11311", False),
+        ("nonsense", "*", False),
+    ],
+)
+def test_a_masters_pattern(master: str, pattern: str, allowed: bool) -> None:
+    assert may_name(master, (pattern,)) is allowed
+
+
+@pytest.mark.parametrize(
+    ("changes", "allowed"),
+    [
+        ({"master": MasterSpec("http://robot:11311")}, True),
+        ({"master": MasterSpec("http://other:11311")}, False),
+        ({"master": MasterSpec("http://other:11311", "192.0.2.7")}, True),
+        # Who says himself where a name leads has not named that name's owner.
+        ({"master": MasterSpec("http://robot:11311", "10.96.0.1")}, False),
+        ({"host_aliases": ({"ip": "10.96.0.1", "hostnames": ["robot"]},)}, False),
+        ({"host_aliases": ({"ip": "10.96.0.1", "hostnames": ["else"]},)}, True),
+        ({"master": MasterSpec(service=Name("ros", "roscore"))}, True),
+        ({"master": MasterSpec(service=Name("ros", "roscore"), service_port=443)}, False),
+    ],
+)
+def test_where_the_master_really_is(changes: dict[str, Any], allowed: bool) -> None:
+    masters = ("http://robot:11311", "http://192.0.2.*:11311", "http://roscore.ros.svc:11311")
+    said = asks(bounded(masters=masters), **changes)
+    assert (said == "") is allowed
+    assert ("allow.masters" in said) is not allowed
+
+
+@pytest.mark.parametrize("publish", [0, 11321])
+@pytest.mark.parametrize(
+    ("consents", "allowed"), [((), False), (("arms",), False), (("ros",), True), (("*",), True)]
+)
+def test_another_namespaces_master_needs_its_consent(
+    consents: tuple[str, ...], allowed: bool, publish: int
+) -> None:
+    seen = observed(consents={ROSCORE: frozenset(consents)})
+    said = objection(rosproxy(master=replace(THEIRS, publish=publish)), seen, OWN)
+    assert (said == "") is allowed
+    command = "kubectl -n other annotate --overwrite service roscore rosproxy.io/allow-from="
+    if not allowed:
+        assert said.endswith(command + ",".join([*consents, "ros"]))
+
+
+def test_whether_another_namespaces_service_exists_is_not_told() -> None:
+    seen = scene(of=rosproxy(master=THEIRS))
+    missing = replace(seen, masters={ROSCORE: ("", "there is no Service")})
+    there = replace(seen, masters={ROSCORE: ("10.96.0.9", "")})
+    assert status(look(missing)) == status(look(there))
+
+
+def test_who_asks_for_too_much_gets_nothing_and_is_told() -> None:
+    of = rosproxy(data_plane="kernel")
+    found = look(observed(of, pod(wired="")), settings=OWN)
+    assert done(found) == []
+    text = "spec.dataPlane: 'Kernel' is not what the operator allows"
+    for kind, holds in (("Ready", "False"), ("Degraded", "True")):
+        status_, reason, message = condition(status(found), kind)
+        assert (status_, reason) == (holds, "NotAllowed")
+        assert message.startswith(text)
+    assert [one.about.kind for one in found.problems if one.about] == ["RosProxy"]
+    assert told(found, "NotAllowed")
+
+
+def test_what_it_had_stays_as_it_is() -> None:
+    """An upgrade that forbids what was allowed takes no port from anybody."""
+    of = rosproxy(image="mine:1", status={"perNode": [{"name": "one", "ports": "11400-11403"}]})
+    found = look(observed(of, service(of), pod(), proxy(of)), settings=OWN)
+    assert done(found) == []
+    assert status(found)["perNode"] == of.status["perNode"]
+    assert found.callers == {"uid-proxy-robot-one": (pod().ip,)}
+
+
+def test_ports_of_one_that_asks_for_too_much_are_still_his() -> None:
+    bad, good = rosproxy("arm", image="mine:1"), rosproxy(ports=2)
+    found = look(observed(bad, good, service(good), proxy(bad), pod()), settings=OWN)
+    action = creation(found)
+    assert action.of == ROBOT
+    assert action.body["metadata"]["annotations"]["rosproxy.io/port-range"] == "11404-11405"
+
+
+def test_one_that_is_deleted_asks_for_nothing() -> None:
+    of = rosproxy(image="mine:1", deleting=True)
+    assert within_bounds(observed(of), OWN).unusable == {}
+
+
+def test_nothing_is_set_aside_for_nothing() -> None:
+    seen: ClusterSnapshot = observed(rosproxy(), node())
+    assert within_bounds(seen, OWN) is seen
