@@ -29,8 +29,9 @@ from rosproxy.ros1.api.master import MasterApi, serve_published
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.servers.admission import NodeAdmission
+from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
-from rosproxy.ros1.servers.xmlrpc_server import XmlRpcServer, XmlRpcService
+from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer, XmlRpcService
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
@@ -62,6 +63,7 @@ class App:
         self.plane = plane = KernelPlane(
             settings, context.registry, context.tasks, context.problems, context.now
         )
+        self._callers, self._probing = Callers(context), asyncio.Lock()
         self.alias = Alias(context)
         self.registrar = registrar = Registrar(context, self.alias)
         self._resubscriber = Resubscriber(context, registrar, self.tcpros, plane)
@@ -102,7 +104,8 @@ class App:
         self._reserve_range()
         await self.plane.start()
         master = MasterApi(context, self._admission, self.alias, self._recovery, self._adopter)
-        self._listen("--master-port", settings.master_port, master, "ROS master API, proxied")
+        guard, what = self._callers.refusal, "ROS master API, proxied"
+        self._listen("--master-port", settings.master_port, master, what, guard)
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
             published = partial(serve_published, context, str(where))
@@ -152,11 +155,19 @@ class App:
         return self.master_monitor.error or f"master {self.settings.master_uri} was not asked yet"
 
     async def _probe(self, body: Any) -> dict[str, Any]:
-        return to_json(await probe_range(self.context, self.leases))
+        async with self._probing:
+            return to_json(await probe_range(self.context, self.leases))
 
     async def _handle_news(self, body: Any) -> dict[str, Any]:
-        """``POST /containers``: how many nodes were unregistered, moved and adopted."""
+        """``POST /containers``: how many nodes were unregistered, moved and adopted.
+
+        Who is selected is taken in at once: nodes wait for that, and it needs no master.
+        """
         news = read_body(body, ContainerNews)
+        if news.selected is not None:
+            self._callers.select(news.selected)
+        if not news.tells_events:
+            return {"moved": 0, "unregistered": 0, "adopted": 0}
         arrived = [(one.address, one.names) for one in news.arrived]
         return {**await self._containers.handle(news.gone, news.moved, arrived)}
 
@@ -188,10 +199,13 @@ class App:
             log.warning("%s", text)
             self.context.problems.add(RANGE_OPTION, text)
 
-    def _listen(self, option: str, port: int, service: XmlRpcService, what: str) -> None:
+    def _listen(
+        self, option: str, port: int, service: XmlRpcService, what: str, guard: Guard | None = None
+    ) -> None:
         with _binding(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
-        server = XmlRpcServer(service, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n")
+        greeting = f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n"
+        server = XmlRpcServer(service, greeting, guard)
         self._servers.append(server)
         self._acceptors.append(
             Acceptor(self.context.tasks, sock, lambda conn, peer: server.dispatch(conn))

@@ -54,11 +54,18 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``gone``: addresses that no container has any more. ``moved``: old address to new address.
     ``arrived``: containers that may have nodes which registered before the proxy was there.
+    ``selected``: the addresses that may use the proxy as their master; None: unchanged.
     """
 
     gone: tuple[str, ...] = ()
     moved: dict[str, str] = {}
     arrived: tuple[Arrival, ...] = ()
+    selected: tuple[str, ...] | None = None
+
+    @property
+    def tells_events(self) -> bool:
+        """Whether it tells of anything that has happened to a container."""
+        return bool(self.gone or self.moved or self.arrived)
 
     def __post_init__(self) -> None:
         gone = tuple(_address(f"gone[{i}]", each) for i, each in enumerate(self.gone))
@@ -68,6 +75,9 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         }
         msgspec.structs.force_setattr(self, "gone", gone)
         msgspec.structs.force_setattr(self, "moved", moved)
+        if self.selected is not None:
+            told = (_address(f"selected[{i}]", each) for i, each in enumerate(self.selected))
+            msgspec.structs.force_setattr(self, "selected", tuple(told))
 
 
 class PortProbe(msgspec.Struct, frozen=True):

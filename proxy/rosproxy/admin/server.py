@@ -3,17 +3,15 @@
 GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default. POST
 changes things: it is for callers on loopback that are no web page, and for those that know the
 token, of which only the hash is held here. What a POST does is given as an action by its path;
-calls of one path wait for each other.
+actions wait for each other as far as they have to.
 """
 
-import asyncio
 import hashlib
 import hmac
 import json
 import logging
-from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from aiohttp import web
@@ -53,7 +51,6 @@ class AdminServer:
     _actions: Mapping[str, Action]
     _token_hash: str | None
     _runner: web.AppRunner | None = None
-    _locks: Mapping[str, asyncio.Lock] = field(default_factory=lambda: defaultdict(asyncio.Lock))
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
@@ -92,8 +89,7 @@ class AdminServer:
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
             body = _read_json(await request.read())
-            async with self._locks[request.path]:
-                return web.json_response(await self._actions[request.path](body))
+            return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
             return web.Response(status=400, text=f"rosproxy: {error}\n")
         except (Unreachable, MasterError) as error:

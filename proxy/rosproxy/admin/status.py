@@ -81,6 +81,10 @@ class ProxyState(Collector):
             ("kernel_connections", "TCPROS connections that the kernel forwards.", forwarded),
         ):
             yield GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
+        if self._context.selected is not None:
+            text = "Addresses that may use the proxy as their master."
+            count = len(self._context.selected)
+            yield GaugeMetricFamily("rosproxy_selected_addresses", text, value=count)
         states = [endpoint.state for endpoint in endpoints]
         by_state = GaugeMetricFamily(
             "rosproxy_endpoints", "Inside nodes by state.", labels=["state"]
@@ -108,7 +112,7 @@ class ProxyState(Collector):
         return relayed, forwarded
 
     def _settings(self) -> document.StatusSettings:
-        settings = self._context.settings
+        settings, selected = self._context.settings, self._context.selected
         return document.StatusSettings(
             master_port=settings.master_port,
             publish_master=settings.publish_master,
@@ -117,6 +121,7 @@ class ProxyState(Collector):
             inside_networks=tuple(map(str, self._context.addressing.networks)),
             cleanup_after=settings.cleanup_after,
             linger=settings.linger,
+            selected=None if selected is None else len(selected),
         )
 
     def _master(self) -> document.MasterStatus:

@@ -29,7 +29,10 @@ class NotAStatus(ValueError):
 
 
 class StatusSettings(msgspec.Struct, frozen=True):
-    """The settings that others have to know. ``inside_networks``: those in force, as CIDRs."""
+    """The settings that others have to know. ``inside_networks``: those in force, as CIDRs.
+
+    ``selected``: how many addresses an operator has selected; None: it has told of none yet.
+    """
 
     master_port: Count = 11311
     publish_master: Count | None = None
@@ -38,6 +41,7 @@ class StatusSettings(msgspec.Struct, frozen=True):
     inside_networks: Names = ()
     cleanup_after: Seconds = 0.0
     linger: Seconds = 0.0
+    selected: Count | None = None
 
 
 class MasterStatus(msgspec.Struct, frozen=True):

@@ -52,7 +52,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
         yield f"topics   {_plane(plane)}"
     networks = listed(map(clean, settings.inside_networks)) or "none"
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
-    yield f"inside   {inside}, networks {networks}"
+    selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
+    yield f"inside   {inside}, networks {networks}{selected}"
     if ports := status.alias_ports:
         yield f"alias    {_alias_ports(ports)}"
     if settings.publish_master:

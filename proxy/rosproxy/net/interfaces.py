@@ -4,7 +4,7 @@ import socket
 from ipaddress import ip_address, ip_network
 from pathlib import Path
 
-from rosproxy.net.addresses import Network, plain_address
+from rosproxy.net.addresses import Network, is_loopback, plain_address
 
 
 def address_towards(address: str) -> str:
@@ -19,6 +19,14 @@ def address_towards(address: str) -> str:
         except OSError:
             return "::1" if family == socket.AF_INET6 else "127.0.0.1"
         return plain_address(probe.getsockname()[0])
+
+
+def is_own(address: str) -> bool:
+    """Whether an IP address is this machine's own, so that a peer that has it is a program here.
+
+    The route to an own address begins at that address.
+    """
+    return is_loopback(address) or address_towards(address) == address
 
 
 def interface_networks() -> tuple[Network, ...]:

@@ -14,6 +14,7 @@ from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.registry.selection import Standing, standing
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Metrics
@@ -27,6 +28,7 @@ class Context:
     """The state and the tools of one proxy that is about to start; needs a running event loop.
 
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
+    ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -39,12 +41,17 @@ class Context:
         )
         self.nodes = NodeClient(self.upstream, settings.probe_timeout)
         self.retired = False
+        self.selected: frozenset[str] | None = None
         self._towards: dict[str, str] = {}
         self.read_networks()
 
     def now(self) -> float:
         """Seconds of the monotonic clock."""
         return time.monotonic()
+
+    def standing(self, address: str) -> Standing:
+        """Whether an address may use the proxy as its master, as far as is known now."""
+        return standing(address, self.addressing.networks, self.selected)
 
     def refresh_networks(self, source: str = "") -> None:
         """Take in the networks that the proxy's interfaces are in now.

@@ -66,6 +66,8 @@ class Metrics:
         self.exhausted = counter("range_exhausted", refused)
         bounds = "Requests and connections refused because they were over a bound."
         self.refused = counter("refused", bounds, "reason")
+        strangers = "Calls refused for the address that they came from, by what that is."
+        self.strangers = counter("strangers", strangers, "standing")
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
             "Time for a call of the proxy's own to the master.",

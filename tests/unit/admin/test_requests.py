@@ -30,6 +30,8 @@ GOOD: list[tuple[Any, ContainerNews]] = [
         ),
     ),
     ({"arrived": [{"address": "172.18.0.7"}]}, ContainerNews(arrived=(Arrival("172.18.0.7"),))),
+    ({"selected": []}, ContainerNews(selected=())),
+    ({"selected": ["::ffff:172.18.0.5"]}, ContainerNews(selected=("172.18.0.5",))),
 ]
 
 
@@ -45,6 +47,8 @@ BAD: list[tuple[Any, str]] = [
     (1, "the body: Expected `object`, got `int`"),
     (True, "the body: Expected `object`, got `bool`"),
     ({"goen": []}, "the body: Object contains unknown field `goen`; known: gone, moved, arrived"),
+    ({"selected": "172.18.0.5"}, "selected: Expected `array"),
+    ({"selected": ["10.0.0.0/24"]}, "selected[0]: must be an IP address such as 172.18.0.5"),
     ({"gone": "172.18.0.5"}, "gone: Expected `array`, got `str`"),
     ({"gone": {}}, "gone: Expected `array`, got `object`"),
     ({"gone": ["a"]}, "gone[0]: must be an IP address such as 172.18.0.5, not 'a'"),

@@ -39,7 +39,7 @@ class IncomingCall:
         protocol = request.protocol
         self.body = body
         self.path = request.path_qs
-        self.source = _address(protocol.peername).host
+        self.source = _source(request)
         self.local = _address(protocol.sockname)
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
@@ -62,6 +62,10 @@ XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
 """Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
 
 
+Guard = Callable[[str], Awaitable[str | None]]
+"""Why a source's calls are refused, in one line, before they are read; None if they are not."""
+
+
 async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[bytes]) -> bytes:
     """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
     try:
@@ -74,11 +78,11 @@ async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[byte
 
 
 class XmlRpcServer(web.Server):
-    """Turns accepted sockets into XML-RPC calls to a service."""
+    """Turns accepted sockets into XML-RPC calls to a service, for those whom the guard lets in."""
 
-    def __init__(self, service: XmlRpcService, greeting: str) -> None:
+    def __init__(self, service: XmlRpcService, greeting: str, guard: Guard | None = None) -> None:
         super().__init__(self._handle, access_log=None, keepalive_timeout=75)
-        self._service, self._greeting = service, greeting
+        self._service, self._greeting, self._guard = service, greeting, guard
         self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
         self._busy: set[web.RequestHandler] = set()
         self._mute: set[web.RequestHandler] = set()
@@ -152,6 +156,9 @@ class XmlRpcServer(web.Server):
             return web.Response(text=self._greeting)
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
+        refused = await self._guard(_source(request)) if self._guard else None
+        if refused:
+            return _forbid(refused)
         body = await _body(request)
         if not isinstance(body, bytes):
             return body
@@ -207,6 +214,17 @@ def _head(version: HttpVersion, lasts: bool, size: int) -> bytes:
 @lru_cache(maxsize=1024)
 def _address(found: Any) -> HostPort:
     return HostPort(plain_address(found[0]), found[1]) if found else HostPort("", 0)
+
+
+def _source(request: web.BaseRequest) -> str:
+    return _address(request.protocol.peername).host
+
+
+def _forbid(text: str) -> web.StreamResponse:
+    """The answer to somebody who is not let in; rospy shows the reason phrase, people the text."""
+    response = web.Response(status=403, reason=text, text=f"{text}\n")
+    response.force_close()
+    return response
 
 
 async def _body(request: web.BaseRequest) -> bytes | web.StreamResponse:

@@ -1,0 +1,48 @@
+"""Who may use the proxy as its master: nodes inside, and of those the ones that were selected.
+
+ROS 1 knows no identity but the address that a call comes from. Without an operator every address
+of the inside networks may; an operator names the addresses that it has selected (``POST
+/containers``), and then only these may, wherever they lie. Until it has named them for the first
+time after a start, the networks count: a proxy that is started again while its operator is away
+serves whomever it served.
+"""
+
+from collections.abc import Collection, Sequence
+from enum import Enum
+
+from rosproxy.net.addresses import Network, is_inside
+
+
+class Standing(Enum):
+    """What an address is to the proxy; the value is the word for it in metrics."""
+
+    ADMITTED = "admitted"
+    OUTSIDE = "outside"
+    UNSELECTED = "unselected"
+
+
+def standing(
+    address: str, networks: Sequence[Network], selected: Collection[str] | None
+) -> Standing:
+    """What an address is, given the inside networks and the selected addresses; None: not told."""
+    if selected is not None and address in selected:
+        return Standing.ADMITTED
+    if not is_inside(address, networks):
+        return Standing.OUTSIDE
+    return Standing.ADMITTED if selected is None else Standing.UNSELECTED
+
+
+def refusal(address: str, found: Standing, networks: Sequence[Network]) -> str:
+    """What somebody is told, in one line, who may not use the proxy as its master."""
+    if found is Standing.UNSELECTED:
+        return (
+            f"rosproxy: {address} is not selected to use this proxy as its master: label its "
+            "container rosproxy.enable=true (Docker) or its pod rosproxy.io/inject=true "
+            "(Kubernetes), with this proxy's master"
+        )
+    inside = ", ".join(map(str, networks)) or "none"
+    return (
+        f"rosproxy: {address} is in no inside network ({inside}), and only nodes inside may use "
+        "this proxy as their master: give its network by --inside-network "
+        "(ROSPROXY_INSIDE_NETWORKS), or use the real master"
+    )

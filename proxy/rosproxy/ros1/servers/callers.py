@@ -1,0 +1,102 @@
+"""Who is let in at the master port, which is for inside nodes alone.
+
+`rosproxy.ros1.registry.selection` decides by the address that a connection comes from, before
+anything that it sends is read. Programs on the proxy's own machine are always let in.
+
+An operator tells of a container some tenths of a second after its start, and the container's first
+call may be faster. So a call from an address that is not selected waits for news, up to
+NEWS_TIMEOUT. What is refused then gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes
+a fault for the master's last word and never asks again (master.cpp, execute), but goes on trying
+after anything that is no XML-RPC reply, as rospy does. So a node whose container is selected later
+still comes to register.
+"""
+
+import asyncio
+import logging
+from collections import Counter
+from collections.abc import Iterable
+
+from rosproxy.net.addresses import is_loopback
+from rosproxy.net.interfaces import is_own
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry import selection
+from rosproxy.ros1.registry.selection import Standing
+
+log = logging.getLogger(__name__)
+
+NEWS_TIMEOUT = 3.0
+"""Seconds that a call waits at most for the news that its source is selected."""
+MOST_WAITING = 512
+"""Calls that wait for news at once; beyond that they are refused without. A node makes one call at
+a time, so that these are as many nodes that start in the same seconds."""
+MOST_WAITING_EACH = 64
+"""The same for one source: nobody takes all places."""
+LOG_INTERVAL = 10.0
+"""Seconds between two log lines about refused callers."""
+SUBJECT = "master port"
+
+
+class Callers:
+    """Lets callers in, or says why not."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._news = asyncio.Event()
+        self._waiting = Counter[str]()
+        self._logged: float | None = None
+
+    def select(self, addresses: Iterable[str]) -> None:
+        """Take in which addresses an operator has selected, instead of those before."""
+        self._context.selected = frozenset(addresses)
+        self._context.problems.solved(SUBJECT)
+        news, self._news = self._news, asyncio.Event()
+        news.set()
+
+    async def refusal(self, source: str) -> str | None:
+        """Why a caller is refused, in one line; None if it is let in."""
+        if self._standing(source) is Standing.ADMITTED:
+            return None
+        await self._wait_for_news(source)
+        found = self._standing(source)
+        if found is Standing.ADMITTED:
+            return None
+        text = selection.refusal(source, found, self._context.addressing.networks)
+        self._report(text, found)
+        return text
+
+    def _standing(self, source: str) -> Standing:
+        self._context.refresh_networks()
+        if self._context.standing(source) is Standing.ADMITTED or is_own(source):
+            return Standing.ADMITTED
+        self._context.refresh_networks(source)
+        return self._context.standing(source)
+
+    async def _wait_for_news(self, source: str) -> None:
+        """Wait until an operator has selected a source, up to NEWS_TIMEOUT.
+
+        None can tell where the admin endpoint is on loopback, and none has told so far.
+        """
+        alone = self._context.selected is None and is_loopback(self._context.settings.admin.host)
+        waiting = self._waiting
+        if alone or waiting.total() >= MOST_WAITING or waiting[source] >= MOST_WAITING_EACH:
+            return
+        waiting[source] += 1
+        try:
+            async with asyncio.timeout(NEWS_TIMEOUT):
+                while self._standing(source) is not Standing.ADMITTED:
+                    await self._news.wait()
+        except TimeoutError:
+            log.debug("%s was not selected in time", source)
+        finally:
+            waiting[source] -= 1
+            if not waiting[source]:
+                del waiting[source]
+
+    def _report(self, text: str, found: Standing) -> None:
+        context, now = self._context, self._context.now()
+        context.metrics.strangers.labels(found.value).inc()
+        context.problems.solved(SUBJECT)  # the last one is enough: there may be any number
+        context.problems.add(SUBJECT, text)
+        if self._logged is None or now - self._logged >= LOG_INTERVAL:
+            self._logged = now
+            log.warning("%s: refused: %s", SUBJECT, text)

@@ -1,0 +1,38 @@
+"""Who may use the proxy as its master."""
+
+from ipaddress import ip_network
+
+import pytest
+
+from rosproxy.ros1.registry.selection import Standing, refusal, standing
+
+NETWORKS = (ip_network("10.0.0.0/24"), ip_network("fd00::/64"))
+ADMITTED, OUTSIDE, UNSELECTED = Standing.ADMITTED, Standing.OUTSIDE, Standing.UNSELECTED
+
+
+@pytest.mark.parametrize(
+    ("address", "selected", "found"),
+    [
+        ("10.0.0.5", None, ADMITTED),
+        ("fd00::5", None, ADMITTED),
+        ("10.0.1.5", None, OUTSIDE),
+        ("", None, OUTSIDE),
+        ("10.0.0.5", {"10.0.0.5"}, ADMITTED),
+        ("10.0.0.6", {"10.0.0.5"}, UNSELECTED),
+        ("10.0.0.5", set(), UNSELECTED),
+        ("10.0.1.5", set(), OUTSIDE),
+        ("10.0.1.5", {"10.0.1.5"}, ADMITTED),
+    ],
+)
+def test_standing(address: str, selected: set[str] | None, found: Standing) -> None:
+    assert standing(address, NETWORKS, selected) is found
+
+
+def test_a_refusal_is_one_line_that_says_what_to_do() -> None:
+    outside = refusal("10.0.1.5", OUTSIDE, NETWORKS)
+    for part in ("10.0.1.5", "10.0.0.0/24, fd00::/64", "--inside-network"):
+        assert part in outside
+    unselected = refusal("10.0.0.5", UNSELECTED, NETWORKS)
+    for part in ("10.0.0.5", "rosproxy.enable=true", "rosproxy.io/inject"):
+        assert part in unselected
+    assert "\n" not in outside + unselected
