@@ -12,6 +12,7 @@ from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from tests.integration.admin.test_admin import metrics
+from tests.integration.admin_calls import news
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     MASTER,
@@ -513,3 +514,66 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
     assert await refuses(service(robot), OTHER_NODE)
     await proxy.app.alias.listen_for([robot.uri])
     assert await refuses(slave(robot), NODE)
+
+
+async def test_an_update_that_the_master_does_not_bear_out_opens_no_port(
+    proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
+) -> None:
+    """Whoever called publisherUpdate at its own lease had any port of the master's host opened."""
+    await node.subscribe(proxy.master, "/t")
+    secret = await asyncio.start_server(lambda *_: None, MASTER)
+    port = secret.sockets[0].getsockname()[1]
+    forged = [f"http://robot:{port}/", f"rosrpc://robot:{port}"]
+    for topic, uris in (("/t", forged), ("/chatter", forged), ("/t", [robot.uri])):
+        for source in (NODE, OUTSIDE, MASTER):
+            params = "/master", topic, uris
+            assert (await rpc(proxy.uri(node), "publisherUpdate", *params, source=source))[0] == 1
+    assert alias_ports(proxy) == {}
+    assert await refuses((PROXY, port), NODE)
+    # What the master has of that topic opens its port, whoever tells.
+    await rpc(proxy.uri(node), "publisherUpdate", "/master", "/chatter", [robot.uri, *forged])
+    assert set(alias_ports(proxy)) == {slave(robot)[1]}
+    secret.close()
+
+
+async def test_updates_that_come_together_share_a_question_to_the_master(
+    proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
+) -> None:
+    await node.subscribe(proxy.master, "/t")
+    before = len(master.named("getSystemState"))
+    master.delay = 0.05
+    updates = (
+        rpc(proxy.uri(node), "publisherUpdate", "/m", f"/t{i}", [f"http://robot:{i + 1}/"])
+        for i in range(30)
+    )
+    await asyncio.gather(*updates)
+    assert len(master.named("getSystemState")) - before < 10
+    assert alias_ports(proxy) == {}
+
+
+async def test_an_update_is_passed_on_while_the_master_is_away(
+    proxy: Proxy, robot: FakeNode, node: FakeNode, master: FakeMaster
+) -> None:
+    await node.subscribe(proxy.master, "/t")
+    lease = proxy.uri(node)
+    await master.stop()
+    assert (await rpc(lease, "publisherUpdate", "/master", "/t", [robot.uri]))[0] == 1
+    assert node.updates("/t") == [[robot.uri]]
+    assert alias_ports(proxy) == {}
+
+
+async def test_only_tcpros_is_relayed(proxy: Proxy, robot: FakeNode) -> None:
+    """A port that speaks something else can't be used, though the master names it."""
+    await look_up_service(proxy)
+    for data in (b"\x00\x01\x02\x03garbage", b"\xff\xff\xff\xff", b"\x04\x00\x00\x00abcd"):
+        before = robot.tcpros.connections
+        assert await knock(service(robot), data, NODE) in ("closed", "reset", "silent")
+        assert robot.tcpros.connections == before
+
+
+async def test_only_those_who_are_selected_are_let_in(proxy: Proxy, robot: FakeNode) -> None:
+    await look_up(proxy, robot)
+    assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[0] == 1
+    await news(proxy, selected=[OTHER_NODE])
+    assert (await rpc(slave(robot), "getPid", "/tool", source=OTHER_NODE))[0] == 1
+    assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) in ("closed", "reset")

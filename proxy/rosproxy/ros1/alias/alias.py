@@ -2,8 +2,10 @@
 
 Where the master's name leads to the proxy (see `policy`), a port is opened right before an inside
 node is given a URI that needs it (`Alias.listen_for`), and closed when the node behind it refuses,
-since a dead node must look dead. Slave API calls are forwarded to the node, TCPROS connections of
-services relayed as they are; topics flow directly, to the address in the node's own reply.
+since a dead node must look dead. Only URIs that the master names open one: they come with its
+replies, or it is asked (`Alias.listen_for_announced`). Slave API calls are forwarded to the node,
+TCPROS connections of services relayed as they are; topics flow directly, to the address in the
+node's own reply. Nothing is relayed that does not begin with a TCPROS header.
 
 All of this is done only while the master's address is given (``--master-address``), which is what
 says that its name may lead to the proxy.
@@ -14,21 +16,26 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort, is_inside
+from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import address_towards
 from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias import policy
-from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.servers.tcpros import hand_on, read_header
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 
 log = logging.getLogger(__name__)
@@ -55,9 +62,17 @@ class Alias:
         self._relays = OpenRelays()
         self._server = XmlRpcServer(self._forward, "rosproxy: a ROS node on the master's host\n")
         self._closed = False
+        self._asking = asyncio.Lock()
+        self._asked: set[str] = set()
+        """Topics whose publishers somebody waits to be told of."""
+        self._publishers: dict[str, set[str]] = {}
+        """The master's last answer to that: slave URIs by topic."""
 
     async def listen_for(self, uris: Iterable[str]) -> None:
-        """Have the ports listen that these URIs lead to, before an inside node is given them."""
+        """Have the ports listen that these URIs lead to, before an inside node is given them.
+
+        The URIs are the master's own word.
+        """
         if self._address is None or self._closed:
             return
         wanted = policy.ports_needed(uris, self._name, self._context.addressing)
@@ -67,6 +82,21 @@ class Alias:
         for port, uri in wanted.items():
             if port not in self._refused:
                 self._listen(port, uri)
+
+    async def listen_for_announced(self, topic: str, uris: Sequence[str]) -> None:
+        """The same for the publishers that a ``publisherUpdate`` names, as far as they are some.
+
+        Anybody may call that at a lease, and name any port. Its source proves nothing: every
+        program on the master's host has that address, and NAT gives it to others. So where a
+        port would have to be opened the master is asked whether it has that publisher.
+        """
+        if self._address is None or self._closed:
+            return
+        wanted = policy.ports_needed(uris, self._name, self._context.addressing)
+        known = {uri for port, uri in wanted.items() if port in self._acceptors}
+        if len(known) < len(wanted):
+            known |= await self._publishers_of(topic)
+        await self.listen_for(uri for uri in wanted.values() if uri in known)
 
     def import_call(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
@@ -109,6 +139,34 @@ class Alias:
     def _address(self) -> str | None:
         """The address of the master's host; None if its name can't lead to the proxy."""
         return self._context.upstream.master_address if self._name else None
+
+    async def _publishers_of(self, topic: str) -> set[str]:
+        """The slave URIs of a topic's publishers as the master has them now; none if it is away.
+
+        There is one question at a time, for all topics that have come up meanwhile.
+        """
+        self._asked.add(topic)
+        async with self._asking:
+            if topic in self._asked:  # nobody has asked since
+                topics, self._asked = self._asked, set()
+                self._publishers = await self._ask_publishers(topics)
+            return self._publishers.get(topic, set())
+
+    async def _ask_publishers(self, topics: set[str]) -> dict[str, set[str]]:
+        upstream = self._context.upstream
+        try:
+            state = await upstream.read_registrations()
+            names = [
+                name
+                for name, held in state.items()
+                if any(one.kind is Kind.PUBLISHER and one.name in topics for one in held)
+            ]
+            graph = Graph(state, await upstream.look_up("lookupNode", names))
+        except (Unreachable, MasterError) as error:
+            log.debug("the master can't be asked who publishes: %s", error)
+            return {}
+        publishers = graph.by_topic(Kind.PUBLISHER)
+        return {topic: set(publishers.get(topic, ())) for topic in topics}
 
     def _listen(self, port: int, uri: str) -> None:
         """Let a port listen that a URI needs, or report why it can't."""
@@ -183,15 +241,22 @@ class Alias:
     async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
         self._context.refresh_networks()
-        if not is_inside(peer, self._context.addressing.networks):
-            log.debug("%s is not inside: refused at port %d", peer, port)
+        if self._context.standing(peer) is not Standing.ADMITTED:
+            log.debug("%s may not use the proxy: refused at port %d", peer, port)
             conn.close()
             return
         self._note_used(port)
         await self._server.dispatch(conn, partial(self._relay, port, peer))
 
     async def _relay(self, port: int, peer: str, conn: socket.socket) -> None:
-        """Relay TCPROS as it is."""
+        """Relay TCPROS as it is, once it is known to be that."""
+        try:
+            header = await read_header(conn)
+            decode_header(header[4:])
+        except HeaderError as error:
+            log.debug("%s at port %d: %s", peer, port, error)
+            conn.close()
+            return
         try:
             node = await self._dial(port, CONNECT_TIMEOUT)
         except OSError as error:
@@ -200,6 +265,10 @@ class Alias:
             conn.close()
             if isinstance(error, ConnectionRefusedError):
                 self._note_refused(port)
+            return
+        if not await hand_on(header, node):
+            sockets.reset_on_close(conn)
+            conn.close()
             return
         splice = self._context.settings.data_plane != "copy"
         relay = Relay(port, "service", f"at port {port}", "", peer, node, conn, splice=splice)

@@ -115,7 +115,8 @@ class SlaveApi:
             return await self._ask(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
-            await self._alias.listen_for(slave_api.announced_publishers(parsed))
+            announced = slave_api.announced_publishers(parsed)
+            await self._alias.listen_for_announced(parsed.string(1) or "", announced)
         self._context.refresh_networks()
         node, addressing = self._context.node_asker(endpoint), self._context.addressing
         body = self._alias.import_call(body, parsed)

@@ -60,7 +60,7 @@ class TcprosServer:
     async def serve(self, endpoint: Endpoint, peer: str, conn: socket.socket) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
-            header = await _read_header(conn)
+            header = await read_header(conn)
             fields = decode_header(header[4:])
             if too_long := too_long_to_connect(fields):
                 raise HeaderError(too_long)
@@ -73,7 +73,7 @@ class TcprosServer:
         kind = "service" if "service" in fields else "topic"
         name = fields.get(kind, "")
         inside = await self._connect(endpoint, kind, name)
-        if inside is None or not await _hand_on(header, inside):
+        if inside is None or not await hand_on(header, inside):
             self._fail(endpoint, conn, name)
             return
         wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
@@ -137,7 +137,7 @@ class TcprosServer:
         self._context.problems.add(endpoint.label, text, endpoint.port)
 
 
-async def _read_header(conn: socket.socket) -> bytes:
+async def read_header(conn: socket.socket) -> bytes:
     """Take a connection header off the socket: its four bytes of length and its body.
 
     Raises HeaderError if it is too long, EOFError, TimeoutError, OSError.
@@ -155,7 +155,7 @@ async def _dial(address: str, port: int | None) -> socket.socket | None:
         return None
 
 
-async def _hand_on(header: bytes, inside: socket.socket) -> bool:
+async def hand_on(header: bytes, inside: socket.socket) -> bool:
     """Send a node the header that was read; closes the connection to it if that fails."""
     try:
         async with asyncio.timeout(sockets.CONNECT_TIMEOUT):
