@@ -5,7 +5,7 @@ from xmlrpc.client import Fault
 
 import pytest
 
-from examples.demo.fake_http import Answer, FakeHttpServer, FakeRequest, ok, value
+from examples.demo.fake_http import Answer, FakeHttpServer, FakeRequest, call, ok, value
 from tests.integration.net import (
     HOST,
     NODE,
@@ -111,11 +111,16 @@ async def test_somebody_elses_registration_opens_no_further_port_of_a_node(
 ):
     evil, other = await make_node("/evil"), await make_node("/other", OTHER_NODE)
     forged = f"rosrpc://{OTHER_NODE}:{victim.port}"
-    # First as the only one who registers the node, then next to the node itself.
+    door = "registerService", "/door", forged, other.uri
+    # In the node's own name: first as the only one who registers it, then next to the node itself.
     for _ in range(2):
-        await evil.call(proxy.master, "registerService", "/door", forged, other.uri)
+        await call(proxy.master, door[0], "/other", *door[1:], source=NODE)
         await knock(proxy.lease(other), service_header("/door"))
         await other.publish(proxy.master)
+    # In another name, it is not the node's registration at all.
+    code, text, _ = await evil.call(proxy.master, *door)
+    assert (code, "says that it is /other" in text) == (-1, True)
+    assert proxy.endpoint(other).caller_ids == ["/other"]
     assert victim.http.connections == 0
     # The node's own word is believed.
     own = f"rosrpc://{OTHER_NODE}:{other.tcpros_port}"

@@ -1,9 +1,10 @@
 """Asking a node who it is: does it answer, as which process, with which topics, on which port?
 
-There are two questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over.
+There are three questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over.
 `NodeClient.inspect` has the node describe itself; whoever is about to believe what somebody else
 said of a node (the master after a restart, an operator, the node's former process) inspects it
-first. Both only ask: what follows for the endpoint is decided in `upkeep`.
+first. `NodeClient.name` asks what it is called, before it is registered for somebody who calls from
+another address. All only ask: what follows for the endpoint is decided in `upkeep`.
 """
 
 import asyncio
@@ -11,8 +12,10 @@ import logging
 
 import msgspec
 
+from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
+from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.graph import NodeInfo, read_types
 from rosproxy.ros1.registry.health import ProbeResult
 
@@ -59,6 +62,56 @@ class NodeClient:
             return None
         port = await self._tcpros_port(where, sorted(published))
         return NodeInfo(answer.pid, published, subscribed, port)
+
+    async def name(self, where: HostPort, service: tuple[str, int] | None = None) -> str | None:
+        """What the node at an address is called, as it says itself; None if it doesn't.
+
+        rospy has ``getName`` for that. roscpp has nothing like it in its slave API, but gives its
+        name in the header with which it answers a TCPROS connection (roscpp's
+        transport_subscriber_link.cpp and service_client_link.cpp, handleHeader): for a topic that
+        it publishes, or for a ``service``, given with its port. It has one of them when it
+        registers for the first time: it notes a publisher (/rosout is the first of all) and a
+        service before it registers them. Its subscriptions are not asked for: it keeps them locked
+        while it registers one (topic_manager.cpp, subscribe).
+        """
+        try:
+            said = await self._upstream.call_node(where, self._within, "getName")
+            return said if isinstance(said, str) else await self._name_by_tcpros(where, service)
+        except Unreachable:
+            return None
+        except MasterError:
+            return await self._name_by_tcpros(where, service)
+
+    async def _name_by_tcpros(self, where: HostPort, service: tuple[str, int] | None) -> str | None:
+        try:
+            published = await self._topics(where, "getPublications")
+            topics = sorted(published, key=lambda topic: topic != "/rosout")[:TOPICS_ASKED]
+            port = await self._tcpros_port(where, topics)
+        except (Unreachable, MasterError) as error:
+            log.debug("%s does not tell its topics: %s", where, error)
+            return None
+        for topic in topics if port else []:
+            name = await self._greet(HostPort(where.host, port or 0), {"topic": topic, "type": "*"})
+            if name:
+                return name
+        if service is None:
+            return None
+        return await self._greet(HostPort(where.host, service[1]), {"service": service[0]})
+
+    async def _greet(self, where: HostPort, wanted: dict[str, str]) -> str | None:
+        """The name in the header with which a TCPROS server answers; None if it gives none."""
+        header = encode_header({"callerid": CALLER_ID, "md5sum": "*", "probe": "1", **wanted})
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(self._within):
+                conn = await sockets.dial(where)
+                with conn:
+                    await loop.sock_sendall(conn, header)
+                    size = header_length(await sockets.read_exactly(conn, 4))
+                    return decode_header(await sockets.read_exactly(conn, size)).get("callerid")
+        except (OSError, EOFError, HeaderError) as error:
+            log.debug("%s does not answer a TCPROS header: %s", where, error)
+            return None
 
     async def _topics(self, where: HostPort, method: str) -> dict[str, str]:
         return read_types(await self._upstream.call_node(where, self._within, method))

@@ -210,6 +210,30 @@ class Endpoint:
         return self.trusted and not self.health.down
 
     @property
+    def proven(self) -> bool:
+        """Whether its node has ever answered here, as itself."""
+        return self.trusted and self.health.answered is not None
+
+    @property
+    def never_found(self) -> bool:
+        """Whether its node registered and has never answered here: it may be elsewhere."""
+        health = self.health
+        return self.trusted and health.answered is None and health.failures > 0
+
+    @property
+    def expendable(self) -> bool:
+        """Whether its port is rather for a node that lives: its own does not answer.
+
+        One that never answered has one chance; what the master alone tells of must be borne out
+        when it is asked for the first time.
+        """
+        if self.pending or self.connected:
+            return False
+        if self.proven:
+            return self.health.down
+        return self.health.failures > 0 or not (self.trusted or self.health.answered is None)
+
+    @property
     def tcpros_ports(self) -> set[int]:
         """The TCPROS ports that the node has named."""
         return {port for port in (self.tcpros_port, *self.topic_ports.values()) if port}

@@ -2,8 +2,11 @@
 
 A node says where it is by its slave URI, and that may name a host which only its own container
 knows. So the address that the registration came from counts where it must: see `NodeAdmission`'s
-``_place``. A node that is admitted is looked at once, so that one which can't be reached is told
-of at once; a node that is known is taken for alive, whatever was believed of it.
+``_place``. Another address than that one is taken only if the node there says itself that it has
+the name that is being registered: else anybody could have any node published.
+
+A node that is admitted is looked at once, so that one which can't be reached is told of at once; a
+node that is known is taken for alive, whatever was believed of it.
 """
 
 import logging
@@ -12,16 +15,20 @@ from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.master_methods import row
+from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
+from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.rewriting.addressing import Asker
 from rosproxy.ros1.rewriting.master_api import Admission, Refusal, registering_uri
 
 log = logging.getLogger(__name__)
 
+MOST_ADDRESSES = 4
+"""How many addresses of a host name are tried."""
 RETIRED = "rosproxy: this proxy has been retired and registers nothing any more"
 
 
@@ -32,16 +39,18 @@ class NodeAdmission:
         self._context, self._leases = context, leases
 
     async def admit(self, call: Call, asker: Asker) -> Admission:
-        """The endpoint of a call that registers, or why there is none; None for other calls."""
+        """The endpoint of a call that registers, or why there is none; None for other calls.
+
+        None, too, for a node that is found to be outside: its URI passes as it is.
+        """
         uri = registering_uri(call)
         if uri is None:
             return None
         if self._context.retired:
             return Refusal(RETIRED)
         endpoint = self._context.registry.admitted(uri, asker.address)
-        if endpoint is not None:
-            self._welcome_back(endpoint, asker)
-            return endpoint
+        if endpoint is not None and not endpoint.never_found:
+            return await self._admit_again(endpoint, call, asker)
         node = parse_slave_uri(uri)
         if node is None:
             return Refusal(
@@ -49,7 +58,31 @@ class NodeAdmission:
             )
         if self._context.addressing.handed_out(uri, asker):
             return None
-        place = await self._place(node, asker.address)
+        return await self._admit_new(uri, node, call, asker)
+
+    async def _admit_again(
+        self, endpoint: Endpoint, call: Call, asker: Asker
+    ) -> Endpoint | Refusal:
+        """The endpoint that a URI has meant before, for a node that is there.
+
+        Somebody else at a source that hides several has to bear out its name as well.
+        """
+        caller_id, place = call.string(0) or "", endpoint.place
+        if place.address != asker.address and caller_id not in endpoint.caller_ids:
+            name = await self._context.nodes.name(endpoint.slave, _service(call))
+            if name != caller_id:
+                return Refusal(
+                    f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
+                    f"node there says that it is {(name or 'none')[:200]}"
+                )
+        self._welcome_back(endpoint, asker)
+        return endpoint
+
+    async def _admit_new(self, uri: str, node: HostPort, call: Call, asker: Asker) -> Admission:
+        """The endpoint of a node that has not registered from there before; see `admit`."""
+        place = await self._place(node, call, asker)
+        if place is None:
+            return None
         taken_in = self.take_in(uri, node, place, asker)
         if isinstance(taken_in, Endpoint):
             await self._leases.cleared(taken_in)
@@ -81,6 +114,9 @@ class NodeAdmission:
             problems.solved_at(endpoint.port)
             problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
 
+    async def _answers(self, slave: HostPort) -> bool:
+        return (await self._context.nodes.probe(slave)).pid is not None
+
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
         """A node that registers is alive, whatever was believed of it."""
         if not endpoint.place.confirmed and endpoint.place.address == asker.address:
@@ -91,16 +127,36 @@ class NodeAdmission:
         if endpoint.health.down or (known and asker.caller_id not in known):
             endpoint.health.suspect()
 
-    async def _place(self, node: HostPort, source: str) -> Place:
-        """Where a node is that gives ``node`` as its address and registers from ``source``."""
+    async def _place(self, node: HostPort, call: Call, asker: Asker) -> Place | None:
+        """Where a node is that gives ``node`` as its address; None if that is outside.
+
+        If the address leads elsewhere than to the source of the call, and no node answers at the
+        source (the way to the proxy hides it), the node there must bear out that it has the name
+        that the call registers.
+        """
+        source, caller_id = asker.address, call.string(0) or ""
         addresses = await resolve(self._context.upstream.reach(node).host, source)
         elsewhere = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not elsewhere:
             return Place(source, named=source in addresses)
-        for address in (source, *elsewhere):
-            if (await self._context.nodes.probe(HostPort(address, node.port))).pid is not None:
-                at_source = address == source
-                return Place(address, named=not at_source, confirmed=at_source)
+        if await self._answers(HostPort(source, node.port)):
+            return Place(source, named=False)
+        service = _service(call)
+        for address in elsewhere[:MOST_ADDRESSES]:
+            where = HostPort(address, node.port)
+            if await self._context.nodes.name(where, service) != caller_id:
+                continue
+            if self._context.standing(address) is Standing.ADMITTED:
+                return Place(address, named=True, confirmed=False)
+            log.info("%s at %s is outside; its URI passes as it is", caller_id, where)
+            return None
+        text = (
+            f"gives its address as {node}, but registers from {source}: no node answers there at "
+            f"port {node.port}, and none of this name at {', '.join(elsewhere[:MOST_ADDRESSES])}. "
+            "Set ROS_IP where it runs"
+        )
+        self._context.problems.add(caller_id, text)
+        log.warning("%s: %s", caller_id, text)
         return Place(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
@@ -115,6 +171,13 @@ class NodeAdmission:
         text = _unreachable_text(endpoint, answer.reason)
         self._context.problems.add(caller_id, text, endpoint.port)
         log.warning("%s: %s", caller_id, text)
+
+
+def _service(call: Call) -> tuple[str, int] | None:
+    """The service that a call registers, and its port; None if it registers another thing."""
+    found = row(call.method)
+    where = parse_service_uri(call.string(found.service_api) or "")
+    return (call.string(found.name) or "", where.port) if where else None
 
 
 def _on_loopback(endpoint: Endpoint) -> bool:
