@@ -75,8 +75,8 @@ class App:
             context.tasks,
             context.problems,
         )
-        self._admission = NodeAdmission(context, leases)
         self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane)
+        self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
         self.master_monitor = monitor = MasterMonitor(context, self._recovery, registrar)
         self._state = ProxyState(context, monitor, self.tcpros, self.alias, plane)

@@ -145,10 +145,12 @@ class Leases(Generic[_H]):
             sock.close()
         self._reserved.clear()
 
-    def make_room(self) -> bool:
-        """Take a port back that is needed least, if there is one: a fast port, or an idle lease."""
-        if self._give_fast_port_back() is not None:
-            return True
+    def give_up_fast_port(self) -> bool:
+        """Take the fast port back that is needed least, if there is one."""
+        return self._give_fast_port_back() is not None
+
+    def end_idle(self) -> bool:
+        """End the lease that is needed least, if nobody needs it."""
         oldest = self._holders.reclaimable()
         if oldest is not None:
             self.end(oldest)

@@ -76,7 +76,8 @@ class Endpoint:
 
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
     listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
-    ``trusted`` is False while only the master's data tell of the endpoint.
+    ``trusted`` is False while only the master's data tell of the endpoint. ``source`` is the
+    address whose registration it was made for; after a recovery the node's own.
 
     ``former_uris`` are those by which the master may have known it: the node's own, if it
     registered around the proxy, and advertised ones of places where it was. ``unsettled``: what
@@ -101,8 +102,10 @@ class Endpoint:
     pending: int = 0
     idle_since: float | None = None
     trusted: bool = True
+    source: str = ""
     health: Health = field(default_factory=Health)
-    admissions: set[tuple[str, str]] = field(default_factory=set)
+    admissions: dict[tuple[str, str], None] = field(default_factory=dict)
+    """The URIs and sources that were found to mean it, oldest first; `Registry` keeps them."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0

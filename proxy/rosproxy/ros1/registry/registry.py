@@ -4,6 +4,7 @@ Plain state without I/O. It is changed in place rather than copied: with a thous
 topics each a copy per call would make registration quadratic.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 
 from rosproxy.leases.ports import PortPool, PortRange
@@ -11,6 +12,13 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.registry.endpoint import LONGEST_REGISTRATION, Endpoint, Place, Registration
+
+MOST_ADMISSIONS = 16
+"""URIs and sources remembered for one endpoint. A node gives one URI, from one address or, on a
+machine that is in several networks, from a few."""
+UNPROVEN_SHARE = 4
+"""One part in so many of the range is for nodes of one source that have never answered. A node
+that is well answers within milliseconds of its first registration."""
 
 
 class RangeExhausted(Exception):
@@ -62,7 +70,7 @@ class Registry:
                     f"leases held, {len(self.pool.blocked)} taken by other programs); give the "
                     "proxy a larger --port-range (ROSPROXY_PORT_RANGE)"
                 )
-            endpoint = self._add(uri, node, place, port)
+            endpoint = self._add(uri, node, place, port, source)
         elif place.confirmed or not endpoint.place.confirmed:
             self._forget_uri(endpoint)
             endpoint.uri, endpoint.node, endpoint.place = uri, node, place
@@ -74,7 +82,7 @@ class Registry:
         """Rebuild an endpoint on the port that it had; None if either is taken."""
         if HostPort(place.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
-        endpoint = self._add(uri, node, place, port)
+        endpoint = self._add(uri, node, place, port, place.address)
         endpoint.trusted = False
         self._admit(endpoint, uri, place.address)
         return endpoint
@@ -115,6 +123,31 @@ class Registry:
         """
         idle = [e for e in self if e.unused and e.idle_since is not None]
         return min(idle, key=lambda e: e.idle_since or 0.0, default=None)
+
+    def dead(self) -> Endpoint | None:
+        """The endpoint to give up first for a node that lives; None if no node is dead.
+
+        Those that never answered go first, of the source that has most of them; then those that
+        refuse, which have ended; then those that are silent, for the longest time.
+        """
+        found = [e for e in self if e.expendable]
+        crowds = Counter(e.source for e in found if not e.proven)
+
+        def order(endpoint: Endpoint) -> tuple[bool, int, bool, float]:
+            health, proven = endpoint.health, endpoint.proven
+            crowd = 0 if proven else crowds[endpoint.source]
+            return proven, -crowd, not health.refused, health.failing_since or 0.0
+
+        return min(found, key=order, default=None)
+
+    def unproven(self, source: str) -> list[Endpoint]:
+        """The endpoints that a source has registered whose nodes have never answered."""
+        return [e for e in self if e.source == source and not e.proven]
+
+    @property
+    def most_unproven(self) -> int:
+        """How many of them one source may have."""
+        return max(1, len(self.pool.range) // UNPROVEN_SHARE)
 
     def register(self, endpoint: Endpoint, held: Registration) -> None:
         """Note what the master has accepted.
@@ -194,12 +227,12 @@ class Registry:
         address = endpoint.place.address
         uris = [uri for uri, source in endpoint.admissions if source == address]
         for uri in uris:
-            endpoint.admissions.discard((uri, address))
+            del endpoint.admissions[uri, address]
             del self._admitted[uri, address]
         return [*uris, endpoint.uri]
 
-    def _add(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint:
-        endpoint = Endpoint(uri, node, place, port)
+    def _add(self, uri: str, node: HostPort, place: Place, port: int, source: str) -> Endpoint:
+        endpoint = Endpoint(uri, node, place, port, source=source)
         self.by_port[port] = self.by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
         self._by_uri.setdefault(uri, {})[port] = endpoint
@@ -207,9 +240,12 @@ class Registry:
 
     def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
         before = self._admitted.get((uri, source), endpoint)
-        before.admissions.discard((uri, source))
+        before.admissions.pop((uri, source), None)
         self._admitted[uri, source] = endpoint
-        endpoint.admissions.add((uri, source))
+        endpoint.admissions[uri, source] = None
+        if len(endpoint.admissions) > MOST_ADMISSIONS:
+            oldest = next(iter(endpoint.admissions))
+            del endpoint.admissions[oldest], self._admitted[oldest]
 
     def _remember(self, endpoint: Endpoint) -> None:
         """Note who has a port now, in place of who had it last."""

@@ -5,11 +5,18 @@ knows. So the address that the registration came from counts where it must: see 
 ``_place``. Another address than that one is taken only if the node there says itself that it has
 the name that is being registered: else anybody could have any node published.
 
+Ports are for nodes that live. Those that have never answered get a part of the range, by the
+address that registers them; and where the range is used up, a node that answers gets the port of
+one that doesn't, whose registrations are taken back (`_make_room`). So neither dead URIs nor stale
+claims of former proxies keep a port from it.
+
 A node that is admitted is looked at once, so that one which can't be reached is told of at once; a
 node that is known is taken for alive, whatever was believed of it.
 """
 
+import asyncio
 import logging
+from typing import Protocol
 
 from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net.addresses import HostPort, is_loopback
@@ -27,21 +34,48 @@ from rosproxy.ros1.rewriting.master_api import Admission, Refusal, registering_u
 
 log = logging.getLogger(__name__)
 
+PATIENCE = 15.0
+"""Seconds that a node has to answer for the first time where many of its source have not: all nodes
+of a machine that has just started may be slow at once."""
+PATIENCE_STEP = 0.2
 MOST_ADDRESSES = 4
 """How many addresses of a host name are tried."""
 RETIRED = "rosproxy: this proxy has been retired and registers nothing any more"
 
 
+class Cleanup(Protocol):
+    """Takes back at the master what a node has that does not answer."""
+
+    async def give_up(self, endpoint: Endpoint, /) -> None:
+        """Unregister it. Raises Unreachable."""
+
+
+class Verification(Protocol):
+    """Asks nodes that only the master tells of; see `rosproxy.ros1.upkeep.recovery`."""
+
+    async def hasten(self) -> None:
+        """Wait a moment until one of them turns out dead."""
+
+
 class NodeAdmission:
     """Gives endpoints to nodes that register."""
 
-    def __init__(self, context: Context, leases: Leases[Endpoint]) -> None:
+    def __init__(
+        self,
+        context: Context,
+        leases: Leases[Endpoint],
+        cleanup: Cleanup,
+        verification: Verification,
+    ) -> None:
         self._context, self._leases = context, leases
+        self._cleanup, self._verification = cleanup, verification
+        self._making_room = asyncio.Lock()
 
     async def admit(self, call: Call, asker: Asker) -> Admission:
         """The endpoint of a call that registers, or why there is none; None for other calls.
 
-        None, too, for a node that is found to be outside: its URI passes as it is.
+        None, too, for a node that is found to be outside: its URI passes as it is. Raises
+        Unreachable if the master is needed and away.
         """
         uri = registering_uri(call)
         if uri is None:
@@ -83,29 +117,39 @@ class NodeAdmission:
         place = await self._place(node, call, asker)
         if place is None:
             return None
-        taken_in = self.take_in(uri, node, place, asker)
+        taken_in = await self.take_in(uri, node, place, asker)
         if isinstance(taken_in, Endpoint):
             await self._leases.cleared(taken_in)
             first_probe = self._probe_first(taken_in, asker.caller_id)
             self._context.tasks.spawn(first_probe, f"first probe of {uri}")
         return taken_in
 
-    def take_in(self, uri: str, node: HostPort, place: Place, asker: Asker) -> Endpoint | Refusal:
+    async def take_in(
+        self, uri: str, node: HostPort, place: Place, asker: Asker, answers: bool = False
+    ) -> Endpoint | Refusal:
         """The endpoint of a node found at a place, its port open; a refusal if none is left.
 
-        Ports that turn out to be taken are passed over.
+        Ports that turn out to be taken are passed over. ``answers``: the node has just done so.
+        Raises Unreachable.
         """
         registry, leases, problems = self._context.registry, self._leases, self._context.problems
+        slave, source = HostPort(place.address, node.port), asker.address
+        if slave not in registry.by_slave and not answers and self._is_crowded(source):
+            answers = await self._comes_to_answer(slave, source)
+            if not answers and self._is_crowded(source):
+                return self._refuse(uri, asker, _crowd_text(source, slave, registry.most_unproven))
         while True:
             try:
-                endpoint = registry.admit(uri, node, place, asker.address)
+                endpoint = registry.admit(uri, node, place, source)
             except RangeExhausted as error:
-                if leases.make_room():
+                answers = answers or await self._answers(slave)
+                async with self._making_room:
+                    room = registry.pool.free or await self._make_room(answers)
+                if room:
                     continue
-                self._context.metrics.exhausted.inc()
-                problems.add(asker.caller_id, str(error))
-                log.error("%s (%s) gets no port: %s", asker.caller_id, uri, error)
-                return Refusal(str(error))
+                return self._refuse(uri, asker, str(error))
+            if answers:
+                endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
             leases.open(endpoint)
             if leases.is_open(endpoint) or endpoint.registrations:
                 return endpoint
@@ -114,8 +158,74 @@ class NodeAdmission:
             problems.solved_at(endpoint.port)
             problems.add(RANGE_OPTION, f"port {endpoint.port} is taken")
 
+    async def _make_room(self, answers: bool) -> bool:
+        """Free a port for a new node, if one can be had.
+
+        Only one that ``answers`` displaces others. Raises Unreachable.
+        """
+        if self._leases.give_up_fast_port():
+            return True
+        if answers and await self._give_up_dead():
+            return True
+        if self._leases.end_idle():
+            return True
+        if not answers:
+            return False
+        await self._verification.hasten()
+        return self._context.registry.pool.free > 0 or await self._give_up_dead()
+
+    async def _give_up_dead(self) -> bool:
+        """Unregister a node that is dead and end its lease; whether there was one.
+
+        It may have come back while the master was told: then it keeps its port.
+        """
+        registry = self._context.registry
+        endpoint = registry.dead()
+        if endpoint is None:
+            return False
+        label, port, fields = endpoint.label, endpoint.port, endpoint.log_fields
+        await self._cleanup.give_up(endpoint)
+        if registry.by_port.get(port) is endpoint and endpoint.expendable:
+            self._leases.end(endpoint)
+            log.warning("%s does not answer: port %d is for another", label, port, extra=fields)
+        return True
+
+    def _is_crowded(self, source: str) -> bool:
+        """Whether a source has all the nodes that it may have which have never answered.
+
+        Those that have no registration left are given up for new ones.
+        """
+        registry = self._context.registry
+        while len(unproven := registry.unproven(source)) >= registry.most_unproven:
+            unused = next((e for e in unproven if e.unused and e.idle_since is not None), None)
+            if unused is None:
+                return True
+            self._leases.end(unused)
+        return False
+
+    async def _comes_to_answer(self, slave: HostPort, source: str) -> bool:
+        """Whether a node answers, in the time that it may take on a machine that just starts.
+
+        Nobody waits for it once it is known not to be there, or not needed to be.
+        """
+        end = self._context.now() + PATIENCE
+        while True:
+            answer = await self._context.nodes.probe(slave)
+            if answer.pid is not None:
+                return True
+            over = self._context.now() >= end
+            if answer.probe is ProbeResult.REFUSED or over or not self._is_crowded(source):
+                return False
+            await asyncio.sleep(PATIENCE_STEP)
+
     async def _answers(self, slave: HostPort) -> bool:
         return (await self._context.nodes.probe(slave)).pid is not None
+
+    def _refuse(self, uri: str, asker: Asker, text: str) -> Refusal:
+        self._context.metrics.exhausted.inc()
+        self._context.problems.add(asker.caller_id, text)
+        log.error("%s (%s) gets no port: %s", asker.caller_id, uri, text)
+        return Refusal(text)
 
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
         """A node that registers is alive, whatever was believed of it."""
@@ -178,6 +288,14 @@ def _service(call: Call) -> tuple[str, int] | None:
     found = row(call.method)
     where = parse_service_uri(call.string(found.service_api) or "")
     return (call.string(found.name) or "", where.port) if where else None
+
+
+def _crowd_text(source: str, slave: HostPort, most: int) -> str:
+    return (
+        f"rosproxy: {slave} does not answer, nor has any of the {most} nodes that {source} has "
+        "registered before: that many ports of the range are for such. Check ROS_IP where they "
+        "run, and that no firewall or network policy is in between"
+    )
 
 
 def _on_loopback(endpoint: Endpoint) -> bool:

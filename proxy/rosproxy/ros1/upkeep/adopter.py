@@ -163,7 +163,7 @@ class Adopter:
         named = place.host in await resolve(host, place.host)
         asker = Asker(place.host, "", nodes[0].caller_id)
         where = Place(place.host, named, confirmed=False)
-        endpoint = self._admission.take_in(uri, own, where, asker)
+        endpoint = await self._admission.take_in(uri, own, where, asker, answers=True)
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.hold()

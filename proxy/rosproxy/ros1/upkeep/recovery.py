@@ -10,6 +10,11 @@ borne it out (`_verify`), the endpoint's port is held but refuses. Then subscrib
 connect again (`Resubscriber.announce`). A node that does not answer yet is verified when a probe
 finds it (`Prober`).
 
+A claim keeps no port from a node that lives: where the range is used up, one that registers waits
+a moment for claims that are being verified, and gets the port of one whose node is dead (`hasten`).
+What the master has for nodes that got no port again, although it carries this proxy's own address,
+is nobody's: a former proxy left it behind, and it is taken back (`_sweep`).
+
 If ports are others after a start, look here: the log names each claim that was refused, and why.
 """
 
@@ -24,6 +29,8 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.upkeep.policy import recovery as policy
 from rosproxy.ros1.upkeep.policy.recovery import Claim
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -32,6 +39,8 @@ from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 log = logging.getLogger(__name__)
 
 PARALLEL_INSPECTIONS = 64
+HASTE = 1.0
+"""Seconds that a claim gets to be borne out once a living node waits for its port."""
 
 
 class Recovery:
@@ -51,6 +60,7 @@ class Recovery:
         self._context, self._leases, self._plane = context, leases, plane
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
+        self._inspecting: set[Endpoint] = set()
         self._limit = asyncio.Semaphore(PARALLEL_INSPECTIONS)
         self._done = asyncio.Event()
         self._one_at_a_time = asyncio.Lock()
@@ -99,12 +109,32 @@ class Recovery:
             if found:
                 await self._resubscriber.announce(found)
 
+    async def hasten(self) -> None:
+        """Wait until a node that is being verified turns out dead, for a moment.
+
+        Those that were being asked all that time and are silent count as failing from then on.
+        """
+        end, waited = self._context.now() + HASTE, set(self.verifying)
+        asked = set(self._inspecting)
+        while waited & self.verifying and self._context.now() < end:
+            if self._context.registry.pool.free or self._context.registry.dead() is not None:
+                return
+            await asyncio.sleep(0.01)
+        for endpoint in asked & self._inspecting:
+            endpoint.health.note(ProbeResult.SILENT, self._context.now())
+
     async def _recover(self) -> None:
         self._context.refresh_networks()
         graph = await self._context.upstream.read_graph()
-        claims = await self._settle(policy.claims(graph, self._context.addressing))
-        endpoints = [e for claim in claims if (e := self._restore(claim)) is not None]
+        found = policy.claims(graph, self._context.addressing)
+        restored = [(claim, self._restore(claim)) for claim in await self._settle(found)]
+        endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
+        served = {id(claim) for claim, endpoint in restored if endpoint is not None}
+        left = [claim for claim in found if id(claim) not in served]
         self._plane.recovered(endpoints)
+        if left and self._context.settings.cleanup_after:
+            self._context.tasks.spawn(self._sweep(left), "taking back what former proxies left")
+        self.verifying |= set(endpoints)
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
             self._context.tasks.spawn(self._resume(endpoints), "recovery")
@@ -124,7 +154,7 @@ class Recovery:
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
         address = claim.slave.host
-        if not is_inside(address, self._context.addressing.networks):
+        if self._context.standing(address) is Standing.OUTSIDE:
             text = "port %d: the master has %s for it, which is not in an inside network; refused"
             log.warning(text, claim.port, address)
             return None
@@ -140,16 +170,47 @@ class Recovery:
 
     async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
         """Serve recovered endpoints; none waits for another that does not answer."""
-        self.verifying |= set(endpoints)
         try:
             await asyncio.gather(*map(self.serve, endpoints))
             log.info("recovered %d nodes", sum(e.trusted for e in endpoints))
         except (Unreachable, MasterError) as error:
             log.warning("recovery is incomplete: %s", error)
 
+    async def _sweep(self, left: Sequence[Claim]) -> None:
+        """Take back at the master what nobody stands for, after the time for nodes that are gone.
+
+        A node that bears out what the master says of it is not: it gets its port if that is free
+        by now, and if it is inside, which an operator may have told meanwhile.
+        """
+        await asyncio.sleep(self._context.settings.cleanup_after)
+        self._context.refresh_networks()
+        for claim in left:
+            try:
+                if not await self._is_borne_out(claim):
+                    await self._registrar.take_back(claim.advertised, claim.registrations)
+                elif endpoint := self._restore(claim):
+                    await self.serve(endpoint)
+            except (Unreachable, MasterError) as error:
+                log.warning("%s stays at the master as it is: %s", claim.advertised, error)
+
+    async def _is_borne_out(self, claim: Claim) -> bool:
+        """Whether the node of a claim is inside and says itself what the master has for it."""
+        if self._context.standing(claim.slave.host) is Standing.OUTSIDE:
+            return False
+        info = await self._context.nodes.inspect(claim.slave)
+        return info is not None and policy.confirmed_by(claim, info.topics)
+
     async def _verify(self, endpoint: Endpoint) -> None:
-        info = await self._context.nodes.inspect(endpoint.slave)
-        if info is None or endpoint.trusted:
+        self._inspecting.add(endpoint)
+        try:
+            info = await self._context.nodes.inspect(endpoint.slave)
+        finally:
+            self._inspecting.discard(endpoint)
+        if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
+            return  # it has registered meanwhile, or was given up for a node that lives
+        if info is None:
+            if endpoint.health.answered is None:
+                endpoint.health.note(ProbeResult.SILENT, self._context.now())
             return
         if not policy.confirmed_by(endpoint, info.topics):
             log.warning("%s: the node there has none of its topics; not served", endpoint.label)
@@ -157,6 +218,7 @@ class Recovery:
             self._leases.end(endpoint)
             return
         endpoint.note_verified(info.pid, info.tcpros_port)
+        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         self._leases.open(endpoint)
         address = endpoint.place.address
         host = self._context.upstream.reach(endpoint.node).host

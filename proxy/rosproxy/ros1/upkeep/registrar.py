@@ -17,7 +17,7 @@ from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
@@ -124,6 +124,27 @@ class Registrar:
         endpoint.health.note_cleaned(started)
         self._context.metrics.cleanups.inc()
         _log(endpoint, "cleaned up %s: %d registrations taken back", len(held))
+
+    async def give_up(self, endpoint: Endpoint) -> None:
+        """Unregister a node that does not answer, whose port another needs. Raises Unreachable."""
+        if not endpoint.health.cleaned:
+            await self.clean_up(endpoint)
+
+    async def take_back(self, uri: str, held: Sequence[Registration]) -> None:
+        """Unregister what names hold by an advertised URI that no endpoint stands for.
+
+        Names that have another URI by now are left alone. Raises Unreachable.
+        """
+        addressing, upstream = self._context.addressing, self._context.upstream
+        known = await upstream.look_up("lookupNode", {one.caller_id for one in held})
+        where = parse_slave_uri(uri)
+        if where is None or addressing.stands_for(uri):
+            return
+        left = [one for one in held if known.get(one.caller_id) == uri]
+        service = service_uri(where)
+        await upstream.multicall([policy.unregister_call(one, uri, service) for one in left])
+        if left:
+            log.info("took back %d registrations that a former proxy left for %s", len(left), uri)
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
         """Register a node again that was cleaned up and answers after all, as process ``pid``.

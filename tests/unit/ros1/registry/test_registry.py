@@ -15,7 +15,7 @@ from rosproxy.ros1.registry.endpoint import (
     Registration,
 )
 from rosproxy.ros1.registry.health import Health
-from rosproxy.ros1.registry.registry import RangeExhausted, Registry
+from rosproxy.ros1.registry.registry import MOST_ADMISSIONS, RangeExhausted, Registry
 from tests.unit.builders import own_uri
 
 PUB, SUB, SRV, PARAM = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE, Kind.PARAM
@@ -408,3 +408,83 @@ def test_an_endpoint_of_many_nodes_has_a_short_label() -> None:
         register(registry, endpoint, PUB, "/t", f"/n{number}")
     assert endpoint.label == "/n0, /n1, /n10 and 997 more (http://10.0.0.5:40001/)"
     assert endpoint.log_fields["node"] == "/n0, /n1, /n10 and 997 more"
+
+
+def failing(
+    registry: Registry, number: int, source: int, proven: bool = False, failures: int = 1
+) -> Endpoint:
+    """A node that an address registered and that does not answer any more, or never did."""
+    address = f"10.0.0.{number}"
+    endpoint = admit(registry, own_uri(address), address, f"10.0.0.{source}")
+    endpoint.health.answered = 1.0 if proven else None
+    endpoint.health.failures, endpoint.health.failing_since = failures, float(number)
+    register(registry, endpoint, PUB, f"/topic{number}", f"/node{number}")
+    return endpoint
+
+
+def given_up(registry: Registry) -> list[str]:
+    """Who is given up for nodes that live, one after the other."""
+    found = []
+    while (endpoint := registry.dead()) is not None:
+        found.append(endpoint.place.address.removeprefix("10.0.0."))
+        registry.remove(endpoint)
+    return found
+
+
+def test_the_dead_give_way_in_order() -> None:
+    registry = make_registry(16)
+    node(registry, 1)  # just admitted: nothing is known of it yet
+    failing(registry, 2, source=2, proven=True)  # may come back: it has failed once only
+    silent = failing(registry, 3, source=3, proven=True, failures=2)
+    ended = failing(registry, 4, source=4, proven=True, failures=2)
+    ended.health.refused = True
+    failing(registry, 5, source=5, proven=True, failures=2).pending = 1
+    failing(registry, 6, source=6, proven=True, failures=2).connections = 1
+    failing(registry, 7, source=90)
+    for number in (8, 9, 10):
+        failing(registry, number, source=91)
+    assert given_up(registry) == ["8", "9", "7", "10", "4", "3"]
+    assert silent not in registry
+    assert len(registry) == 4
+
+
+def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> None:
+    registry = make_registry()
+    where, place = HostPort("10.0.0.5", 40001), Place("10.0.0.5", named=True, confirmed=False)
+    claim = registry.restore(own_uri("10.0.0.5"), where, place, 45000)
+    assert claim
+    register(registry, claim, PUB, "/a")
+    assert registry.dead() is None  # it is being asked
+    claim.health.failures = 1
+    assert registry.dead() is claim
+    claim.health.failures, claim.health.answered = 0, 5.0  # something answers that is not the node
+    assert registry.dead() is claim
+    claim.trusted = True
+    assert registry.dead() is None
+
+
+def test_nodes_of_a_source_that_never_answered() -> None:
+    registry = make_registry(8)
+    one = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", "10.0.0.9")
+    other = admit(registry, own_uri("10.0.0.6"), "10.0.0.6", "10.0.0.9")
+    node(registry, 7)
+    assert registry.unproven("10.0.0.9") == [one, other]
+    one.health.answered = 1.0
+    assert registry.unproven("10.0.0.9") == [other]
+    assert [make_registry(size).most_unproven for size in (1, 4, 8, 100)] == [1, 1, 2, 25]
+
+
+def test_few_uris_are_remembered_for_one_endpoint_and_the_oldest_go() -> None:
+    registry = make_registry()
+    uris = [f"http://name{number}:40001/" for number in range(MOST_ADMISSIONS + 2)]
+    endpoints = {admit(registry, uri, "10.0.0.5") for uri in uris}
+    (endpoint,) = endpoints
+    known = [uri for uri in uris if registry.admitted(uri, "10.0.0.5") is endpoint]
+    assert known == uris[2:]
+    assert len(endpoint.admissions) == MOST_ADMISSIONS
+    admit(registry, uris[2], "10.0.0.5")  # used again: it is the newest now
+    admit(registry, uris[0], "10.0.0.5")
+    assert registry.admitted(uris[2], "10.0.0.5") is endpoint
+    assert registry.admitted(uris[3], "10.0.0.5") is None
+    registry.remove(endpoint)
+    assert not any(registry.admitted(uri, "10.0.0.5") for uri in uris)

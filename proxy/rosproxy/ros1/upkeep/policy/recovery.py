@@ -24,7 +24,8 @@ NO_MERIT = -(10**9)
 class Claim:
     """An endpoint that the master's data tell of: its port, its inside address, what it holds.
 
-    ``node`` is the host and port that the node calls itself, ``slave`` where to look for it.
+    ``node`` is the host and port that the node calls itself, ``slave`` where to look for it,
+    ``advertised`` the URI that the master has.
     ``said`` are the topics that it names there; None if it was not asked or gave no answer.
     """
 
@@ -33,6 +34,7 @@ class Claim:
     slave: HostPort
     registrations: list[Registration] = field(default_factory=list)
     said: set[str] | None = None
+    advertised: str = ""
 
     @property
     def topics(self) -> set[str]:
@@ -51,7 +53,7 @@ def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     for node, uri in graph.uris.items():
         if ours := addressing.identify(uri):
             port, inside = ours
-            claim = Claim(port, inside.node, inside.slave)
+            claim = Claim(port, inside.node, inside.slave, advertised=uri)
             found.setdefault(uri, claim).registrations += graph.held.get(node, [])
     return list(found.values())
 
@@ -78,7 +80,7 @@ def settle(found: Sequence[Claim]) -> list[Claim]:
     return list(ports.values())
 
 
-def confirmed_by(endpoint: Endpoint, topics: set[str]) -> bool:
+def confirmed_by(endpoint: Endpoint | Claim, topics: set[str]) -> bool:
     """Whether the topics that a node itself names bear out what the master says of it.
 
     A forged URI that leads to something other than the node of that name finds no answer here,

@@ -1,0 +1,467 @@
+"""Who may use the proxy as its master, whom it believes, and who gets a port."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack
+from typing import Any
+
+import pytest
+
+from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, call, value, where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
+from rosproxy.ros1.servers import callers
+from tests.integration.admin.test_admin import metrics
+from tests.integration.admin_calls import news, post, tell
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.net import (
+    HOST,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    PROXY,
+    THIRD_NODE,
+    connect,
+    exchange,
+    knock,
+    refuses,
+    rpc,
+    topic_header,
+    until,
+    xml,
+)
+from tests.integration.net import post as request
+from tests.integration.proxy import Proxy
+
+HIDDEN = "127.0.2.99"
+"""An inside address at which no node is: that of a gateway which hides where calls come from."""
+
+
+@pytest.fixture
+def _no_source_is_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All addresses of the tests are this machine's own, whose programs are always let in."""
+    monkeypatch.setattr("rosproxy.ros1.servers.callers.is_own", lambda address: False)
+
+
+@pytest.fixture
+def _as_if_not_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' addresses are loopback, where a node's word counts for even less."""
+    monkeypatch.setattr("rosproxy.ros1.servers.admission.is_loopback", lambda address: False)
+
+
+def problems(proxy: Proxy) -> dict[str, str]:
+    return {row["subject"]: row["text"] for row in proxy.app.status()["problems"]}
+
+
+def address_of(proxy: Proxy, name: str) -> str:
+    """Where the proxy takes a node to be."""
+    return proxy.app.context.registry.by_caller[name].place.address
+
+
+# Who may use the proxy as its master
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_the_master_port_is_for_inside_alone(
+    proxy: Proxy, node: FakeNode, master: FakeMaster, caplog: pytest.LogCaptureFixture
+) -> None:
+    uri = f"http://{OUTSIDE}:4000/"
+    body = xml("registerPublisher", "/stranger", "/t", "x/Y", uri)
+    for _ in range(3):
+        reply = await exchange(proxy.master, request(body), OUTSIDE)
+        assert reply.status == 403
+        assert reply.headers["connection"] == "close"
+    for part in (OUTSIDE, "127.0.2.0/24", "--inside-network"):
+        assert part in reply.body.decode()
+        assert part in problems(proxy)["master port"]
+    assert caplog.text.count("no inside network") == 1  # it is told in the log now and then only
+    assert proxy.metric("strangers_total", standing="outside") == 3
+    assert "/stranger" not in master.nodes
+    assert (await node.publish(proxy.master))[0] == 1
+    assert [problem for problem in problems(proxy) if OUTSIDE in problem] == []
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_a_stranger_is_refused_before_anything_of_its_document_is_read(proxy: Proxy) -> None:
+    async with connect(proxy.master, OUTSIDE) as wire:
+        await wire.send(request(b"", "Content-Length: 1000000"))
+        assert (await wire.reply()).status == 403
+
+
+async def test_programs_on_the_proxys_own_machine_are_let_in(proxy: Proxy) -> None:
+    assert (await rpc(proxy.master, "getPid", "/doctor", source=OUTSIDE))[0] == 1
+    await tell(proxy, "/containers", selected=[])
+    assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_where_an_operator_selects_only_its_containers_are_let_in(
+    make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
+    proxy = await make_proxy(linger=60)
+    node, other = await make_node(), await make_node("/other", OTHER_NODE)
+    assert (await node.publish(proxy.master))[0] == 1
+    assert proxy.app.status()["settings"]["selected"] is None
+    assert await news(proxy, selected=[OTHER_NODE]) == (0, 0, 0)
+    assert proxy.app.status()["settings"]["selected"] == 1
+    assert (await metrics(proxy))["rosproxy_selected_addresses"] == 1
+    body = xml("registerPublisher", node.name, "/more", "x/Y", node.uri)
+    reply = await exchange(proxy.master, request(body), NODE)
+    assert reply.status == 403
+    for part in (NODE, "rosproxy.enable=true", "rosproxy.io/inject"):
+        assert part in reply.body.decode()
+        assert part in problems(proxy)["master port"]
+    assert proxy.metric("strangers_total", standing="unselected") == 1
+    assert (await other.publish(proxy.master))[0] == 1
+    # What it has stays: only the operator's "gone" ends that.
+    assert await proxy.serves(node)
+    # Other news leave the selection as it is; nobody is selected by an empty one.
+    await news(proxy, gone=[THIRD_NODE])
+    assert (await other.publish(proxy.master))[0] == 1
+    await news(proxy, selected=[])
+    assert (await exchange(proxy.master, request(body), OTHER_NODE)).status == 403
+    # A proxy that is started again knows nothing of it yet, and serves whom it served.
+    await proxy.restart()
+    assert (await node.publish(proxy.master, "/more"))[0] == 1
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_a_new_container_waits_for_the_news_and_loses_nothing(
+    proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    await news(proxy, selected=[])
+    call_ = asyncio.create_task(node.publish(proxy.master))
+    waiting = proxy.app._callers
+    await until(lambda: waiting._waiting.total() == 1, "the call waits")
+    await news(proxy, selected=[OTHER_NODE])
+    assert not call_.done()
+    await news(proxy, selected=[OTHER_NODE, NODE])
+    assert (await call_)[0] == 1
+    assert waiting._waiting.total() == 0
+    assert proxy.metric("strangers_total", standing="unselected") == 0
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_no_more_than_so_many_calls_wait(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    monkeypatch.setattr(callers, "MOST_WAITING_EACH", 2)
+    monkeypatch.setattr(callers, "MOST_WAITING", 3)
+    await news(proxy, selected=[])
+    waiting, body = proxy.app._callers._waiting, request(xml("getPid", "/n"))
+    sources = [NODE, NODE, OTHER_NODE]
+    calls = [asyncio.create_task(exchange(proxy.master, body, source)) for source in sources]
+    await until(lambda: waiting.total() == 3, "the calls wait")
+    for source in (NODE, THIRD_NODE):
+        assert (await exchange(proxy.master, body, source)).status == 403
+    await news(proxy, selected=[NODE, OTHER_NODE])
+    assert [(await call_).status for call_ in calls] == [200] * 3
+
+
+@pytest.mark.usefixtures("_no_source_is_own")
+async def test_the_selection_is_taken_in_while_the_master_is_away(
+    make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
+    proxy = await make_proxy(master_uri="http://127.0.1.1:9")
+    reply = await post(proxy, "/containers", f'{{"gone": ["{NODE}"], "selected": []}}')
+    assert reply.status == 503
+    assert (await exchange(proxy.master, request(xml("getPid", "/n")), NODE)).status == 403
+
+
+# Whom it believes where a node is
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+async def test_a_forged_caller_api_publishes_nobody_else(
+    proxy: Proxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    """A node that never joined was published by somebody who registered its address."""
+    evil, victim = await make_node("/evil"), await make_node("/victim", OTHER_NODE)
+    await evil.call(proxy.master, "registerPublisher", "/rosout", "rosgraph_msgs/Log", victim.uri)
+    assert address_of(proxy, "/evil") == NODE
+    told = [row["text"] for row in proxy.app.status()["problems"] if row["subject"] == "/evil"]
+    assert any("gives its address as" in text for text in told)
+    (endpoint,) = proxy.app.context.registry
+    calls = len(victim.calls)
+    for data in (request(xml("getBusStats", "/outside")), topic_header("/rosout")):
+        assert await knock((HOST, endpoint.port), data) != "answered"
+    assert len(victim.calls) == calls
+
+
+Ask = Callable[[FakeNode, Proxy], Any]
+
+
+def as_rospy(node: FakeNode) -> None:
+    """It tells its name when it is asked for it, and may have no topic yet."""
+    node.answers["getName"] = value([1, "", node.name])
+    node.published.clear()
+
+
+def as_roscpp(node: FakeNode) -> None:
+    """It publishes /rosout first of all, and has no getName; its subscriptions are locked."""
+    node.answers["getName"] = node.answers["x"] = value([-1, "no such method", 0])
+    node.answers["getSubscriptions"] = End.HANG
+
+
+def as_roscpp_without_rosout(node: FakeNode) -> None:
+    """Its first registration is a service (init_options::NoRosout)."""
+    as_roscpp(node)
+    node.published.clear()
+
+
+async def publish(node: FakeNode, proxy: Proxy) -> Any:
+    params = "/rosout", "rosgraph_msgs/Log", node.uri
+    return await call(proxy.master, "registerPublisher", node.name, *params, source=HIDDEN)
+
+
+async def serve(node: FakeNode, proxy: Proxy) -> Any:
+    params = f"{node.name}/get_loggers", node.service_api, node.uri
+    return await call(proxy.master, "registerService", node.name, *params, source=HIDDEN)
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+@pytest.mark.parametrize(
+    ("kind", "first"),
+    [(as_rospy, publish), (as_roscpp, publish), (as_roscpp_without_rosout, serve)],
+)
+async def test_a_node_whose_source_is_hidden_bears_out_its_address_by_its_name(
+    proxy: Proxy, make_node: MakeNode, kind: Callable[[FakeNode], None], first: Ask
+) -> None:
+    node = await make_node("/hidden", OTHER_NODE)
+    kind(node)
+    assert (await first(node, proxy))[0] == 1
+    assert address_of(proxy, "/hidden") == OTHER_NODE
+    assert await proxy.serves(node)
+    assert problems(proxy) == {}
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
+    proxy: Proxy, make_node: MakeNode
+) -> None:
+    node = await make_node("/hidden", OTHER_NODE)
+    forged = "/t", "x/Y", node.uri
+    await call(proxy.master, "registerPublisher", "/evil", *forged, source=HIDDEN)
+    assert address_of(proxy, "/evil") == HIDDEN
+    by_caller = proxy.app.context.registry.by_caller
+    await until(lambda: by_caller["/evil"].never_found, "it is looked for there")
+    assert (await publish(node, proxy))[0] == 1
+    assert address_of(proxy, "/hidden") == OTHER_NODE
+    code, text, _ = await call(proxy.master, "registerPublisher", "/evil2", *forged, source=HIDDEN)
+    assert (code, "says that it is /hidden" in text) == (-1, True)
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+async def test_a_node_outside_is_left_to_itself(
+    proxy: Proxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    """Somebody inside registers it, as a bridge between masters does: no port leads there."""
+    far = await make_node("/far", OUTSIDE)
+    assert (await publish(far, proxy))[0] == 1
+    assert master.nodes["/far"] == far.uri
+    assert list(proxy.app.context.registry) == []
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+async def test_the_selection_counts_for_addresses_that_others_register_too(
+    proxy: Proxy, make_node: MakeNode
+) -> None:
+    await news(proxy, selected=[HIDDEN])
+    assert (await publish(await make_node("/other", OTHER_NODE), proxy))[0] == 1
+    assert list(proxy.app.context.registry) == []
+
+
+# Who gets a port
+
+
+def dead_uri(number: int, address: str = NODE) -> str:
+    """A URI at which nobody is."""
+    return f"http://{address}:{number + 1}/"
+
+
+async def test_the_dead_uris_of_one_source_do_not_take_every_port(
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    proxy = await make_proxy(cleanup_after=60, linger=60)
+    results = [
+        await rpc(
+            proxy.master, "registerPublisher", f"/d{i}", "/t", "x/Y", dead_uri(i), source=NODE
+        )
+        for i in range(8)
+    ]
+    assert [code for code, *_ in results] == [1, 1] + [-1] * 6
+    assert "does not answer" in results[-1][1]
+    # Those of the same source that live get as many as there are.
+    crowd = [await make_node(f"/n{i}") for i in range(6)]
+    assert [(await node.publish(proxy.master))[0] for node in crowd] == [1] * 6
+    # The range is used up: the next one gets the port of a dead one, which is unregistered.
+    late = await make_node("/late", OTHER_NODE)
+    assert (await late.publish(proxy.master))[0] == 1
+    assert await proxy.serves(late)
+    assert len({"/d0", "/d1"} & set(master.nodes)) == 1
+    assert {node.name for node in crowd} < set(master.nodes)
+
+
+async def test_several_sources_of_dead_uris_give_way_as_well(
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    proxy = await make_proxy(cleanup_after=60, linger=60)
+    sources = [f"127.0.2.{number}" for number in (21, 22, 23, 24)]
+    for number in range(8):
+        source = sources[number // 2]
+        params = f"/d{number}", "/t", "x/Y", dead_uri(number, source)
+        assert (await rpc(proxy.master, "registerPublisher", *params, source=source))[0] == 1
+    nodes = [await make_node(f"/n{i}") for i in range(8)]
+    await asyncio.gather(*(node.publish(proxy.master) for node in nodes))
+    assert set(master.nodes) == {node.name for node in nodes}
+    assert len({proxy.lease(node) for node in nodes}) == 8
+    ninth = await make_node("/ninth")
+    code, text, _ = await ninth.publish(proxy.master)
+    assert (code, "--port-range" in text) == (-1, True)
+
+
+async def claim(master: FakeMaster, name: str, port: int, inside: str, topic: str = "/t") -> None:
+    """Register at the master what a former proxy would have registered."""
+    uri = f"http://{HOST}:{port}/{inside}/"
+    await rpc(master.uri, "registerPublisher", name, topic, "x/Y", uri)
+    await rpc(master.uri, "registerService", name, f"{name}/s", f"rosrpc://{HOST}:{port}", uri)
+
+
+@pytest.fixture
+async def mute() -> AsyncIterator[list[FakeHttpServer]]:
+    """Eight programs that take connections and never say a word, as a lost container seems to."""
+
+    async def hang(_: FakeRequest) -> End:
+        return End.HANG
+
+    async with AsyncExitStack() as stack:
+        made = [FakeHttpServer(hang) for _ in range(8)]
+        for server in made:
+            await server.start(OTHER_NODE)
+            stack.push_async_callback(server.stop)
+        yield made
+
+
+@pytest.mark.parametrize("kind", ["refusing", "silent"])
+async def test_stale_claims_do_not_keep_a_port_from_a_node_that_lives(
+    make_proxy: MakeProxy,
+    make_node: MakeNode,
+    master: FakeMaster,
+    mute: list[FakeHttpServer],
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+) -> None:
+    """Eight registrations of dead nodes held eight ports; the next node got none, for ever."""
+    monkeypatch.setattr("rosproxy.ros1.upkeep.recovery.HASTE", 0.2)
+    former = await make_proxy()
+    await former.stop()
+    ports = former.settings.ports.listen
+    for i, (port, server) in enumerate(zip(ports.ports(), mute, strict=True)):
+        inside = i + 1 if kind == "refusing" else server.address[1]
+        await claim(master, f"/dead{i}", port, f"{OTHER_NODE}:{inside}")
+    proxy = await make_proxy(
+        port_range=str(ports), cleanup_after=60, probe_timeout=20, probe_interval=60
+    )
+    node = await make_node("/late")
+    assert await node.serve(proxy.master, "/late") == [
+        1,
+        "Registered [/late] as provider of [/late]",
+        1,
+    ]
+    assert await proxy.serves(node)
+    assert master.holds("services", "/late") == [f"rosrpc://{HOST}:{proxy.lease(node)[1]}"]
+    assert len(proxy.app.context.registry) == 8
+    assert len([name for name in master.nodes if name.startswith("/dead")]) == 7
+    assert len([name for name in master.tables["services"] if "/dead" in name]) == 7
+
+
+async def test_a_claim_of_a_node_that_lives_is_not_given_away(
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    former = await make_proxy()
+    nodes = [await make_node(f"/n{i}") for i in range(8)]
+    for node in nodes:
+        await node.publish(former.master)
+    uris = dict(master.nodes)
+    await former.stop()
+    nodes[0].delay = 0.1  # it takes its time
+    proxy = await make_proxy(port_range=str(former.settings.ports.listen))
+    late = await make_node("/late")
+    assert (await late.publish(proxy.master))[0] == -1
+    assert master.nodes == uris
+    await until(lambda: proxy.serves(nodes[0]), "the slow one is served")
+    await nodes[5].stop()
+    await until(lambda: proxy.endpoint(nodes[5]).is_down, "one is found dead")
+    assert (await late.publish(proxy.master))[0] == 1
+    assert set(master.nodes) == {"/late", *uris} - {"/n5"}
+
+
+async def test_what_former_proxies_left_is_cleaned_from_the_master(
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    """Also that for which the successor has no port, which nothing probes."""
+    former = await make_proxy()
+    node = await make_node()
+    await node.publish(former.master)
+    port, uri = former.endpoint(node).port, former.uri(node)
+    await former.stop()
+    await claim(master, "/same_port", port, f"{OTHER_NODE}:1")
+    await claim(master, "/other_network", port + 1, "10.99.0.5:40001")
+    await claim(master, "/foreign", port + 100, f"{OTHER_NODE}:2")  # no port of this proxy
+    proxy = await make_proxy(
+        port_range=str(former.settings.ports.listen), cleanup_after=0.2, linger=60
+    )
+    await until(lambda: set(master.nodes) == {node.name, "/foreign"}, "the rest is taken back")
+    assert set(master.tables["services"]) == {"/foreign/s"}
+    assert proxy.uri(node) == uri
+    assert await proxy.serves(node)
+
+
+async def test_what_an_operator_selects_is_recovered_wherever_it_lies(
+    make_proxy: MakeProxy, make_node: MakeNode, master: FakeMaster
+) -> None:
+    """Some clusters give pods addresses that are in none of the networks known at the start."""
+    former = await make_proxy()
+    node = await make_node()
+    await node.publish(former.master)
+    uri = former.uri(node)
+    await former.stop()
+    proxy = await make_proxy(
+        port_range=str(former.settings.ports.listen),
+        inside_network=("127.0.2.12/32",),
+        cleanup_after=1.0,
+    )
+    await until(lambda: proxy.app.status()["master"]["up"], "the master is found")
+    assert list(proxy.app.context.registry) == []
+    await news(proxy, selected=[NODE])
+    await until(lambda: len(proxy.app.context.registry), "the node is found")
+    await until(lambda: proxy.serves(node), "the node is served")
+    assert proxy.uri(node) == uri == master.nodes[node.name]
+
+
+async def test_what_is_left_stays_where_nothing_is_cleaned_up(
+    make_proxy: MakeProxy, master: FakeMaster
+) -> None:
+    former = await make_proxy()
+    await former.stop()
+    ports = former.settings.ports.listen
+    await claim(master, "/other_network", ports.first, "10.99.0.5:40001")
+    proxy = await make_proxy(port_range=str(ports), cleanup_after=0, master_interval=0.05)
+    await until(lambda: proxy.app.status()["master"]["up"], "the master is found")
+    await asyncio.sleep(0.1)
+    assert "/other_network" in master.nodes
+
+
+async def test_a_hundred_uris_of_one_node_are_not_all_remembered(
+    proxy: Proxy, node: FakeNode
+) -> None:
+    port = where(node.uri)[1]
+    for number in range(40):
+        uri = f"http://name{number}.invalid:{port}/"
+        await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
+    assert len(proxy.endpoint(node).admissions) <= 16
+    assert not await refuses((PROXY, proxy.endpoint(node).port))
