@@ -17,6 +17,7 @@ from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, r
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.protocol.xmlrpc.multicall import (
     MULTICALL,
     inner_calls,
@@ -146,7 +147,7 @@ class MasterReply(msgspec.Struct, frozen=True):
 
 def read_request(body: bytes, asker: Asker) -> Request:
     """Parse a request. Raises XmlRpcError if it is none."""
-    call = xmlrpc.parse_call(body)
+    call = xmlrpc.parse_call(body, MASTER_CALL)
     if call.method != MULTICALL:
         return Request(body, (call,), False, replace(asker, caller_id=_caller_id(call)))
     calls = tuple(inner_calls(call))

@@ -15,6 +15,9 @@ from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
 """What the master calls at nodes; a policy can refuse it from anybody else."""
 
+LONG = frozenset({"paramUpdate"})
+"""What may be long and holds no address. All else that outside calls is short."""
+
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 

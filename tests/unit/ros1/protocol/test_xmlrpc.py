@@ -3,8 +3,8 @@
 import pytest
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc import values
 from rosproxy.ros1.protocol.xmlrpc.document import Edit, XmlRpcError
+from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from tests.unit.builders import DIALECTS, cpp_call, py_call, py_reply, python_values, raw_call
 
 URI = "http://10.0.0.5:40001/"
@@ -254,13 +254,31 @@ def test_only_the_name_in_a_member_is_a_member_s() -> None:
     assert xmlrpc.parse_call(body).params[0].members == ["a"]
 
 
-def test_the_number_of_elements_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    body = raw_call("<value>x</value>", "<value>x</value>")  # two of param and value, and three
-    monkeypatch.setattr(values, "MAX_ELEMENTS", 7)
-    assert xmlrpc.parse_call(body).params
-    monkeypatch.setattr(values, "MAX_ELEMENTS", 6)
+@pytest.mark.parametrize("odd", ["", "<!-- -->"])
+def test_the_number_of_elements_is_bounded(odd: str) -> None:
+    body = raw_call(f"<value>{odd}x</value>", "<value/>")  # two of param and value, and three
+    assert xmlrpc.parse_call(body, Limits(1000, 7)).params
     with pytest.raises(XmlRpcError, match="more than 6 elements"):
+        xmlrpc.parse_call(body, Limits(1000, 6))
+
+
+@pytest.mark.parametrize("odd", ["", "<!-- -->"])
+def test_the_size_is_bounded(odd: str) -> None:
+    body = raw_call(f"<value>{odd}x</value>")
+    assert xmlrpc.parse_call(body, Limits(len(body), 10)).params
+    with pytest.raises(XmlRpcError, match=f"longer than {len(body) - 1} bytes"):
+        xmlrpc.parse_call(body, Limits(len(body) - 1, 10))
+
+
+@pytest.mark.parametrize("name", ["methodName", "value", "string", "array", "struct", "name"])
+def test_what_python_would_read_in_spite_of_a_prefix_is_refused(name: str) -> None:
+    body = raw_call(f"<value>a</value><x:{name}>b</x:{name}>")
+    with pytest.raises(XmlRpcError, match="has no prefix"):
         xmlrpc.parse_call(body)
+
+
+def test_extension_types_have_a_prefix() -> None:
+    assert xmlrpc.parse_call(raw_call("<value><ex:i8>5</ex:i8></value>")).params[0].kind == "other"
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import fast
-from rosproxy.ros1.protocol.xmlrpc import values as bounds
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Value, XmlRpcError
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
 from tests.unit.builders import cpp_call, cpp_reply, py_call, py_reply
 
 TEXT = st.text(st.characters(min_codepoint=0x20, max_codepoint=0x7E, exclude_characters="&<>"))
@@ -31,19 +31,19 @@ SOUP = st.lists(
 ).map("".join)
 
 
-def by_expat(body: bytes) -> tuple[str, Any]:
+def by_expat(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, Any]:
     """What expat makes of a document, and whether it accepts it at all."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fast, "call", lambda *_: None)
         patch.setattr(fast, "response", lambda *_: None)
-        return read(body)
+        return read(body, limits)
 
 
-def read(body: bytes) -> tuple[str, Any]:
+def read(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, Any]:
     try:
         if b"methodCall" in body:
-            return "call", xmlrpc.parse_call(body)
-        return "reply", xmlrpc.parse_response(body)
+            return "call", xmlrpc.parse_call(body, limits)
+        return "reply", xmlrpc.parse_response(body, limits)
     except XmlRpcError as error:
         return "refused", error.code
 
@@ -97,21 +97,20 @@ def test_soup_between_sound_tags_is_read_as_by_expat(soup: str, root: str) -> No
 
 
 @pytest.mark.parametrize("depth", range(1, 16))
-def test_depth_is_bounded_as_by_expat(depth: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounds, "MAX_DEPTH", depth)
-    body = py_call("x", [["deep"]])
-    assert read(body) == by_expat(body)
-    assert (read(body)[0] == "refused") is (depth < 11)
+def test_depth_is_bounded_as_by_expat(depth: int) -> None:
+    body, limits = py_call("x", [["deep"]]), Limits(1000, 100, depth)
+    assert read(body, limits) == by_expat(body, limits)
+    assert (read(body, limits)[0] == "refused") is (depth < 11)
 
 
-def test_elements_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_elements_are_bounded() -> None:
     body = py_call("x", ["y"] * 100)
-    monkeypatch.setattr(bounds, "MAX_ELEMENTS", body.count(b"</"))
-    assert fast.call(body) is not None
-    monkeypatch.setattr(bounds, "MAX_ELEMENTS", body.count(b"</") - 1)
-    assert fast.call(body) is None
-    with pytest.raises(XmlRpcError, match="more than"):
-        xmlrpc.parse_call(body)
+    count = body.count(b"</")
+    assert fast.call(body, Limits(len(body), count)) is not None
+    for limits in (Limits(len(body), count - 1), Limits(len(body) - 1, count)):
+        assert fast.call(body, limits) is None
+        with pytest.raises(XmlRpcError, match="than"):
+            xmlrpc.parse_call(body, limits)
 
 
 @pytest.mark.parametrize("text", ["&lt;", "é", "\x00"])

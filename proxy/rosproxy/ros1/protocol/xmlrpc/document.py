@@ -18,6 +18,7 @@ from xmlrpc.client import Fault, dumps
 import msgspec
 
 from rosproxy.ros1.protocol.xmlrpc import fast, values
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, SCALARS, text_of
 
 Value = values.Value
@@ -32,6 +33,10 @@ SYSTEM_ERROR = -32400
 
 _TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _ENCODINGS = frozenset({"utf-8", "us-ascii", "ascii", "iso-8859-1"})
+_MEANING = frozenset(
+    {"methodName", "params", "fault", "value", "string", "array", "struct", "member", "name"}
+)
+"""Elements that Python's Unmarshaller takes for themselves with any prefix, as ``<x:value>``."""
 
 
 class XmlRpcError(ValueError):
@@ -102,17 +107,17 @@ def apply(body: bytes, edits: Iterable[Edit]) -> bytes:
     return b"".join([*parts, body[position:]])
 
 
-def parse_call(body: bytes) -> Call:
+def parse_call(body: bytes, limits: Limits = OWN_REPLY) -> Call:
     """Parse a ``methodCall``.
 
     Raises XmlRpcError if the document is malformed, holds a DTD or entities, is too large or deep
     or is not a method call. Of what looks like several method names XmlRpc++ takes the first, even
     in a comment, and Python the last element: such a document is refused.
     """
-    plain = fast.call(body)
+    plain = fast.call(body, limits)
     if plain is not None:
         return Call(*plain)
-    parser = _Parser(body)
+    parser = _Parser(body, limits)
     if parser.root != "methodCall" or not parser.method:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC call: no methodCall with a methodName")
     if body.count(b"<methodName") != 1:
@@ -120,24 +125,24 @@ def parse_call(body: bytes) -> Call:
     return Call(parser.method, parser.values)
 
 
-def parse_reply(body: bytes) -> Value | None:
+def parse_reply(body: bytes, limits: Limits = REPLY) -> Value | None:
     """Parse a ``methodResponse``; None if it is a fault.
 
     Raises XmlRpcError if the document is malformed, too large or deep, or is not a response.
     """
-    value, fault = parse_response(body)
+    value, fault = parse_response(body, limits)
     return None if fault else value
 
 
-def parse_response(body: bytes) -> tuple[Value, bool]:
+def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool]:
     """Parse a ``methodResponse``: its value, and whether that is a fault.
 
     Raises XmlRpcError as ``parse_reply`` does.
     """
-    plain = fast.response(body)
+    plain = fast.response(body, limits)
     if plain is not None:
         return plain, False
-    parser = _Parser(body)
+    parser = _Parser(body, limits)
     if parser.root != "methodResponse" or len(parser.values) != 1:
         raise XmlRpcError(INVALID_REQUEST, "not an XML-RPC response")
     return parser.values[0], parser.fault
@@ -179,8 +184,8 @@ def python_value(value: Value) -> Any:
 class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
-    def __init__(self, body: bytes) -> None:
-        self.body = body
+    def __init__(self, body: bytes, limits: Limits) -> None:
+        self.body, self._limits = body, limits
         self.root, self.method, self.fault = "", "", False
         self.values: list[Value] = []
         self._encoding = "utf-8"
@@ -188,6 +193,10 @@ class _Parser:
         self._open: list[Value] = []
         self._count = 0
         self._inner = 0
+        if len(body) > limits.size:
+            raise XmlRpcError(PARSE_ERROR, f"longer than {limits.size} bytes")
+        if body.count(b"</") + body.count(b"/>") > limits.elements:  # before any takes memory
+            raise XmlRpcError(PARSE_ERROR, f"more than {limits.elements} elements")
         if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "neither UTF-8 nor another encoding without NUL bytes")
         self._expat = parser = expat.ParserCreate()
@@ -213,10 +222,7 @@ class _Parser:
         self._path.append(name)
         self._count += 1
         self.root = self.root or name
-        if len(self._path) > values.MAX_DEPTH:
-            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {values.MAX_DEPTH} elements")
-        if self._count > values.MAX_ELEMENTS:
-            raise XmlRpcError(PARSE_ERROR, f"more than {values.MAX_ELEMENTS} elements")
+        self._check(name)
         if name == "value":
             self._start_value()
         elif name in KINDS:
@@ -227,6 +233,15 @@ class _Parser:
             self.fault = True
         elif self._path[-2:-1] == ["value"]:
             self._open[-1].kind = "other"
+
+    def _check(self, name: str) -> None:
+        """Refuse an element that begins, if it is one too many or could be read in two ways."""
+        if len(self._path) > self._limits.depth:
+            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {self._limits.depth} elements")
+        if self._count > self._limits.elements:
+            raise XmlRpcError(PARSE_ERROR, f"more than {self._limits.elements} elements")
+        if ":" in name and name.rpartition(":")[2] in _MEANING:
+            raise XmlRpcError(INVALID_REQUEST, "an element of XML-RPC has no prefix")
 
     def _end(self, name: str) -> None:
         self._path.pop()

@@ -9,7 +9,7 @@ as long and decides what is an error.
 import re
 from collections.abc import Iterator
 
-from rosproxy.ros1.protocol.xmlrpc import values
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
 
 _PLAIN = bytes({*b"\t\n\r", *range(0x20, 0x7F)} - {*b"&"})
@@ -49,39 +49,40 @@ class _NotPlain(Exception):
     """A document of another form, or of none."""
 
 
-def call(body: bytes) -> tuple[str, list[Value]] | None:
+def call(body: bytes, limits: Limits = OWN_REPLY) -> tuple[str, list[Value]] | None:
     """The method and parameters of a ``methodCall``, None if it is not of the plain form."""
     head = _CALL.match(body)
-    if head is None or not _is_plain(body):
+    if head is None or not _is_plain(body, limits):
         return None
-    params = _params(body, head.end(), _CALL_END)
+    params = _params(body, head.end(), _CALL_END, limits.depth)
     return None if params is None else (head[1].decode(), params)
 
 
-def response(body: bytes) -> Value | None:
+def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
     """The value of a ``methodResponse``, None if it is a fault or not of the plain form."""
     head = _RESPONSE.match(body)
-    if head is None or not _is_plain(body):
+    if head is None or not _is_plain(body, limits):
         return None
-    params = _params(body, head.end(), _RESPONSE_END)
+    params = _params(body, head.end(), _RESPONSE_END, limits.depth)
     return params[0] if params is not None and len(params) == 1 else None
 
 
-def _is_plain(body: bytes) -> bool:
+def _is_plain(body: bytes, limits: Limits) -> bool:
     return (
-        not body.translate(None, _PLAIN)
+        len(body) <= limits.size
+        and not body.translate(None, _PLAIN)
         and b"]]>" not in body
-        and body.count(b"</") <= values.MAX_ELEMENTS  # each is closed by a tag of its own
+        and body.count(b"</") <= limits.elements  # each is closed by a tag of its own
     )
 
 
-def _params(body: bytes, start: int, end: re.Pattern[bytes]) -> list[Value] | None:
+def _params(body: bytes, start: int, end: re.Pattern[bytes], depth: int) -> list[Value] | None:
     tokens, params, place = _TOKEN.finditer(body, start), list[Value](), start
     try:
         for token in tokens:
             if token.lastindex != _PARAM:
                 break
-            params.append(_value(body, next(tokens), tokens, values.MAX_DEPTH - 3))
+            params.append(_value(body, next(tokens), tokens, depth - 3))
             last = next(tokens)
             if last.lastindex != _PARAM_END:
                 return None

@@ -16,8 +16,13 @@ from rosproxy.ros1.protocol.xmlrpc.document import (
     dump_value,
     parse_response,
 )
+from rosproxy.ros1.protocol.xmlrpc.limits import REPLY
 
 MULTICALL = "system.multicall"
+MOST_CALLS = 1000
+"""Calls that one multicall may have. They are admitted, or put to a node, one after the other. Only
+roslaunch and the proxy itself (a hundred at once) make such calls; roslaunch's set parameters and
+are counted from 64 KiB on no more (`passing`)."""
 
 
 def inner_items(call: Call) -> list[Value]:
@@ -30,10 +35,13 @@ def inner_items(call: Call) -> list[Value]:
 def inner_calls(call: Call) -> list[Call | None]:
     """The calls of a multicall, in order; None for an element that is no call.
 
-    Raises XmlRpcError if one of them is a multicall again: rosmaster would carry it out, and
-    XmlRpc++ does so without end.
+    Raises XmlRpcError if there are too many, or if one of them is a multicall again: rosmaster
+    would carry it out, and XmlRpc++ does so without end.
     """
-    return [_inner_call(item) for item in inner_items(call)]
+    items = inner_items(call)
+    if len(items) > MOST_CALLS:
+        raise XmlRpcError(INVALID_PARAMS, f"{len(items)} calls in one; at most {MOST_CALLS}")
+    return [_inner_call(item) for item in items]
 
 
 def single_call(call: Call) -> bytes:
@@ -48,7 +56,7 @@ def result_value(reply: bytes) -> bytes:
 
     Raises XmlRpcError if it is no XML-RPC response.
     """
-    value, fault = parse_response(reply)
+    value, fault = parse_response(reply, REPLY)
     return value.raw if fault else _array([value.raw])
 
 
@@ -77,6 +85,8 @@ def insert_items(array: Value, inserts: Sequence[tuple[int, bytes]]) -> list[Edi
 
 
 def _inner_call(item: Value) -> Call | None:
+    if len(set(item.members)) < len(item.members):  # Python takes the last of a name
+        raise XmlRpcError(INVALID_PARAMS, f"a call of {MULTICALL} has a member twice")
     method, params = item.member("methodName"), item.member("params")
     name = method.string() if method else None
     if name == MULTICALL:

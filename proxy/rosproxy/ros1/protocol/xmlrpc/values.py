@@ -4,11 +4,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 from xml.parsers import expat
 
-MAX_DEPTH = 64
-"""How deep the elements of a document may be nested."""
-MAX_ELEMENTS = 500_000
-"""How many it may have. They take some 3 µs each, in which nothing else is served."""
-
 Kind = Literal["string", "int", "array", "struct", "other"]
 KINDS: dict[str, Kind] = {
     "array": "array",

@@ -1,0 +1,169 @@
+"""Calls that pass unread, because they are long and hold no address: parameters, above all.
+
+The method is read from the head of the document, in the form that ROS's clients write; a document
+with another head is read whole, within the bounds of `limits`. The rest is only watched while it
+passes: the master, or a node, must not see another method than was judged. Whoever takes the pieces
+further holds the last one back until all were watched, so that nobody acts on a refused document:
+rosmaster and nodes read a body to its end before they look into it.
+
+A ``system.multicall``, by which roslaunch sets parameters, is taken apart by expat, piece by piece:
+it passes if each of its calls does. Its grammar is held to the letter, as Python's Unmarshaller
+(xmlrpc/client.py), which keeps a stack and knows no grammar, could see another one.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from xml.parsers import expat
+
+from rosproxy.ros1.protocol.xmlrpc.document import (
+    INVALID_REQUEST,
+    PARSE_ERROR,
+    XmlRpcError,
+)
+from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
+
+SHORT = 64 * 1024
+"""Bytes up to which a document is read whole, whatever it is: that takes some milliseconds."""
+HEAD = 4096
+"""Bytes of a document in which its method is looked for."""
+DEPTH = 64
+
+_HEAD = re.compile(
+    rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")
+    (?:\s+encoding=(["'])(?i:utf-8|us-ascii|ascii|iso-8859-1)\1)?\s*\?>)?
+    \s*<methodCall>\s*<methodName>([\w./]{1,200})</methodName>""",
+    re.VERBOSE,
+)
+_FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
+_HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
+"""One of them is in all that is forbidden; to look for them first takes a hundredth of the time."""
+_NESTING = re.compile(rb"<(/?)(?:array|struct)>")
+_LONGEST = len(b"<methodName>")
+"""Bytes of the longest thing that is looked for."""
+NESTED = 20
+"""Arrays and structs inside of each other: XmlRpc++ takes a piece of its stack for each."""
+
+_LEVELS = (
+    {"methodCall"},
+    {"methodName", "params"},
+    *({name} for name in ("param", "value", "array", "data", "value", "struct", "member")),
+    {"name", "value"},
+    {"string", "array"},
+)
+"""The elements of a multicall, from the root down to what a call's members hold."""
+_CALL, _MEMBER, _PART, _HELD = 8, 9, 10, 11
+"""How deep a call's struct lies, its members, their names and values, and what the values hold."""
+_METHOD, _PARAMS = ["name:methodName", "value"], ["name:params", "value", "array"]
+
+
+def method_of(head: bytes) -> str | None:
+    """The method of a call whose document begins so; None if that can't be told from its head."""
+    found = _HEAD.match(head, 0, HEAD)
+    return found[2].decode() if found else None
+
+
+class Watch:
+    """Sees a document go by, from its head on."""
+
+    def __init__(self) -> None:
+        self._seen: bytes | None = None
+        self._nested = 0
+
+    def see(self, piece: bytes) -> None:
+        """Look at the next piece; the first one holds the method. Raises XmlRpcError."""
+        if self._seen is None:
+            head = _HEAD.match(piece)
+            piece = piece[head.end() :] if head else piece
+        text = (self._seen or b"") + piece
+        found = _FORBIDDEN.search(text) if any(hint in text for hint in _HINTS) else None
+        if found:
+            what = found[0].decode("latin-1").strip("\0<:/> \t\r\n") or "a NUL byte"
+            raise XmlRpcError(INVALID_REQUEST, f"{what} inside of a long call")
+        for tag in _NESTING.finditer(text):
+            if tag.end() <= len(self._seen or b""):  # seen with the piece before
+                continue
+            self._nested = max(self._nested - 1, 0) if tag[1] else self._nested + 1
+            if self._nested > NESTED:
+                raise XmlRpcError(PARSE_ERROR, f"more than {NESTED} arrays in each other")
+        self._seen = text[1 - _LONGEST :]
+
+    def end(self) -> None:
+        """All of it was seen. Raises XmlRpcError if it should not have ended."""
+
+
+class MulticallWatch(Watch):
+    """Sees a multicall go by; ``may_pass`` says of each method whether it passes unread."""
+
+    def __init__(self, may_pass: Callable[[str], bool]) -> None:
+        super().__init__()
+        self._may_pass = may_pass
+        self._depth = 0
+        self._text = ""
+        self._parts: list[str] = []
+        self._members: list[str] = []
+        self._parser = parser = expat.ParserCreate()
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+
+    def see(self, piece: bytes) -> None:
+        """Look at the next piece; the first one holds the method. Raises XmlRpcError."""
+        super().see(piece)
+        self._parse(piece)
+
+    def end(self) -> None:
+        """All of it was seen. Raises XmlRpcError if it should not have ended."""
+        self._parse(b"", last=True)
+
+    def _parse(self, piece: bytes, last: bool = False) -> None:
+        try:
+            self._parser.Parse(piece, last)
+        except expat.ExpatError as error:
+            raise XmlRpcError(PARSE_ERROR, f"not well-formed XML: {error}") from None
+
+    def _start(self, name: str, attributes: object) -> None:
+        self._depth += 1
+        if self._depth > DEPTH:
+            raise XmlRpcError(PARSE_ERROR, f"nested deeper than {DEPTH} elements")
+        if self._depth > _HELD:
+            return
+        if name not in _LEVELS[self._depth - 1]:
+            raise XmlRpcError(INVALID_REQUEST, f"<{name[:40]}> in a long {MULTICALL}")
+        if self._depth == _CALL:
+            self._members = []
+        elif self._depth == _MEMBER:
+            self._parts = []
+        elif self._depth >= _PART:
+            self._parts.append(name)
+            self._text = ""
+            self._parser.CharacterDataHandler = None if name == "array" else self._add
+
+    def _end(self, name: str) -> None:
+        if self._depth == _PART and name == "name":
+            self._parts[-1] += f":{self._text}"
+        elif self._depth == _MEMBER:
+            self._end_member()
+        elif self._depth == _CALL and sorted(self._members) != ["methodName", "params"]:
+            raise XmlRpcError(INVALID_REQUEST, f"a call of {MULTICALL} needs a method and params")
+        if self._depth in (_PART, _HELD):
+            self._parser.CharacterDataHandler = None
+        self._depth -= 1
+
+    def _end_member(self) -> None:
+        if self._parts == _PARAMS:
+            self._members.append("params")
+        elif self._parts in (_METHOD, [*_METHOD, "string"]):
+            self._members.append("methodName")
+            if self._text == MULTICALL or not self._may_pass(self._text):
+                raise XmlRpcError(INVALID_REQUEST, f"{self._text} in a long {MULTICALL}")
+        else:
+            raise XmlRpcError(INVALID_REQUEST, f"an odd member of a call in a long {MULTICALL}")
+
+    def _add(self, text: str) -> None:
+        self._text += text
+        if len(self._text) > HEAD:
+            raise XmlRpcError(INVALID_REQUEST, f"a name of more than {HEAD} characters")
+
+
+def cut(body: bytes) -> Iterator[bytes]:
+    """A body in pieces that are each watched in some milliseconds."""
+    return (body[start : start + SHORT] for start in range(0, len(body), SHORT))
