@@ -16,6 +16,7 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
 
+MEBIBYTE = 1024 * 1024
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
@@ -67,6 +68,10 @@ class Settings:
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
     admin_token_hash: str | None = None
+    max_body: int = 64
+    max_buffered: int = 32
+    max_connections_per_source: int = 4096
+    max_connections_per_lease: int = 2048
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:

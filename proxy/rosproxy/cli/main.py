@@ -116,6 +116,30 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     default="auto",
     help="How topics' bytes are forwarded: by the kernel, where the proxy may; spliced; or copied.",
 )
+@click.option(
+    "--max-body",
+    type=options.MEBIBYTES,
+    default=64,
+    help="Longest parameter, or other call or reply without addresses, that passes.",
+)
+@click.option(
+    "--max-buffered",
+    type=options.MEBIBYTES,
+    default=32,
+    help="Memory for all calls and replies that are read; one source gets half.",
+)
+@click.option(
+    "--max-connections-per-source",
+    type=options.CONNECTIONS,
+    default=4096,
+    help="Connections from one address.",
+)
+@click.option(
+    "--max-connections-per-lease",
+    type=options.CONNECTIONS,
+    default=2048,
+    help="Connections to one port of the range.",
+)
 @options.log_options
 @click.option("--check", is_flag=True, help="Validate the options and exit.")
 def run(check: bool, log_format: str, log_level: str, **values: Any) -> None:

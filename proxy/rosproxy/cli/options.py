@@ -55,6 +55,10 @@ class Seconds(click.FloatRange):
 
 PORT = click.IntRange(1, 65535)
 PORT.name = "port"
+MEBIBYTES = click.IntRange(1, 65536)
+MEBIBYTES.name = "MiB"
+CONNECTIONS = click.IntRange(16, 1_000_000)
+CONNECTIONS.name = "n"
 PORT_RANGE = Parsed("A-B", settings.read_range)
 HOST = Parsed("host", settings.read_host)
 ADDRESS = Parsed("address", settings.read_address)

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 
 from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.net.gate import Gate
 from rosproxy.net.tasks import Tasks
 
 log = logging.getLogger(__name__)
@@ -22,6 +23,8 @@ BACKLOG = 256
 ACCEPTS_PER_TURN = 64
 CONNECT_TIMEOUT = 5.0
 """Seconds that a peer has to accept a connection."""
+WRITE_TIMEOUT = 30.0
+"""Seconds in which a reader has to take something of what is waiting for it."""
 SILENCE_TIMEOUT = 30.0
 """Seconds in which a client has to send what is waited for before its connection is closed."""
 
@@ -57,11 +60,15 @@ def listen(address: str, port: int) -> socket.socket:
 class Acceptor:
     """Accepts on a listening socket until it is closed; each connection has a task of its own.
 
-    The handler takes it over; an exception that ends the handler closes it.
+    The handler takes it over; an exception that ends the handler closes it. With a ``gate``, one
+    too many is reset, and each is counted until the handler has ended.
     """
 
-    def __init__(self, tasks: Tasks, sock: socket.socket, handler: Handler) -> None:
-        self._tasks, self._sock, self._handler = tasks, sock, handler
+    def __init__(
+        self, tasks: Tasks, sock: socket.socket, handler: Handler, gate: Gate | None = None
+    ) -> None:
+        self._tasks, self._sock, self._handler, self._gate = tasks, sock, handler, gate
+        self._port = sock.getsockname()[1]
         self._loop = asyncio.get_running_loop()
         self._pause: asyncio.TimerHandle | None = None
         self._listen()
@@ -82,8 +89,15 @@ class Acceptor:
                 conn, peer = self._sock.accept()
                 conn.setblocking(False)
                 source = plain_address(peer[0])
+                if self._gate is not None and not self._gate.admits(source, self._port):
+                    reset_on_close(conn)
+                    conn.close()
+                    continue
                 task = self._tasks.spawn(self._serve(conn, source), f"connection from {source}")
                 task.add_done_callback(partial(_close_if_cancelled, conn))
+                if self._gate is not None:
+                    self._gate.enter(source, self._port)
+                    task.add_done_callback(partial(_leave, self._gate, source, self._port))
         except BlockingIOError:
             return
         except OSError as error:
@@ -109,6 +123,10 @@ def _close_if_cancelled(conn: socket.socket, task: asyncio.Task[None]) -> None:
     """A task that is cancelled before it has begun never gets to close its connection."""
     if task.cancelled():
         conn.close()
+
+
+def _leave(gate: Gate, source: str, port: int, _: asyncio.Task[None]) -> None:
+    gate.leave(source, port)
 
 
 async def dial(where: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
@@ -155,6 +173,22 @@ def reset_on_close(sock: socket.socket) -> None:
     """Make closing a socket send a reset instead of an orderly end."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_RESET)
+
+
+def hang_up(sock: socket.socket) -> None:
+    """End a connection that somebody waits for: it then reads as ended."""
+    with contextlib.suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)
+
+
+def end_if_stalled(sock: socket.socket, after: float = WRITE_TIMEOUT) -> None:
+    """Have the kernel end a connection whose peer takes nothing of what it is sent, for so long.
+
+    One that reads slowly is left alone (tcp(7), TCP_USER_TIMEOUT). After the event loop has
+    written a reply nobody else sees that it never leaves.
+    """
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(after * 1000))
 
 
 async def _readable(conn: socket.socket) -> None:

@@ -1,0 +1,66 @@
+"""How much may be held at once, and how much of that by one source.
+
+Pure bookkeeping, in bytes or in numbers of things. Whoever wants to hold something takes it from a
+budget first and gives it back in the end; what is over budget is refused at once, since whoever
+waits holds something as well. No source gets more than its share, so that none shuts out the rest.
+"""
+
+from collections import Counter
+from types import TracebackType
+
+
+class OverBudget(Exception):
+    """A refusal: what is too much, in words."""
+
+
+class Budget:
+    """At most ``most`` at once, of which a source has at most ``share``; ``what`` names it."""
+
+    def __init__(self, most: int, share: int, what: str) -> None:
+        self._most, self._share, self._what = most, share, what
+        self._held: Counter[str] = Counter()
+        self.used = 0
+
+    def take(self, source: str, size: int) -> None:
+        """Take so much for a source. Raises OverBudget, and takes nothing."""
+        if self.used + size > self._most:
+            raise OverBudget(f"more than {self._most} {self._what} at once; try again")
+        if self._held[source] + size > self._share:
+            raise OverBudget(f"more than {self._share} {self._what} at once from {source}")
+        self.used += size
+        self._held[source] += size
+
+    def give(self, source: str, size: int) -> None:
+        """Give back what was taken."""
+        self.used -= size
+        self._held[source] -= size
+        if not self._held[source]:
+            del self._held[source]
+
+
+class Charge:
+    """What one piece of work holds of a budget; all of it is given back when the context ends."""
+
+    __slots__ = ("_budget", "_source", "held")
+
+    def __init__(self, budget: Budget, source: str) -> None:
+        self._budget, self._source, self.held = budget, source, 0
+
+    def add(self, size: int) -> None:
+        """Hold more. Raises OverBudget."""
+        self._budget.take(self._source, size)
+        self.held += size
+
+    def __enter__(self) -> "Charge":
+        """Begin to hold something."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Give all of it back."""
+        self._budget.give(self._source, self.held)
+        self.held = 0

@@ -1,0 +1,42 @@
+"""What the proxy has refused because it was over a bound: counted, logged, and shown in the status.
+
+A metric counts every refusal by its reason, a word of those in docs/reference/limits.md. The log
+gets one line for each reason and source, then none for a while; `rosproxy status` shows the last
+one of each reason.
+"""
+
+import logging
+from collections.abc import Callable
+
+from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.problems import Problems
+
+log = logging.getLogger(__name__)
+
+QUIET = 60.0
+"""Seconds in which a source is not logged again for the same reason."""
+MOST = 1000
+"""Sources and reasons that are remembered for that."""
+
+
+class Refusals:
+    """Tells of refusals; ``now`` is the monotonic clock."""
+
+    def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
+        self._metrics, self._problems, self._now = metrics, problems, now
+        self._told: dict[tuple[str, str], float] = {}
+
+    def note(self, reason: str, source: str, text: str) -> None:
+        """Tell that something from a source was refused, and why."""
+        self._metrics.refused.labels(reason).inc()
+        now, key = self._now(), (reason, source)
+        if now - self._told.get(key, -QUIET) < QUIET:
+            return
+        self._told.pop(key, None)
+        if len(self._told) >= MOST:
+            del self._told[next(iter(self._told))]
+        self._told[key] = now
+        subject = f"refused: {reason.replace('_', ' ')}"
+        log.warning("%s, from %s: %s", subject, source, text)
+        self._problems.solved(subject)
+        self._problems.add(subject, f"from {source}: {text}")

@@ -1,0 +1,44 @@
+"""What may be held at once, in all and by one source."""
+
+import contextlib
+
+import pytest
+
+from rosproxy.net.budget import Budget, Charge, OverBudget
+
+
+def test_a_source_has_a_share_and_leaves_the_rest_to_others() -> None:
+    budget = Budget(100, 50, "bytes")
+    budget.take("a", 50)
+    with pytest.raises(OverBudget, match="more than 50 bytes at once from a"):
+        budget.take("a", 1)
+    budget.take("b", 50)
+    with pytest.raises(OverBudget, match="more than 100 bytes at once; try again"):
+        budget.take("c", 1)
+    budget.give("a", 1)
+    budget.take("c", 1)
+    assert budget.used == 100
+
+
+def test_a_charge_is_given_back_whatever_happens() -> None:
+    budget = Budget(100, 50, "bytes")
+    with Charge(budget, "a") as charge:
+        charge.add(20)
+        charge.add(30)
+        assert budget.used == charge.held == 50
+        with pytest.raises(OverBudget):
+            charge.add(1)
+        assert budget.used == 50
+    assert budget.used == 0
+    with contextlib.suppress(LookupError), Charge(budget, "a") as charge:
+        charge.add(50)
+        raise LookupError
+    assert budget.used == 0
+
+
+def test_nothing_is_kept_of_a_source_that_holds_nothing() -> None:
+    budget = Budget(100, 50, "bytes")
+    for number in range(1000):
+        with Charge(budget, f"source {number}") as charge:
+            charge.add(1)
+    assert not budget._held

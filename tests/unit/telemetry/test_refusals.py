@@ -1,0 +1,35 @@
+"""What was refused is counted each time, and told once in a while."""
+
+import pytest
+
+from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.refusals import MOST, QUIET, Refusals
+
+
+def test_each_refusal_counts_and_the_first_of_a_source_is_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    metrics, problems, clock = Metrics(), Problems(), [0.0]
+    refusals = Refusals(metrics, problems, lambda: clock[0])
+    for _ in range(5):
+        refusals.note("long_body", "10.0.0.5", "a body of more than 5 bytes")
+    refusals.note("long_body", "10.0.0.6", "another")
+    assert [record.message for record in caplog.records] == [
+        "refused: long body, from 10.0.0.5: a body of more than 5 bytes",
+        "refused: long body, from 10.0.0.6: another",
+    ]
+    clock[0] = QUIET
+    refusals.note("long_body", "10.0.0.5", "again")
+    assert len(caplog.records) == 3
+    value = metrics.registry.get_sample_value("rosproxy_refused_total", {"reason": "long_body"})
+    assert value == 7
+    (problem,) = problems.all()
+    assert (problem.subject, problem.text) == ("refused: long body", "from 10.0.0.5: again")
+
+
+def test_many_sources_are_forgotten() -> None:
+    refusals = Refusals(Metrics(), Problems(), lambda: 0.0)
+    for number in range(MOST + 10):
+        refusals.note("long_body", str(number), "x")
+    assert len(refusals._told) == MOST
