@@ -1,6 +1,7 @@
 """Calls over kept connections, against peers that end them in every way."""
 
 import asyncio
+import gzip
 import socket
 import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -9,7 +10,7 @@ import aiohttp
 import pytest
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.net.http_client import HttpClient
+from rosproxy.net.http_client import HttpClient, LongReply
 from tests.integration.net import MASTER, until
 
 REPLY = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
@@ -168,9 +169,7 @@ async def test_what_is_no_reply_is_told_as_such(client, peer, reply):
         await post(client, peer)
 
 
-async def test_a_reply_beyond_the_bound_is_refused(client, peer, monkeypatch):
-    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
-
+async def test_a_reply_beyond_the_bound_is_refused(client, peer):
     async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:
             await peer.request(reader)
@@ -178,9 +177,112 @@ async def test_a_reply_beyond_the_bound_is_refused(client, peer, monkeypatch):
             writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + b"x" * size)
 
     peer.serve = long
-    assert len(await post(client, peer)) == 100_000
+    assert len(await client.post(peer.where, "/", "robot", b"x", 5, longest=100_000)) == 100_000
     with pytest.raises(ValueError, match="100000 bytes"):
+        await client.post(peer.where, "/", "robot", b"x", 5, longest=100_000)
+    await until(lambda: peer.open == 0, "the connection is closed")
+
+
+async def test_a_compressed_reply_is_not_inflated(client, peer):
+    async def bomb(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        body = gzip.compress(b"x" * 50_000_000)
+        head = b"HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: %d\r\n\r\n"
+        writer.write(head % len(body) + body)
+
+    peer.serve = bomb
+    with pytest.raises(ValueError, match="compressed"):
         await post(client, peer)
+
+
+class Pieces:
+    """A long body; ``fails`` after so many pieces."""
+
+    def __init__(self, count: int, fails: bool = False) -> None:
+        self.size, self._count, self._fails = count * 70_000, count, fails
+        self.given = 0
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        for _ in range(self._count):
+            if self._fails and self.given == self._count // 2:
+                raise LookupError("the rest does not come")
+            self.given += 1
+            yield b"x" * 70_000
+
+
+async def pass_on(client: HttpClient, peer: Peer, body: bytes | Pieces) -> bytes | LongReply:
+    return await client.pass_on(peer.where, "/", "robot", body, 5)
+
+
+async def test_a_long_reply_comes_piece_by_piece_and_keeps_its_connection(client, peer):
+    async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            await peer.request(reader)
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: 5000000\r\n\r\n" + b"x" * 5_000_000)
+
+    peer.serve = long
+    for _ in range(2):
+        reply = await pass_on(client, peer, b"hello")
+        assert isinstance(reply, LongReply)
+        assert sum([len(piece) async for piece in reply.pieces()]) == reply.size == 5_000_000
+        reply.close()
+    assert peer.accepted == 1
+    unread = await pass_on(client, peer, b"hello")
+    assert isinstance(unread, LongReply)
+    unread.close()
+    await until(lambda: peer.open == 0, "a connection with an unread reply is closed")
+
+
+async def test_long_replies_do_not_take_the_place_of_short_calls(client, peer):
+    async def long(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            await peer.request(reader)
+            size = 5_000_000 if len(peer.heads) <= 8 else 5
+            writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + b"x" * size)
+
+    peer.serve = long
+    unread = [await pass_on(client, peer, b"hello") for _ in range(8)]
+    assert await post(client, peer) == b"xxxxx"
+    for reply in unread:
+        assert isinstance(reply, LongReply)
+        reply.close()
+
+
+async def test_a_long_body_goes_on_a_new_connection(client, peer):
+    await post(client, peer)
+    body = Pieces(50)
+    assert await pass_on(client, peer, body) == b"ok"
+    assert body.given == 50
+    assert peer.accepted == 2
+
+
+async def test_a_long_body_that_fails_is_cut_before_its_end(client, peer):
+    whole: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        whole.append(b"all")
+
+    peer.serve = serve
+    with pytest.raises(LookupError):
+        await pass_on(client, peer, Pieces(50, fails=True))
+    await until(lambda: peer.open == 0, "the connection is closed")
+    assert not whole
+
+
+async def test_a_peer_that_does_not_read_holds_a_long_body_up(client, peer, monkeypatch):
+    monkeypatch.setattr("rosproxy.net.http_client.PIECE_TIMEOUT", 0.3)
+    over = asyncio.Event()
+
+    async def idle(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await over.wait()
+
+    peer.serve = idle
+    body = Pieces(500)
+    with pytest.raises(TimeoutError):
+        await pass_on(client, peer, body)
+    over.set()
+    assert body.given < 300
 
 
 @pytest.mark.parametrize("size", [10, 300_000])

@@ -1,24 +1,37 @@
 """The client's side of XML-RPC: POST over kept connections.
 
 aiohttp's connection and parser do the work. Its ClientSession is left out: cookies, redirects,
-proxies and the like take longer than all the rest of a call that is forwarded.
+proxies and the like take longer than all the rest of a call that is forwarded. Nothing is ever
+inflated: ROS does not compress, and a small body could become a huge one.
+
+Bodies that need not be read here, requests and replies alike, go through piece by piece: who can't
+write does not read, so that they take some 100 KiB whatever their length.
 """
 
 import asyncio
 import errno
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
+from functools import partial
+from typing import Protocol
 
 import aiohttp
 from aiohttp.client_proto import ResponseHandler
+from aiohttp.http import StreamWriter
 
 from rosproxy.net import resolver
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import dial
 
 MAX_BODY = 64 * 1024 * 1024
-"""Longest XML-RPC body in bytes, either way."""
+"""Longest XML-RPC body in bytes, either way, unless told otherwise."""
+LONG = 64 * 1024
+"""Bytes from which on a reply that nobody here reads is passed on piece by piece."""
+PIECE_TIMEOUT = 30.0
+"""Seconds in which the next piece of a long body has to come, or to go."""
+LONG_TIMEOUT = 600.0
+"""Seconds that a long body may take in all: 64 MiB at 0.9 Mbit/s."""
 CONNECT_TIMEOUT = 2.0
 SEPARATE_BODY = 64 * 1024
 """Bytes from which on a body is not copied to stand behind its header."""
@@ -26,45 +39,108 @@ SEPARATE_BODY = 64 * 1024
 _SENDABLE = re.compile(r"[^\x00-\x20\x7f]+")
 
 
+class LongBody(Protocol):
+    """A request's body that comes piece by piece."""
+
+    size: int
+
+    def pieces(self) -> AsyncIterator[bytes]:
+        """The pieces, once; what they raise ends the call that carries them."""
+
+
+class LongReply:
+    """A reply's body that is passed on piece by piece; `close` it in any case."""
+
+    def __init__(self, size: int, stream: aiohttp.StreamReader, done: Callable[[], None]) -> None:
+        self.size, self._stream, self._done = size, stream, done
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        """The pieces, once. Raises aiohttp.ClientError, TimeoutError."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + LONG_TIMEOUT
+        while not self._stream.at_eof():
+            async with asyncio.timeout_at(min(end, loop.time() + PIECE_TIMEOUT)):
+                piece = await self._stream.readany()
+            yield piece
+
+    def close(self) -> None:
+        """Let the connection go: it is kept if all was read."""
+        self._done()
+
+
 class HttpClient:
     """Calls one kind of peer.
 
     ``headers`` are sent with each call. A connection that is not used for ``keepalive`` seconds is
-    closed; there are never more than ``most`` in use. ``source`` is who gives the peers' names (see
-    `resolver`). ``last`` is the address reached last.
+    closed; there are never more than ``most`` in use, those of long bodies apart. No body is longer
+    than ``longest`` bytes. ``source`` is who gives the peers' names (see `resolver`). ``last`` is
+    the address reached last.
     """
 
     def __init__(
-        self, headers: Mapping[str, str], keepalive: float, most: int, source: str = ""
+        self,
+        headers: Mapping[str, str],
+        keepalive: float,
+        most: int,
+        longest: int = MAX_BODY,
+        source: str = "",
     ) -> None:
         self.last: str | None = None
         lines = {"Content-Type": "text/xml", "User-Agent": "rosproxy", **headers}
         self._headers = "".join(f"{name}: {text}\r\n" for name, text in lines.items())
         self._keepalive, self._limit = keepalive, asyncio.Semaphore(most)
         self._source = source
+        self._longest = longest
         self._idle: dict[HostPort, list[tuple[float, ResponseHandler]]] = {}
         self._used: set[ResponseHandler] = set()
         self._sweeper: asyncio.TimerHandle | None = None
         self._closed = False
 
     async def post(
-        self, where: HostPort, path: str, host: str, body: bytes, within: float
+        self,
+        where: HostPort,
+        path: str,
+        host: str,
+        body: bytes,
+        within: float,
+        longest: int | None = None,
     ) -> bytes:
         """A reply's body, within so many seconds; ``host`` is what the peer is called.
 
-        All calls can be repeated without harm, so a kept connection that turns out to be closed
-        costs one more try. Raises OSError, TimeoutError, aiohttp.ClientError, ValueError.
+        It has at most ``longest`` bytes. All calls can be repeated without harm, so a kept
+        connection that turns out to be closed costs one more try. Raises OSError, TimeoutError,
+        aiohttp.ClientError, ValueError.
         """
         head = self._head(path, host, len(body))
         async with asyncio.timeout(within), self._limit:
-            kept = self._take(where)
-            if kept is not None:
-                try:
-                    return await self._exchange(where, kept, head, body)
-                except (aiohttp.ClientError, ConnectionError) as error:
-                    if not _was_closed(error):
-                        raise
-            return await self._exchange(where, await self._connect(where), head, body)
+            handler, stream, _ = await self._ask(where, head, body)
+            return await self._whole(where, handler, stream, longest or self._longest)
+
+    async def pass_on(
+        self, where: HostPort, path: str, host: str, body: bytes | LongBody, within: float
+    ) -> bytes | LongReply:
+        """The same for a reply that nobody here reads: if it is long, it comes piece by piece.
+
+        ``within`` bounds the time from the body's end until the reply begins. A long body goes on
+        a new connection, as its pieces can't be sent twice. Raises what `post` raises, and what the
+        body does.
+        """
+        if isinstance(body, bytes):
+            head = self._head(path, host, len(body))
+            async with asyncio.timeout(within), self._limit:
+                return await self._passing(where, *await self._ask(where, head, body))
+        head = self._head(path, host, body.size)
+        async with asyncio.timeout(within):
+            handler = await self._connect(where)
+        self._used.add(handler)
+        try:
+            async with asyncio.timeout(LONG_TIMEOUT):
+                await _upload(handler, head, body)
+            async with asyncio.timeout(within):
+                return await self._passing(where, handler, *await _answer(handler))
+        except BaseException:
+            self._drop(handler)
+            raise
 
     async def close(self) -> None:
         """Close all connections."""
@@ -82,24 +158,67 @@ class HttpClient:
         first = f"POST {path} HTTP/1.1\r\nHost: {host}\r\n"
         return f"{first}{self._headers}Content-Length: {size}\r\n\r\n".encode()
 
+    async def _ask(
+        self, where: HostPort, head: bytes, body: bytes
+    ) -> tuple[ResponseHandler, aiohttp.StreamReader, int | None]:
+        """Send a request and wait for a response: its connection, body and length."""
+        kept = self._take(where)
+        if kept is not None:
+            try:
+                return kept, *await self._exchange(kept, head, body)
+            except (aiohttp.ClientError, ConnectionError) as error:
+                if not _was_closed(error):
+                    raise
+        handler = await self._connect(where)
+        return handler, *await self._exchange(handler, head, body)
+
     async def _exchange(
-        self, where: HostPort, handler: ResponseHandler, head: bytes, body: bytes
-    ) -> bytes:
+        self, handler: ResponseHandler, head: bytes, body: bytes
+    ) -> tuple[aiohttp.StreamReader, int | None]:
         self._used.add(handler)
         try:
-            handler.set_response_params(read_until_eof=True)
+            _expect(handler)
             if handler.transport is None:
                 raise aiohttp.ServerDisconnectedError
             for piece in pieces(head, body):
                 handler.transport.write(piece)
-            reply = await _answer(handler)
+            return await _answer(handler)
         except BaseException:
-            handler.close()
+            self._drop(handler)
             raise
-        finally:
-            self._used.discard(handler)
-        self._keep(where, handler)
+
+    async def _whole(
+        self, where: HostPort, handler: ResponseHandler, stream: aiohttp.StreamReader, longest: int
+    ) -> bytes:
+        try:
+            reply = await read_bounded(stream, longest)
+        except BaseException:
+            self._drop(handler)
+            raise
+        self._finish(where, handler)
         return reply
+
+    async def _passing(
+        self,
+        where: HostPort,
+        handler: ResponseHandler,
+        stream: aiohttp.StreamReader,
+        size: int | None,
+    ) -> bytes | LongReply:
+        if size is None or size <= LONG:
+            return await self._whole(where, handler, stream, self._longest)
+        if size > self._longest:
+            self._drop(handler)
+            raise TooLong(self._longest)
+        return LongReply(size, stream, partial(self._finish, where, handler))
+
+    def _drop(self, handler: ResponseHandler) -> None:
+        self._used.discard(handler)
+        handler.close()
+
+    def _finish(self, where: HostPort, handler: ResponseHandler) -> None:
+        self._used.discard(handler)
+        self._keep(where, handler)
 
     async def _connect(self, where: HostPort) -> ResponseHandler:
         """A new connection; never redirected or led elsewhere than to ``where``."""
@@ -155,8 +274,48 @@ def pieces(head: bytes, body: bytes) -> tuple[bytes, ...]:
     return (head + body,) if len(body) < SEPARATE_BODY else (head, body)
 
 
-async def _answer(handler: ResponseHandler) -> bytes:
-    """The body of a response with status 200."""
+class TooLong(ValueError):
+    """A body of more bytes than there may be."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(f"a body of more than {most} bytes")
+
+
+async def read_bounded(
+    stream: aiohttp.StreamReader, longest: int, hold: Callable[[int], None] | None = None
+) -> bytes:
+    """All of a body; ``hold`` is told how long each part is before the next is waited for.
+
+    Raises TooLong, and what ``hold`` raises.
+    """
+    parts, size = list[bytes](), 0
+    while not stream.at_eof():
+        part = stream.read_nowait() if stream.is_eof() else await stream.readany()
+        size += len(part)
+        if size > longest:
+            raise TooLong(longest)
+        if hold is not None:
+            hold(len(part))
+        parts.append(part)
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def _expect(handler: ResponseHandler) -> None:
+    handler.set_response_params(read_until_eof=True, auto_decompress=False, read_bufsize=LONG)
+
+
+async def _upload(handler: ResponseHandler, head: bytes, body: LongBody) -> None:
+    """Send a long body, as fast as the peer takes it."""
+    _expect(handler)
+    writer = StreamWriter(handler, asyncio.get_running_loop())
+    await writer.write(head)
+    async for piece in body.pieces():
+        async with asyncio.timeout(PIECE_TIMEOUT):
+            await writer.write(piece)
+
+
+async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int | None]:
+    """The body of a response with status 200, and its length if that is told."""
     try:
         message, payload = await handler.read()
         while 100 <= message.code < 200:
@@ -165,19 +324,15 @@ async def _answer(handler: ResponseHandler) -> bytes:
         raise ValueError(f"no HTTP: {error.message}") from error
     if message.code != 200:
         raise ValueError(f"HTTP status {message.code}")
-    return await read_bounded(payload)
+    if not is_plain(message.headers):
+        raise ValueError("the body is compressed")
+    length = None if message.chunked else message.headers.get("Content-Length")
+    return payload, int(length) if length else None
 
 
-async def read_bounded(stream: aiohttp.StreamReader) -> bytes:
-    """All of a body. Raises ValueError if it is longer than MAX_BODY."""
-    parts, size = list[bytes](), 0
-    while not stream.at_eof():
-        part = stream.read_nowait() if stream.is_eof() else await stream.readany()
-        size += len(part)
-        if size > MAX_BODY:
-            raise ValueError(f"a body of more than {MAX_BODY} bytes")
-        parts.append(part)
-    return parts[0] if len(parts) == 1 else b"".join(parts)
+def is_plain(headers: Mapping[str, str]) -> bool:
+    """Whether the body that goes with an HTTP header is not compressed."""
+    return headers.get("Content-Encoding", "identity").strip().lower() in ("identity", "")
 
 
 def _was_closed(error: BaseException) -> bool:

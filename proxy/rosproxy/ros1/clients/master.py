@@ -1,14 +1,16 @@
 """XML-RPC calls to the master and to nodes.
 
 ``post_to_…`` sends a document as it is and gives the reply's bytes: that is how calls of nodes are
-forwarded. ``call_…`` makes a call of the proxy's own and gives the value of the ROS triple
-``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once. ``read_graph``
-and ``look_up`` ask it for the ROS graph.
+forwarded. ``pass_to_…`` does the same for what nobody here reads: a long reply comes piece by
+piece, and a document may go so. ``call_…`` makes a call of the proxy's own and gives the value of
+the ROS triple ``[1, message, value]`` in the reply; ``multicall`` makes many to the master at once.
+``read_graph`` and ``look_up`` ask it for the ROS graph.
 """
 
 import asyncio
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -16,9 +18,10 @@ import aiohttp
 import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy.net.http_client import HttpClient
+from rosproxy.net.http_client import MAX_BODY, HttpClient, LongBody, LongReply
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, read_state
 from rosproxy.ros1.registry.health import ProbeResult
@@ -32,6 +35,7 @@ LOOP_HEADER = "X-Rosproxy"
 """Carries the proxy's own id, so that it notices when a call of its own comes back to it."""
 MULTICALL_SIZE = 100
 MASTER_CONNECTIONS = 64
+NODE_CONNECTIONS = 10_000
 MASTER_TIMEOUT = 30.0
 MASTER_KEEPALIVE = 8.0
 """Seconds that an unused connection to the master is kept; rosmaster spends a thread on each."""
@@ -66,19 +70,25 @@ class MasterClient:
     ``master_address``, which may be changed at any time, is the IP address at which the host of
     ``master_uri`` is reached; None: where its name leads. In a container network that name may
     lead to the proxy itself. It holds for the nodes that run on the master's host as well.
+    ``longest`` is the most bytes of what passes unread.
     """
 
     def __init__(
-        self, master_uri: str, instance: str, metrics: Metrics, master_address: str | None = None
+        self,
+        master_uri: str,
+        instance: str,
+        metrics: Metrics,
+        master_address: str | None = None,
+        longest: int = MAX_BODY,
     ) -> None:
         self.master_uri, self.master_address = master_uri, master_address
         self._metrics = metrics
         parts = urlsplit(master_uri)
         self._master_path, self._netloc = parts.path or "/", parts.netloc
         self._master_where = HostPort(parts.hostname or "", parts.port or 80)
-        self._master = HttpClient({LOOP_HEADER: instance}, MASTER_KEEPALIVE, MASTER_CONNECTIONS)
-        node_headers = {LOOP_HEADER: f"{instance} node"}
-        self._nodes = HttpClient(node_headers, NODE_KEEPALIVE, 10_000, NODES)
+        own, node = {LOOP_HEADER: instance}, {LOOP_HEADER: f"{instance} node"}
+        self._master = HttpClient(own, MASTER_KEEPALIVE, MASTER_CONNECTIONS, longest)
+        self._nodes = HttpClient(node, NODE_KEEPALIVE, NODE_CONNECTIONS, longest, NODES)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -105,21 +115,29 @@ class MasterClient:
             return HostPort(self.master_address, where.port)
         return where
 
-    async def post_to_master(self, body: bytes) -> bytes:
-        """The master's reply to a call. Raises Unreachable.
+    async def post_to_master(self, body: bytes, limits: Limits = REPLY) -> bytes:
+        """The master's reply to a call, within such limits. Raises Unreachable.
 
         Kept connections are told apart by address, so a new address means new connections.
         """
-        where, path = self.reach(self._master_where), self._master_path
-        try:
-            return await self._master.post(where, path, self._netloc, body, MASTER_TIMEOUT)
-        except _FAILURES as error:
-            raise _unreachable(f"master {self.master_uri}", error) from error
+        where, path, name = self.reach(self._master_where), self._master_path, self._netloc
+        with _told_of(f"master {self.master_uri}"):
+            return await self._master.post(where, path, name, body, MASTER_TIMEOUT, limits.size)
+
+    async def pass_to_master(self, body: bytes | LongBody) -> bytes | LongReply:
+        """The master's reply to a call, neither of which is read here.
+
+        Raises Unreachable, and XmlRpcError as a long body does.
+        """
+        where, path, name = self.reach(self._master_where), self._master_path, self._netloc
+        with _told_of(f"master {self.master_uri}"):
+            return await self._master.pass_on(where, path, name, body, MASTER_TIMEOUT)
 
     async def call_master(self, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to the master. Raises Unreachable, MasterError."""
         started = time.monotonic()
-        reply = await self.post_to_master(xmlrpc.dump_call(method, CALLER_ID, *params))
+        call = xmlrpc.dump_call(method, CALLER_ID, *params)
+        reply = await self.post_to_master(call, OWN_REPLY)
         self._metrics.master_round_trip.observe(time.monotonic() - started)
         return _value(method, _parsed(reply))
 
@@ -132,7 +150,8 @@ class MasterClient:
         for start in range(0, len(calls), MULTICALL_SIZE):
             part = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in part]
-            results = _parsed(await self.post_to_master(xmlrpc.dump_call("system.multicall", body)))
+            call = xmlrpc.dump_call("system.multicall", body)
+            results = _parsed(await self.post_to_master(call, OWN_REPLY))
             if not isinstance(results, list) or len(results) != len(part):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_result_of(result) for result in results]
@@ -167,18 +186,37 @@ class MasterClient:
         self, where: HostPort, body: bytes, within: float = NODE_TIMEOUT, path: str = "/"
     ) -> bytes:
         """A node's reply to a call; ``within`` is in seconds. Raises Unreachable."""
-        try:
-            return await self._nodes.post(self.reach(where), path, str(where), body, within)
-        except _FAILURES as error:
-            raise _unreachable(f"node at {where}", error) from error
+        with _told_of(f"node at {where}"):
+            reached, name = self.reach(where), str(where)
+            return await self._nodes.post(reached, path, name, body, within, REPLY.size)
+
+    async def pass_to_node(self, where: HostPort, body: bytes | LongBody) -> bytes | LongReply:
+        """A node's reply to a call, neither of which is read here.
+
+        Raises Unreachable, and XmlRpcError as a long body does.
+        """
+        with _told_of(f"node at {where}"):
+            reached, name = self.reach(where), str(where)
+            return await self._nodes.pass_on(reached, "/", name, body, NODE_TIMEOUT)
 
     async def call_node(self, where: HostPort, within: float, method: str, *params: Any) -> Any:
         """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
-        return _value(method, _parsed(await self.post_to_node(where, body, within)))
+        return _value(method, _parsed(await self.post_to_node(where, body, within), REPLY))
 
 
 _FAILURES = (aiohttp.ClientError, OSError, TimeoutError, ValueError)
+
+
+@contextmanager
+def _told_of(who: str) -> Iterator[None]:
+    """Tell failures as those of a peer."""
+    try:
+        yield
+    except xmlrpc.XmlRpcError:  # of a long body: no failure of the peer's
+        raise
+    except _FAILURES as error:
+        raise _unreachable(who, error) from error
 
 
 def _unreachable(who: str, error: BaseException) -> Unreachable:
@@ -192,10 +230,10 @@ def _unreachable(who: str, error: BaseException) -> Unreachable:
     return Unreachable(f"{who}: {reason}", refused)
 
 
-def _parsed(reply: bytes) -> Any:
+def _parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
     """A reply's value, a fault's too."""
     try:
-        return xmlrpc.python_value(xmlrpc.parse_response(reply)[0])
+        return xmlrpc.python_value(xmlrpc.parse_response(reply, limits)[0])
     except xmlrpc.XmlRpcError as error:
         raise Unreachable(f"no XML-RPC reply: {error}") from None
 
