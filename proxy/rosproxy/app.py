@@ -11,7 +11,6 @@ import logging
 import resource
 import signal
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 from rosproxy.admin.range_probe import probe_range
@@ -25,13 +24,14 @@ from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
-from rosproxy.ros1.api.master import MasterApi, serve_published
+from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
-from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer, XmlRpcService
+from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
@@ -74,6 +74,7 @@ class App:
             self._resubscriber.watch,
             context.tasks,
             context.problems,
+            context.gate,
         )
         self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane)
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
@@ -108,7 +109,7 @@ class App:
         self._listen("--master-port", settings.master_port, master, what, guard)
         if settings.publish_master is not None:
             where = HostPort(settings.advertise_host, settings.publish_master)
-            published = partial(serve_published, context, str(where))
+            published = PublishedMaster(context, str(where))
             self._listen("--publish-master", where.port, published, "ROS master API")
         context.metrics.registry.register(self._state)
         with _binding("--admin-bind", settings.admin):
@@ -191,6 +192,7 @@ class App:
         if files != resource.RLIM_INFINITY and files < len(ports) + SPARE_FILES:
             text = f"{ports} are more ports than this process may have open files (ulimit -Hn)"
             raise SettingError(RANGE_OPTION, text)
+        self.context.gate.bound(max(files, 0) - len(ports) - SPARE_FILES)
         taken = self.leases.reserve_range()
         if len(taken) == len(ports):
             raise SettingError(RANGE_OPTION, f"no port of {ports} can be bound; all are taken")
@@ -200,16 +202,19 @@ class App:
             self.context.problems.add(RANGE_OPTION, text)
 
     def _listen(
-        self, option: str, port: int, service: XmlRpcService, what: str, guard: Guard | None = None
+        self,
+        option: str,
+        port: int,
+        service: MasterApi | PublishedMaster,
+        what: str,
+        guard: Guard | None = None,
     ) -> None:
         with _binding(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
-        greeting = f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n"
-        server = XmlRpcServer(service, greeting, guard)
+        context, greeting = self.context, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n"
+        server = XmlRpcServer(context, service, greeting, MASTER_CALL, service, guard)
         self._servers.append(server)
-        self._acceptors.append(
-            Acceptor(self.context.tasks, sock, lambda conn, peer: server.dispatch(conn))
-        )
+        self._acceptors.append(Acceptor(context.tasks, sock, server.dispatch, context.gate))
 
 
 @contextlib.contextmanager

@@ -57,11 +57,12 @@ def _no_traceback(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 def is_left_out(record: logging.LogRecord) -> bool:
     """Whether it is of the kind that ``rosproxy run`` leaves out of its log.
 
-    That is what clients do to an HTTP server: they speak no HTTP, or are gone before the reply;
-    the latter is a RuntimeError with uvloop.
+    That is what clients do to an HTTP server: they speak no HTTP, or are gone before the reply, or
+    before the end of a body that was refused; the latter two are RuntimeErrors.
     """
     error = record.exc_info[1] if record.exc_info else None
-    if isinstance(error, RuntimeError) and "the handler is closed" not in str(error):
+    gone = "the handler is closed", "Connection closed."
+    if isinstance(error, RuntimeError) and not any(text in str(error) for text in gone):
         return False
     return record.name == "aiohttp.server" and isinstance(
         error, HttpProcessingError | RequestPayloadError | RuntimeError

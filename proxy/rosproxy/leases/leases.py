@@ -16,6 +16,7 @@ from typing import Generic, Protocol, TypeVar
 
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.net.gate import Gate
 from rosproxy.net.sockets import BACKLOG, Acceptor, Handler, bind
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.problems import Problems
@@ -72,6 +73,7 @@ class Leases(Generic[_H]):
     ``server`` answers what comes in. It needs the leases itself (a node that is found dead has its
     port closed), so that it is set once both are there, before the first port opens. ``watch``
     looks after subscribers of endpoints, whose connections may be lost.
+    ``gate`` counts connections.
     """
 
     server: HolderServer[_H]
@@ -84,7 +86,9 @@ class Leases(Generic[_H]):
         watch: Callable[[Iterable[_H]], None],
         tasks: Tasks,
         problems: Problems,
+        gate: Gate,
     ) -> None:
+        self._gate = gate
         self._holders, self._address, self._kernel, self._watch = holders, address, kernel, watch
         self._tasks, self._problems = tasks, problems
         self._reserved: dict[int, socket.socket] = {}
@@ -213,7 +217,7 @@ class Leases(Generic[_H]):
         except OSError:
             sock.close()
             raise
-        self._acceptors[port] = Acceptor(self._tasks, sock, handler)
+        self._acceptors[port] = Acceptor(self._tasks, sock, handler, self._gate)
 
     def _listen(self, endpoint: _H, port: int) -> OSError | None:
         """Let a port listen for an endpoint; the error if another program has it."""

@@ -3,10 +3,13 @@
 Made once, before the parts; none of them keeps a copy of what is in it.
 """
 
+import asyncio
 import time
 import uuid
 
 from rosproxy.net.addresses import is_inside
+from rosproxy.net.budget import Budget
+from rosproxy.net.gate import Gate
 from rosproxy.net.interfaces import address_towards, interface_networks
 from rosproxy.net.tasks import Tasks
 from rosproxy.ros1.clients.master import MasterClient
@@ -16,12 +19,17 @@ from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.selection import Standing, standing
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.settings import Settings
+from rosproxy.settings import MEBIBYTE, Settings
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.refusals import Refusals
 
 NETWORKS_TTL = 5.0
 """Seconds for which the list of the machine's own networks is taken as current."""
+MOST_PASSING = 256
+"""Calls and replies that pass unread at once; each takes a thread of the master's."""
+PASSING_SHARE = 64
+"""Those of them from one source."""
 
 
 class Context:
@@ -29,15 +37,32 @@ class Context:
 
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
     ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
+    ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
+    ``passing`` the calls that pass unread; ``turn`` is for who is about to read a large document;
+    ``refusals`` tells what is over these and other bounds.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings, self.instance = settings, uuid.uuid4().hex
         self.metrics, self.tasks, self.problems = Metrics(KNOWN_METHODS), Tasks(), Problems()
+        self.refusals = Refusals(self.metrics, self.problems, self.now)
+        self.gate = Gate(
+            settings.max_connections_per_source,
+            settings.max_connections_per_lease,
+            self.refusals.note,
+        )
+        held = settings.max_buffered * MEBIBYTE
+        self.buffered = Budget(held, held // 2, "bytes of requests and replies")
+        self.turn = asyncio.Lock()
+        self.passing = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
         self.addressing = Addressing(self.registry, settings.advertise_host, settings.ports)
         self.upstream = MasterClient(
-            settings.master_uri, self.instance, self.metrics, settings.master_address
+            settings.master_uri,
+            self.instance,
+            self.metrics,
+            settings.master_address,
+            settings.max_body * MEBIBYTE,
         )
         self.nodes = NodeClient(self.upstream, settings.probe_timeout)
         self.retired = False

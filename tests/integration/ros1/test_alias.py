@@ -11,6 +11,7 @@ import pytest
 from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -196,13 +197,11 @@ async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot
     assert robot.requests == []
 
 
-async def test_a_body_beyond_the_bound_is_refused(
-    proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_body_beyond_the_bound_is_refused(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
-    monkeypatch.setattr("rosproxy.net.http_client.MAX_BODY", 100_000)
-    assert (await exchange(slave(robot), post(b"x" * 100_001), NODE)).status == 413
-    robot.answers["getPid"] = ok(b"x" * 100_001)
+    size = MASTER_CALL.size + 1
+    assert (await exchange(slave(robot), post(b"x" * size), NODE)).status == 413
+    robot.answers["getPid"] = ok(b"x" * size)
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
 
 

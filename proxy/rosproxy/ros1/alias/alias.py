@@ -33,6 +33,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.servers.tcpros import hand_on, read_header
@@ -60,7 +61,8 @@ class Alias:
         """By port, the one that was of no use for longest first."""
         self._refused: set[int] = set()
         self._relays = OpenRelays()
-        self._server = XmlRpcServer(self._forward, "rosproxy: a ROS node on the master's host\n")
+        greeting = "rosproxy: a ROS node on the master's host\n"
+        self._server = XmlRpcServer(context, self._forward, greeting, MASTER_CALL)
         self._closed = False
         self._asking = asyncio.Lock()
         self._asked: set[str] = set()
@@ -195,7 +197,8 @@ class Alias:
             sock = sockets.listen(self._context.settings.bind, port)
         except OSError as error:
             return f"can't be opened here ({error.strerror})"
-        self._acceptors[port] = Acceptor(self._context.tasks, sock, partial(self._serve, port))
+        serve, gate = partial(self._serve, port), self._context.gate
+        self._acceptors[port] = Acceptor(self._context.tasks, sock, serve, gate)
         log.debug("port %d stands in for that of %s", port, self._name)
         return None
 
@@ -209,6 +212,10 @@ class Alias:
     def _note_used(self, port: int) -> None:
         if port in self._acceptors:
             self._acceptors[port] = self._acceptors.pop(port)
+
+    def _note_end(self, relay: Relay) -> None:
+        self._context.gate.leave(relay.peer, relay.port)
+        self._note_used(relay.port)
 
     def _note_refused(self, port: int) -> None:
         """A node that refuses has ended: its port refuses as well, until it is found again."""
@@ -246,12 +253,12 @@ class Alias:
             conn.close()
             return
         self._note_used(port)
-        await self._server.dispatch(conn, partial(self._relay, port, peer))
+        await self._server.dispatch(conn, peer, partial(self._relay, port, peer))
 
     async def _relay(self, port: int, peer: str, conn: socket.socket) -> None:
         """Relay TCPROS as it is, once it is known to be that."""
         try:
-            header = await read_header(conn)
+            header = await read_header(self._context, peer, conn)
             decode_header(header[4:])
         except HeaderError as error:
             log.debug("%s at port %d: %s", peer, port, error)
@@ -272,13 +279,14 @@ class Alias:
             return
         splice = self._context.settings.data_plane != "copy"
         relay = Relay(port, "service", f"at port {port}", "", peer, node, conn, splice=splice)
-        self._relays.start(relay, lambda ended: self._note_used(ended.port))
+        self._context.gate.enter(peer, port)
+        self._relays.start(relay, self._note_end)
 
     async def _forward(self, call: IncomingCall) -> bytes:
         """A node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
             raise Unreachable(f"the address of {self._name} leads back to the proxy itself")
-        parsed = xmlrpc.parse_call(call.body)
+        parsed = xmlrpc.parse_call(call.body, MASTER_CALL)
         port, upstream = call.local.port, self._context.upstream
         answer = upstream.post_to_node(HostPort(self._name, port), call.body, path=call.path)
         try:

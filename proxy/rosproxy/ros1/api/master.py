@@ -3,24 +3,32 @@
 A call that registers or names an address goes one way: its node is admitted (`admission`), its
 addresses are exported, the master is called, what it accepted is noted in the registry, and the
 addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
-they are.
+they are; long ones, parameters above all, unread.
 """
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
+from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.alias.alias import Alias
+from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import too_long_to_register
+from rosproxy.ros1.protocol.master_methods import NO_ROW, row
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
+from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
 from rosproxy.ros1.rewriting.master_api import Admission, MasterReply, Refusal, Request
 from rosproxy.ros1.servers.admission import NodeAdmission
+from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -38,31 +46,46 @@ class MasterApi:
     _recovery: Recovery
     _adopter: Adopter
 
-    async def __call__(self, call: IncomingCall) -> bytes:
+    async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
-        if call.comes_from(self._context.instance):
-            what = "a node's address"
-            if call.loop_id == self._context.instance:
-                what = f"--master-uri {self._context.settings.master_uri}"
-            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
+        self._refuse_loop(call)
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
-        metrics = self._context.metrics
+        metrics, upstream = self._context.metrics, self._context.upstream
+        if await _is_long_and_passes(call.body):
+            return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
             request = master_api.read_request(call.body, asker)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
         if request.plain:
-            reply = self._context.upstream.post_to_master(request.body)
-        else:
-            reply = self._rewrite(request)
-        return await counted(metrics, "master", request.method, reply)
+            passed = upstream.pass_to_master(request.body)
+            return await counted(metrics, "master", request.method, passed)
+        return await counted(metrics, "master", request.method, self._rewrite(request, call))
 
-    async def _rewrite(self, request: Request) -> bytes:
+    def watch(self, method: str, size: int) -> passing.Watch | None:
+        """How to watch a long call while it passes; None if it has to be read."""
+        return _watch(method, size)
+
+    async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
+        """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
+        self._refuse_loop(call)
+        reply = self._context.upstream.pass_to_master(long_call)
+        return await counted(self._context.metrics, "master", long_call.method, reply)
+
+    def _refuse_loop(self, call: IncomingCall) -> None:
+        """Refuse a call that the proxy itself has made. Raises XmlRpcError."""
+        if call.comes_from(self._context.instance):
+            what = "a node's address"
+            if call.loop_id == self._context.instance:
+                what = f"--master-uri {self._context.settings.master_uri}"
+            raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
+
+    async def _rewrite(self, request: Request, call: IncomingCall) -> bytes:
         """Admit, export, call the master, note, import."""
         await self._recovery.ensure()
         addressing = self._context.addressing
-        async with self._admitted(request) as admissions:
+        async with self._admitted(request, call) as admissions:
             exported = master_api.export_request(request, admissions, addressing)
             if exported.body is None:
                 return exported.refused_reply()
@@ -73,16 +96,20 @@ class MasterApi:
             return master_api.import_reply(reply, addressing)
 
     @asynccontextmanager
-    async def _admitted(self, request: Request) -> AsyncIterator[Sequence[Admission]]:
+    async def _admitted(
+        self, request: Request, incoming: IncomingCall
+    ) -> AsyncIterator[Sequence[Admission]]:
         """What becomes of each call of a request. Raises Unreachable.
 
         Within the context their endpoints are *pending*: their leases do not end while the calls
-        are on their way.
+        are on their way. If the caller goes away meanwhile, the master is told nothing.
         """
         self._context.refresh_networks(request.asker.address)
         admissions: list[Admission] = []
         try:
             for call in request.calls:  # one after the other: they may register the same new node
+                if incoming.gone:
+                    raise Unreachable("the caller has gone")
                 admission = await self._admit(call, request.asker) if call else None
                 admissions.append(admission)
                 if isinstance(admission, Endpoint):
@@ -130,13 +157,58 @@ class MasterApi:
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
 
 
-async def serve_published(context: Context, address: str, call: IncomingCall) -> bytes:
+@dataclass(slots=True, eq=False)
+class PublishedMaster:
     """The master itself for outside (``--publish-master``), where it runs inside.
 
-    What the master holds are outside addresses already; only its own URI is replaced. Raises
-    XmlRpcError, Unreachable.
+    What the master holds are outside addresses already; only its own URI is replaced, by the one at
+    which it is published: ``address``.
     """
-    asker = Asker(call.source, call.local.host, master=address)
-    request = master_api.read_request(call.body, asker)
-    reply = await context.upstream.post_to_master(call.body)
-    return master_api.rename_master(request, reply, address)
+
+    _context: Context
+    _address: str
+
+    async def __call__(self, call: IncomingCall) -> bytes | LongReply:
+        """The reply to a call. Raises XmlRpcError, Unreachable."""
+        upstream = self._context.upstream
+        if await _is_long_and_passes(call.body):
+            return await upstream.pass_to_master(call.body)
+        asker = Asker(call.source, call.local.host, master=self._address)
+        request = master_api.read_request(call.body, asker)
+        if request.plain:
+            return await upstream.pass_to_master(call.body)
+        reply = await upstream.post_to_master(call.body)
+        return master_api.rename_master(request, reply, self._address)
+
+    def watch(self, method: str, size: int) -> passing.Watch | None:
+        """How to watch a long call while it passes; None if it has to be read."""
+        return _watch(method, size)
+
+    async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
+        """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
+        return await self._context.upstream.pass_to_master(long_call)
+
+
+def _passes(method: str) -> bool:
+    return row(method) == NO_ROW
+
+
+def _watch(method: str, size: int) -> passing.Watch | None:
+    if method == MULTICALL:
+        return passing.MulticallWatch(_passes) if size > MASTER_CALL.size else None
+    return passing.Watch() if _passes(method) else None
+
+
+async def _is_long_and_passes(body: bytes) -> bool:
+    """Whether a body is a long multicall of which nothing has to be read."""
+    if len(body) <= passing.SHORT or passing.method_of(body) != MULTICALL:
+        return False
+    watch = passing.MulticallWatch(_passes)
+    try:
+        for piece in passing.cut(body):
+            watch.see(piece)
+            await asyncio.sleep(0)
+        watch.end()
+    except xmlrpc.XmlRpcError:  # it is read, which tells what is wrong with it
+        return False
+    return True

@@ -8,27 +8,33 @@ the calls tell is noted: the TCPROS port that a node names, and that a node refu
 import asyncio
 import logging
 import socket
+from collections.abc import Awaitable
 from functools import partial
+from typing import TypeVar
 
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc import multicall
+from rosproxy.ros1.protocol.xmlrpc import multicall, passing
+from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.rewriting import slave_api
 from rosproxy.ros1.rewriting.slave_api import Visit
+from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 from rosproxy.ros1.upkeep.adopter import Adopter
 
 log = logging.getLogger(__name__)
 
+_Answer = TypeVar("_Answer")
 REGISTRATION_GRACE = 0.5
 """Seconds that a publisherUpdate waits at most for a registration of the same node."""
 
@@ -46,33 +52,58 @@ class SlaveApi:
     ) -> None:
         self._context, self._leases, self._alias = context, leases, alias
         self._adopter, self._tcpros = adopter, tcpros
-        self.server = XmlRpcServer(self, "rosproxy: slave API of a ROS node behind it\n")
+        greeting = "rosproxy: slave API of a ROS node behind it\n"
+        self.server = XmlRpcServer(context, self, greeting, LEASE_CALL, self)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
         """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
-        await self.server.dispatch(conn, partial(self._tcpros.serve, endpoint, peer))
+        await self.server.dispatch(conn, peer, partial(self._tcpros.serve, endpoint, peer))
 
     def end_calls(self, port: int) -> None:
         """Let the XML-RPC connections of a port end, which refuses from now on."""
         self.server.close_port(port)
 
-    async def __call__(self, call: IncomingCall) -> bytes:
+    async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
-        endpoint = self._context.registry.by_port.get(call.local.port)
-        if call.comes_from(self._context.instance):
-            raise Unreachable("a node's address leads back to the proxy itself")
-        if endpoint is None or not self._means(endpoint, call.path):
-            raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
+        endpoint = self._endpoint(call)
+        method = passing.method_of(call.body)
+        if method is not None and not await self._may(method, call.source):
+            return self._refused(method)  # before it is read
         try:
-            parsed = xmlrpc.parse_call(call.body)
+            parsed = xmlrpc.parse_call(call.body, LEASE_CALL)
         except xmlrpc.XmlRpcError:
             self._context.metrics.count("slave", "other", "malformed")
             raise
         if parsed.method != multicall.MULTICALL:
             return await self._one(endpoint, parsed, call.body, call)
-        calls = multicall.inner_calls(parsed)
-        results = [await self._result(endpoint, inner, call) for inner in calls]
+        results = []
+        for inner in multicall.inner_calls(parsed):
+            if call.gone:
+                raise Unreachable("the caller has gone")
+            results.append(await self._result(endpoint, inner, call))
+            call.hold(len(results[-1]))
         return multicall.results_reply(results)
+
+    def watch(self, method: str, size: int) -> passing.Watch | None:
+        """How to watch a long call while it passes; None if it has to be read."""
+        return passing.Watch() if method in slave_api.LONG else None
+
+    async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
+        """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
+        endpoint = self._endpoint(call)
+        if not await self._may(long_call.method, call.source):
+            return self._refused(long_call.method)
+        reply = self._pass(endpoint, long_call)
+        return await counted(self._context.metrics, "slave", long_call.method, reply)
+
+    def _endpoint(self, call: IncomingCall) -> Endpoint:
+        """The endpoint that a call is for. Raises Unreachable."""
+        endpoint = self._context.registry.by_port.get(call.local.port)
+        if call.comes_from(self._context.instance):
+            raise Unreachable("a node's address leads back to the proxy itself")
+        if endpoint is None or not self._means(endpoint, call.path):
+            raise Unreachable(f"port {call.local.port} has no node at {call.path} any more")
+        return endpoint
 
     def _means(self, endpoint: Endpoint, path: str) -> bool:
         """Whether a request's path names this endpoint, or none, as roscpp's.
@@ -90,29 +121,37 @@ class SlaveApi:
         if inner is None:
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
         body = multicall.single_call(inner)
-        reply = await self._one(endpoint, xmlrpc.parse_call(body), body, call)
+        reply = await self._one(endpoint, xmlrpc.parse_call(body, LEASE_CALL), body, call)
+        if isinstance(reply, LongReply):
+            reply.close()
+            text = f"a reply of {reply.size} bytes is too long for a {multicall.MULTICALL}"
+            return multicall.fault_value(xmlrpc.SYSTEM_ERROR, f"rosproxy: {text}")
         return multicall.result_value(reply)
 
     async def _one(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
-    ) -> bytes:
+    ) -> bytes | LongReply:
         """The reply to one call, whose document is ``body``, of those that came as ``call``."""
         if not await self._may(parsed.method, call.source):
-            self._context.metrics.count("slave", parsed.method, "refused")
-            return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+            return self._refused(parsed.method)
         if too_long := too_long_to_ask(parsed):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
         reply = self._forward(endpoint, parsed, body, call)
         return await counted(self._context.metrics, "slave", parsed.method, reply)
 
+    def _refused(self, method: str) -> bytes:
+        """The reply to a call that only the master may make."""
+        self._context.metrics.count("slave", method, "refused")
+        return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+
     async def _forward(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
-    ) -> bytes:
+    ) -> bytes | LongReply:
         if await self._is_void(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
         if not slave_api.rewritten(parsed):
-            return await self._ask(endpoint, body)
+            return await self._pass(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._after_registration(endpoint)
             announced = slave_api.announced_publishers(parsed)
@@ -150,9 +189,20 @@ class SlaveApi:
             await asyncio.sleep(0.002)
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
+        return await self._heard(
+            endpoint, self._context.upstream.post_to_node(endpoint.slave, body)
+        )
+
+    async def _pass(self, endpoint: Endpoint, body: bytes | LongCall) -> bytes | LongReply:
+        return await self._heard(
+            endpoint, self._context.upstream.pass_to_node(endpoint.slave, body)
+        )
+
+    async def _heard(self, endpoint: Endpoint, answer: Awaitable[_Answer]) -> _Answer:
+        """An answer of a node; what it tells of the node's health is noted. Raises Unreachable."""
         health = endpoint.health
         try:
-            reply = await self._context.upstream.post_to_node(endpoint.slave, body)
+            reply = await answer
         except Unreachable as error:
             if error.refused and health.note(error.probe, self._context.now()):
                 # Refused twice, the node has ended: its port refuses as well at once.

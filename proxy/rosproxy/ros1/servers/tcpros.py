@@ -8,11 +8,13 @@ or is asked for now. The header is sent on to that port, and the bytes are relay
 import asyncio
 import logging
 import socket
+from functools import partial
 
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import too_long_to_connect
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -60,7 +62,7 @@ class TcprosServer:
     async def serve(self, endpoint: Endpoint, peer: str, conn: socket.socket) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
-            header = await read_header(conn)
+            header = await read_header(self._context, peer, conn)
             fields = decode_header(header[4:])
             if too_long := too_long_to_connect(fields):
                 raise HeaderError(too_long)
@@ -82,6 +84,7 @@ class TcprosServer:
         caller_id, splice = fields.get("callerid", ""), self._may_splice
         relay = Relay(endpoint.port, kind, name, caller_id, peer, conn, inside, splice=splice)
         endpoint.note_connection()
+        self._context.gate.enter(peer, endpoint.port)
         self.relays.start(relay, lambda ended: self._finished(endpoint, ended))
 
     def cut(self, port: int) -> None:
@@ -118,6 +121,7 @@ class TcprosServer:
 
     def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
         endpoint.note_disconnection()
+        self._context.gate.leave(relay.peer, relay.port)
         self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
     def _fail(self, endpoint: Endpoint, conn: socket.socket, name: str) -> None:
@@ -137,14 +141,22 @@ class TcprosServer:
         self._context.problems.add(endpoint.label, text, endpoint.port)
 
 
-async def read_header(conn: socket.socket) -> bytes:
+async def read_header(context: Context, peer: str, conn: socket.socket) -> bytes:
     """Take a connection header off the socket: its four bytes of length and its body.
 
     Raises HeaderError if it is too long, EOFError, TimeoutError, OSError.
     """
-    async with asyncio.timeout(sockets.SILENCE_TIMEOUT):
-        first = await sockets.read_exactly(conn, 4)
-        return first + await sockets.read_exactly(conn, header_length(first))
+    charge = Charge(context.buffered, peer)
+    with context.gate.waiting(peer, partial(sockets.hang_up, conn)), charge:
+        async with asyncio.timeout(sockets.SILENCE_TIMEOUT):
+            first = await sockets.read_exactly(conn, 4)
+            size = header_length(first)
+            try:
+                charge.add(size)
+            except OverBudget as error:
+                context.refusals.note("over_budget", peer, str(error))
+                raise HeaderError(str(error)) from None
+            return first + await sockets.read_exactly(conn, size)
 
 
 async def _dial(address: str, port: int | None) -> socket.socket | None:

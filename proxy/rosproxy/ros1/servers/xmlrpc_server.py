@@ -2,24 +2,38 @@
 
 What peers expect (ros_comm/utilities/xmlrpcpp, Python's xmlrpc.client): a Content-Length always,
 no chunks, no compression, any path. Errors are XML-RPC faults with HTTP status 200.
+
+What a service reads is bounded (`limits`), and what all servers hold together (`Context.buffered`);
+over it a request is answered with HTTP 413 or 503. A long call that a service need not read passes
+piece by piece (`long_calls`), as do long replies. Compressed requests are refused: ROS sends none.
+A client that takes nothing of its reply is cut by the kernel (`sockets.end_if_stalled`).
 """
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections import defaultdict
 from collections.abc import Awaitable, Callable
-from functools import lru_cache
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, TypeVar
 
-from aiohttp import HttpVersion, HttpVersion11, web
+import aiohttp
+from aiohttp import web
 
 from rosproxy.net.addresses import HostPort, parse_host_port, plain_address
-from rosproxy.net.http_client import pieces, read_bounded
-from rosproxy.net.sockets import peek, reset_on_close
+from rosproxy.net.budget import Charge, OverBudget
+from rosproxy.net.http_client import LongReply, TooLong, is_plain, read_bounded
+from rosproxy.net.sockets import end_if_stalled, hang_up, peek
 from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
+from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc.limits import Limits
+from rosproxy.ros1.servers.long_calls import LongCall, LongCalls
+from rosproxy.ros1.servers.replies import DocumentReply, invite, refuse
+from rosproxy.settings import MEBIBYTE
 from rosproxy.telemetry.metrics import Metrics
 
 log = logging.getLogger(__name__)
@@ -30,14 +44,29 @@ HEADER_TIMEOUT = 30.0
 """Seconds in which the header of a connection's first request must arrive."""
 STOP_TIMEOUT = 0.5
 """Seconds that calls under way get to end when the server stops."""
+READ_AHEAD = 64 * 1024
+"""Bytes of a body that wait to be read, before the client has to wait."""
+MOST_LINE, MOST_FIELDS = 4096, 64
+"""Longest line of a request's header in bytes, and how many fields it has: ROS's have five."""
+VALUE = 400
+"""Bytes of memory that a value of a document takes while its call is answered."""
+MANY_VALUES = 100
+"""Values from which on documents are read one by one, with a look at all connections in between;
+registrations have six. Else many that come together would hold everybody else up."""
+
+_Answer = TypeVar("_Answer")
 
 
 class IncomingCall:
-    """One XML-RPC request: its body, who sent it and where it arrived."""
+    """One XML-RPC request: its body, who sent it and where it arrived.
 
-    def __init__(self, request: web.BaseRequest, body: bytes) -> None:
+    ``hold`` is told how many bytes more the call takes in memory until it is answered; it raises
+    OverBudget.
+    """
+
+    def __init__(self, request: web.BaseRequest, hold: Callable[[int], None]) -> None:
         protocol = request.protocol
-        self.body = body
+        self.body, self.hold, self._request = b"", hold, request
         self.path = request.path_qs
         self.source = _source(request)
         self.local = _address(protocol.sockname)
@@ -49,6 +78,11 @@ class IncomingCall:
         return self.loop_id.partition(" ")[0] == instance
 
     @property
+    def gone(self) -> bool:
+        """Whether the caller has closed the connection."""
+        return self._request.transport is None
+
+    @property
     def reached_locally(self) -> bool:
         """Whether the caller named the very address and port of this machine that it reached.
 
@@ -58,7 +92,7 @@ class IncomingCall:
         return parse_host_port(self.host_header) == self.local
 
 
-XmlRpcService = Callable[[IncomingCall], Awaitable[bytes]]
+XmlRpcService = Callable[[IncomingCall], Awaitable[bytes | LongReply]]
 """Makes the reply to a call. Raises XmlRpcError for a fault, Unreachable for a reset."""
 
 
@@ -66,7 +100,7 @@ Guard = Callable[[str], Awaitable[str | None]]
 """Why a source's calls are refused, in one line, before they are read; None if they are not."""
 
 
-async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[bytes]) -> bytes:
+async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[_Answer]) -> _Answer:
     """A forwarded call's reply, once it is counted whether there was one. Raises Unreachable."""
     try:
         answer = await reply
@@ -77,18 +111,51 @@ async def counted(metrics: Metrics, api: str, method: str, reply: Awaitable[byte
     return answer
 
 
-class XmlRpcServer(web.Server):
-    """Turns accepted sockets into XML-RPC calls to a service, for those whom the guard lets in."""
+class HttpRefusal(Exception):
+    """A request that is refused with an HTTP status; ``reason`` is a word for the metric."""
 
-    def __init__(self, service: XmlRpcService, greeting: str, guard: Guard | None = None) -> None:
-        super().__init__(self._handle, access_log=None, keepalive_timeout=75)
-        self._service, self._greeting, self._guard = service, greeting, guard
+    def __init__(self, status: int, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.status, self.reason = status, reason
+
+
+class XmlRpcServer(web.Server):
+    """Turns accepted sockets into XML-RPC calls to a service, for those whom the guard lets in.
+
+    ``limits`` are those of calls that the service reads; ``long_calls`` take those that it need not
+    read; without, all are read.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        service: XmlRpcService,
+        greeting: str,
+        limits: Limits,
+        long_calls: LongCalls | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        super().__init__(
+            self._handle,
+            access_log=None,
+            keepalive_timeout=75,
+            auto_decompress=False,
+            read_bufsize=READ_AHEAD,
+            max_line_size=MOST_LINE,
+            max_field_size=MOST_LINE,
+            max_headers=MOST_FIELDS,
+        )
+        self._context, self._service, self._greeting = context, service, greeting
+        self._limits, self._long_calls, self._guard = limits, long_calls, guard
         self._by_port: defaultdict[int, set[web.RequestHandler]] = defaultdict(set)
         self._busy: set[web.RequestHandler] = set()
-        self._mute: set[web.RequestHandler] = set()
+        self._mute: dict[web.RequestHandler, Callable[[], None]] = {}
 
     async def dispatch(
-        self, conn: socket.socket, relay: Callable[[socket.socket], Awaitable[None]] | None = None
+        self,
+        conn: socket.socket,
+        peer: str,
+        relay: Callable[[socket.socket], Awaitable[None]] | None = None,
     ) -> None:
         """Take a connection over, or hand it to ``relay`` if it is TCPROS; without, all is HTTP.
 
@@ -96,9 +163,11 @@ class XmlRpcServer(web.Server):
         HTTP method, anything else the length of a connection header. They are only peeked at. One
         that ends before it has said anything is closed. Raises TimeoutError, OSError.
         """
-        first = await peek(conn, 4)
+        with self._context.gate.waiting(peer, partial(hang_up, conn)):
+            first = await peek(conn, 4)
         if first and (relay is None or speaks_http(first)):
-            await self._serve(conn)
+            end_if_stalled(conn)
+            await asyncio.get_running_loop().connect_accepted_socket(self, sock=conn)
         elif len(first) < 4 or relay is None:
             conn.close()
         else:
@@ -121,30 +190,32 @@ class XmlRpcServer(web.Server):
         await self.shutdown(STOP_TIMEOUT)
 
     def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Know a connection by the port that it came in on."""
+        """Know a connection by the port that it came in on, and wait for its first request."""
         super().connection_made(handler, transport)
-        self._by_port[_address(handler.sockname).port].add(handler)
+        port, source = _address(handler.sockname).port, _address(handler.peername).host
+        self._by_port[port].add(handler)
+        self._context.gate.enter(source, port)
+        self._mute[handler] = self._context.gate.wait(source, handler.force_close)
+        asyncio.get_running_loop().call_later(HEADER_TIMEOUT, self._close_mute, handler)
 
     def connection_lost(
         self, handler: web.RequestHandler, exc: BaseException | None = None
     ) -> None:
         """Forget a connection."""
         super().connection_lost(handler, exc)
-        self._by_port[_address(handler.sockname).port].discard(handler)
-
-    async def _serve(self, conn: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        _, handler = await loop.connect_accepted_socket(self, sock=conn)
-        self._mute.add(handler)
-        loop.call_later(HEADER_TIMEOUT, self._close_mute, handler)
+        self._mute.pop(handler, _nothing)()
+        port = _address(handler.sockname).port
+        if handler in self._by_port[port]:
+            self._by_port[port].discard(handler)
+            self._context.gate.leave(_address(handler.peername).host, port)
 
     def _close_mute(self, handler: web.RequestHandler) -> None:
         if handler in self._mute:
-            self._mute.discard(handler)
+            self._mute.pop(handler)()
             handler.force_close()
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
-        self._mute.discard(request.protocol)
+        self._mute.pop(request.protocol, _nothing)()
         self._busy.add(request.protocol)
         try:
             return await self._respond(request)
@@ -156,59 +227,135 @@ class XmlRpcServer(web.Server):
             return web.Response(text=self._greeting)
         if request.method != "POST":
             return web.Response(status=405, text="XML-RPC uses POST\n", headers={"Allow": "POST"})
-        refused = await self._guard(_source(request)) if self._guard else None
+        source = _source(request)
+        refused = await self._guard(source) if self._guard else None
         if refused:
             return _forbid(refused)
-        body = await _body(request)
-        if not isinstance(body, bytes):
-            return body
         try:
-            reply = await self._service(IncomingCall(request, body))
+            with Charge(self._context.buffered, source) as charge:
+                return await self._answer(request, IncomingCall(request, charge.add))
+        except HttpRefusal as refusal:
+            status, reason, text = refusal.status, refusal.reason, str(refusal)
+        except OverBudget as error:
+            status, reason, text = 503, "over_budget", str(error)
+        self._context.refusals.note(reason, source, text)
+        return web.Response(status=status, text=f"rosproxy: {text}\n")
+
+    async def _answer(self, request: web.BaseRequest, call: IncomingCall) -> web.StreamResponse:
+        """Read a call, and send the reply. Raises HttpRefusal, OverBudget."""
+        try:
+            answer = await self._read(request, call)
+            reply = await (answer or self._service(call))
         except xmlrpc.XmlRpcError as error:
             reply = xmlrpc.dump_fault(error.code, f"rosproxy: {error}")
-        except Unreachable as error:
+        except (ConnectionResetError, Unreachable) as error:
             log.debug("no answer for %s: %s", request.remote, error)
-            return _refuse(request)
+            return refuse(request)
+        except (HttpRefusal, OverBudget):
+            raise
+        except web.RequestPayloadError as error:
+            return web.Response(status=400, text=f"{error}\n")
         except Exception:
             log.exception("a call from %s failed in the proxy", request.remote)
             reply = xmlrpc.dump_fault(xmlrpc.SYSTEM_ERROR, "rosproxy: internal error, see its log")
-        return _Reply(reply)
+        if isinstance(reply, LongReply):
+            return await self._send_long(request, call, reply)
+        if len(reply) > passing.SHORT:
+            call.hold(len(reply))
+        response = DocumentReply(reply)
+        with contextlib.suppress(ConnectionError):  # the server sees for itself that it is gone
+            await response.prepare(request)
+        return response
+
+    async def _read(
+        self, request: web.BaseRequest, call: IncomingCall
+    ) -> Awaitable[bytes | LongReply] | None:
+        """Read a call's body; the answer to one that passes, of which only the head is read.
+
+        Raises HttpRefusal, OverBudget.
+        """
+        if not is_plain(request.headers):
+            text = "compressed requests are refused; ROS sends none"
+            raise HttpRefusal(415, "compressed", text)
+        try:
+            size = request.content_length or 0
+            if size <= passing.SHORT and request.content.is_eof():  # it came with the header
+                await self._read_rest(request, call)
+                return None
+            async with asyncio.timeout(BODY_TIMEOUT):
+                invite(request)
+                if size > passing.SHORT and self._long_calls is not None:
+                    long_call = await self._read_head(request, call, size, self._long_calls)
+                    if long_call is not None:
+                        return self._pass_on(self._long_calls, call, long_call)
+                if size > self._limits.size:
+                    raise TooLong(self._limits.size)
+                await self._read_rest(request, call)
+        except TimeoutError:
+            text = f"the body took over {BODY_TIMEOUT:g} s"
+            raise HttpRefusal(408, "slow_body", text) from None
+        except TooLong as error:
+            raise HttpRefusal(413, "long_body", str(error)) from None
+        return None
+
+    async def _read_head(
+        self, request: web.BaseRequest, call: IncomingCall, size: int, service: LongCalls
+    ) -> LongCall | None:
+        """Read so much of a long body that its method is known; the call if it passes.
+
+        Raises TooLong, OverBudget.
+        """
+        while len(call.body) < passing.HEAD and not request.content.at_eof():
+            part = await request.content.readany()
+            call.hold(len(part))
+            call.body += part
+        method = passing.method_of(call.body)
+        watch = service.watch(method, size) if method else None
+        if method is None or watch is None:
+            return None
+        longest = self._context.settings.max_body * MEBIBYTE
+        if size > longest:
+            raise TooLong(longest)
+        return LongCall(method, size, call.body, request.content, watch)
+
+    async def _read_rest(self, request: web.BaseRequest, call: IncomingCall) -> None:
+        left = self._limits.size - len(call.body)
+        rest = await read_bounded(request.content, left, call.hold)
+        call.body = call.body + rest if call.body else rest
+        values = call.body.count(b"<value")
+        call.hold(VALUE * values)
+        if values > MANY_VALUES:
+            async with self._context.turn:
+                await asyncio.sleep(0)
+
+    async def _pass_on(
+        self, service: LongCalls, call: IncomingCall, long_call: LongCall
+    ) -> bytes | LongReply:
+        with Charge(self._context.passing, call.source) as charge:
+            charge.add(1)
+            return await service.pass_on(call, long_call)
+
+    async def _send_long(
+        self, request: web.BaseRequest, call: IncomingCall, reply: LongReply
+    ) -> web.StreamResponse:
+        """Send a reply on, piece by piece. Raises OverBudget."""
+        response = DocumentReply(b"", reply.size)
+        try:
+            with Charge(self._context.passing, call.source) as charge:
+                charge.add(1)
+                await response.prepare(request)
+                async for piece in reply.pieces():
+                    await request.writer.write(piece)
+        except (OSError, aiohttp.ClientError) as error:  # a time-out is one of the former
+            log.debug("a long reply for %s was cut: %s", request.remote, error)
+            return refuse(request)
+        finally:
+            reply.close()
+        return response
 
 
-class _Reply(web.StreamResponse):
-    """An XML-RPC document with status 200.
-
-    Its header is written here: aiohttp takes about as long for one as reading a document takes.
-    """
-
-    def __init__(self, document: bytes) -> None:
-        super().__init__()
-        self._document = document
-        self._lasts = False
-
-    @property
-    def keep_alive(self) -> bool:
-        """Whether the connection serves another request."""
-        return self._lasts
-
-    async def prepare(self, request: web.BaseRequest) -> None:
-        """Send it all. Raises ConnectionError."""
-        self._lasts = request.keep_alive
-        head = _head(request.version, self._lasts, len(self._document))
-        for piece in pieces(head, self._document):
-            await request.writer.write(piece)
-        await request.writer.drain()
-
-    async def write_eof(self, data: bytes = b"") -> None:
-        """Nothing is left to send."""
-
-
-def _head(version: HttpVersion, lasts: bool, size: int) -> bytes:
-    """A reply's header; that the connection lasts is said where HTTP's version doesn't imply it."""
-    lines = f"HTTP/{version.major}.{version.minor} 200 OK\r\nContent-Type: text/xml\r\n"
-    if lasts != (version >= HttpVersion11):
-        lines += f"Connection: {'keep-alive' if lasts else 'close'}\r\n"
-    return f"{lines}Content-Length: {size}\r\n\r\n".encode()
+def _nothing() -> None:
+    pass
 
 
 @lru_cache(maxsize=1024)
@@ -225,37 +372,3 @@ def _forbid(text: str) -> web.StreamResponse:
     response = web.Response(status=403, reason=text, text=f"{text}\n")
     response.force_close()
     return response
-
-
-async def _body(request: web.BaseRequest) -> bytes | web.StreamResponse:
-    """A request's body, or the response to one that can't be read."""
-    try:
-        if request.content.is_eof():  # it came together with the header
-            return await read_bounded(request.content)
-        async with asyncio.timeout(BODY_TIMEOUT):
-            _invite(request)
-            return await read_bounded(request.content)
-    except TimeoutError:
-        return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
-    except ValueError as error:
-        return web.Response(status=413, text=f"{error}\n")
-    except web.RequestPayloadError as error:
-        return web.Response(status=400, text=f"{error}\n")
-    except ConnectionResetError:
-        return _refuse(request)
-
-
-def _invite(request: web.BaseRequest) -> None:
-    """Ask for the body, if the client waits to be asked."""
-    waits = request.headers.get("Expect", "").lower() == "100-continue"
-    if waits and request.version >= HttpVersion11 and request.transport is not None:
-        request.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
-
-
-def _refuse(request: web.BaseRequest) -> web.StreamResponse:
-    """Reset the connection: what a caller finds whose peer is gone; ROS's clients try again."""
-    transport = request.transport
-    if transport is not None:
-        reset_on_close(transport.get_extra_info("socket"))
-        transport.abort()
-    return web.Response(status=503)

@@ -1,0 +1,56 @@
+"""Calls that are too long to be read whole and that a service need not read."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING, Protocol
+
+from aiohttp import StreamReader, web
+
+from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
+from rosproxy.ros1.clients.master import Unreachable
+from rosproxy.ros1.protocol.xmlrpc.passing import Watch
+
+if TYPE_CHECKING:
+    from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
+
+
+class LongCall:
+    """A call whose method is known and whose body of ``size`` bytes is still coming.
+
+    ``head`` is what of it has come, ``rest`` brings the rest.
+    """
+
+    def __init__(
+        self, method: str, size: int, head: bytes, rest: StreamReader, watch: Watch
+    ) -> None:
+        self.method, self.size = method, size
+        self._head, self._rest, self._watch = head, rest, watch
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        """The body, watched; its last piece comes once all of it was.
+
+        Raises XmlRpcError if it must not pass, Unreachable if the caller does not send it.
+        """
+        self._watch.see(self._head)
+        held = self._head
+        while not self._rest.at_eof():
+            try:
+                async with asyncio.timeout(PIECE_TIMEOUT):
+                    piece = await self._rest.readany()
+            except (OSError, web.RequestPayloadError) as error:  # a time-out is one of the former
+                raise Unreachable(f"the caller did not send all of it: {error}") from error
+            self._watch.see(piece)
+            yield held
+            held = piece
+        self._watch.end()
+        yield held
+
+
+class LongCalls(Protocol):
+    """What a service does with long calls that it need not read."""
+
+    def watch(self, method: str, size: int) -> Watch | None:
+        """How to watch a call of a method while it passes; None if it has to be read."""
+
+    async def pass_on(self, call: "IncomingCall", long_call: LongCall) -> bytes | LongReply:
+        """The reply to a call; ``call`` says who makes it. Raises XmlRpcError, Unreachable."""

@@ -1,0 +1,311 @@
+"""Bounds of calls, replies and connections: what passes unread, and what is refused."""
+
+import asyncio
+import socket
+from contextlib import AsyncExitStack
+from typing import Any
+
+import pytest
+
+from examples.demo.fake_http import value
+from rosproxy.net import gate, sockets
+from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, INVALID_REQUEST, PARSE_ERROR
+from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL, MASTER_CALL
+from tests.integration.net import (
+    MASTER,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    connect,
+    exchange,
+    greet,
+    knock,
+    post,
+    rpc,
+    topic_header,
+    until,
+    xml,
+)
+
+BOTH_LOOPS = True
+LONG = "x" * 3_000_000
+LISTED = [[1, 2.5, True, "&<é>", {"methodName": "shutdown", "a": []}]] * 4000
+"""Far more elements than a document that is read may have."""
+
+
+def pid(name: str = "/n") -> bytes:
+    return post(xml("getPid", name))
+
+
+@pytest.mark.parametrize("held", [LONG, LISTED], ids=["text", "list"])
+async def test_long_parameters_pass_unread_both_ways(proxy, master, monkeypatch, held):
+    monkeypatch.setattr("rosproxy.ros1.api.master.master_api.read_request", None)
+    assert (await rpc(proxy.master, "setParam", "/n", "/p", held, source=NODE))[0] == 1
+    assert master.params["/p"] == held
+    monkeypatch.undo()
+    assert (await rpc(proxy.master, "getParam", "/n", "/p", source=NODE))[2] == held
+    assert proxy.metric("xmlrpc_calls_total", api="master", method="setParam", outcome="answered")
+
+
+async def test_a_long_parameter_reaches_its_subscriber(proxy, master, node):
+    await node.publish(proxy.master)
+    body = xml("paramUpdate", "/master", "/p/", LISTED)
+    assert len(body) > LEASE_CALL.size
+    assert (await exchange(proxy.lease(node), post(body), MASTER)).value[0] == 1
+    assert ("paramUpdate", ("/master", "/p/", LISTED)) in node.calls
+    assert body in [request.body for request in node.requests]
+
+
+async def test_no_other_long_call_passes_a_node_s_port(proxy, node):
+    await node.publish(proxy.master)
+    for method in ("publisherUpdate", "shutdown", "getPid", "system.multicall", "foo"):
+        reply = await exchange(proxy.lease(node), post(xml(method, "/n", LONG)))
+        assert reply.status == 413, method
+    assert {caller for _, (caller, *_) in node.calls} <= {"/rosproxy"}
+
+
+async def test_a_long_body_that_hides_another_call_never_reaches_the_master(proxy, master):
+    body = xml("setParam", "/n", "/p", LONG)
+    for hidden in (b"<methodName>registerPublisher</methodName>", b"<!-- <methodName> -->", b"\0"):
+        for place in (100_000, len(body) - 40):
+            whole = body[:place] + hidden + body[place:]
+            assert (await exchange(proxy.master, post(whole), NODE)).fault == INVALID_REQUEST
+    assert (await exchange(proxy.master, pid(), NODE)).value[0] == 1
+    assert not master.named("setParam")
+    assert not master.named("registerPublisher")
+
+
+async def test_a_long_body_that_ends_early_never_reaches_the_master(proxy, master):
+    request = post(xml("setParam", "/n", "/p", LONG))
+    async with connect(proxy.master, NODE) as wire:
+        await wire.send(request[:-1])
+        await wire.half_close()
+        assert await wire.outcome() in ("closed", "reset")
+    assert not master.named("setParam")
+
+
+async def test_a_long_call_with_an_odd_head_is_bounded(proxy):
+    body = xml("setParam", "/n", "/p", LONG)
+    odd = body.replace(b"<methodCall>", b"<methodCall><!-- odd -->")
+    assert (await exchange(proxy.master, post(odd), NODE)).value[0] == 1  # read as a whole
+    longer = odd.replace(b"xxx", b"xxxxx")
+    assert len(longer) > MASTER_CALL.size
+    assert (await exchange(proxy.master, post(longer), NODE)).status == 413
+
+
+def parameters(count: int, held: Any) -> list[dict[str, Any]]:
+    """What roslaunch sends for its parameters."""
+    return [{"methodName": "setParam", "params": ["/n", f"/p{i}", held]} for i in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("count", "held"), [(3000, [1, 2]), (2500, "x" * 2000)], ids=["many elements", "many bytes"]
+)
+async def test_a_long_multicall_of_parameters_passes(proxy, master, count, held):
+    body = xml("system.multicall", parameters(count, held))
+    assert (await exchange(proxy.master, post(body), NODE)).value == [
+        [[1, f"parameter /p{i} set", 0]] for i in range(count)
+    ]
+    assert master.params[f"/p{count - 1}"] == held
+
+
+async def test_a_long_multicall_with_a_registration_is_read_or_refused(proxy, master, node):
+    register = ["/talker", "/chatter", "x/Y", node.uri]
+    calls = [*parameters(500, "x" * 500), {"methodName": "registerPublisher", "params": register}]
+    body = xml("system.multicall", calls)
+    assert passing.SHORT < len(body) < MASTER_CALL.size
+    assert (await exchange(proxy.master, post(body), NODE)).value[-1][0][0] == 1
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+    longer = xml("system.multicall", [*parameters(3000, "x" * 2000), calls[-1]])
+    assert (await exchange(proxy.master, post(longer), NODE)).fault == INVALID_REQUEST
+
+
+async def test_calls_of_a_multicall_are_bounded(proxy):
+    calls = [{"methodName": "lookupNode", "params": ["/n", "/m"]}] * 1001
+    reply = await exchange(proxy.master, post(xml("system.multicall", calls)), NODE)
+    assert reply.fault == INVALID_PARAMS
+
+
+async def test_a_multicall_ends_with_its_client(proxy, node):
+    await node.publish(proxy.master)
+    calls = [{"methodName": "getUri", "params": ["/n"]}] * 500
+    node.delay = 0.02
+
+    def asked() -> int:
+        return sum(method == "getUri" for method, _ in node.calls)
+
+    async with connect(proxy.lease(node)) as wire:
+        await wire.send(post(xml("system.multicall", calls)))
+        await until(lambda: asked() > 2, "the first calls are made")
+    await until(lambda: not proxy.app.context.buffered.used, "the call is given up")
+    assert asked() < 400
+
+
+async def test_a_registration_whose_client_has_gone_is_not_half_noted(proxy, master, node):
+    await node.publish(proxy.master)
+    uris = [f"http://{NODE}:{1 + i}/" for i in range(5)]
+    calls = [
+        {"methodName": "registerPublisher", "params": [f"/n{i}", "/t", "x/Y", uri]}
+        for i, uri in enumerate(uris)
+    ]
+    async with connect(proxy.master, NODE) as wire:
+        await wire.send(post(xml("system.multicall", calls)))
+    await until(lambda: not proxy.app.context.buffered.used, "the call has ended")
+    assert {e.pending for e in proxy.app.context.registry} == {False}
+
+
+async def test_too_many_elements_are_a_fault(proxy, node):
+    await node.publish(proxy.master)
+    for where, limits in ((proxy.lease(node), LEASE_CALL), (proxy.master, MASTER_CALL)):
+        params = b"<param><value/></param>" * (limits.elements // 2)
+        body = xml("registerService").replace(b"<params>", b"<params>" + params)
+        assert passing.SHORT < len(body) < limits.size
+        assert (await exchange(where, post(body), NODE)).fault == PARSE_ERROR
+
+
+async def test_a_call_that_only_the_master_may_make_is_not_parsed(make_proxy, node, monkeypatch):
+    proxy = await make_proxy(slave_control="master")
+    await node.publish(proxy.master)
+    monkeypatch.setattr("rosproxy.ros1.api.slave.xmlrpc.parse_call", None)
+    for body in (
+        xml("publisherUpdate", "/m", "/t", ["x"] * 100),
+        xml("paramUpdate", "/m", "/p", LONG),
+    ):
+        reply = await exchange(proxy.lease(node), post(body))
+        assert reply.value[:2] == [-1, "rosproxy: only the master may call this"]
+    monkeypatch.undo()
+    assert (await exchange(proxy.lease(node), pid())).value[0] == 1
+    assert (
+        await exchange(proxy.lease(node), post(xml("paramUpdate", "/m", "/p", LONG)), MASTER)
+    ).value[0] == 1
+
+
+async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
+    proxy = await make_proxy(max_buffered=1)
+    await node.publish(proxy.master)
+    held = xml("publisherUpdate", "/m", "/t", ["x" * 1000] * 400)
+    async with AsyncExitStack() as stack:
+        for _ in range(2):
+            wire = await stack.enter_async_context(connect(proxy.lease(node)))
+            await wire.send(post(held)[:-1])
+        reply = await exchange(proxy.lease(node), post(held))
+        assert reply.status == 503
+        assert b"more than 524288 bytes of requests and replies at once from" in reply.body
+        assert (await rpc(proxy.master, "getPid", "/n", source=NODE))[0] == 1
+    assert proxy.metric("refused_total", reason="over_budget")
+    (problem,) = proxy.app.status()["problems"]
+    assert problem["subject"] == "refused: over budget"
+    await until(lambda: not proxy.app.context.buffered.used, "all is given back")
+
+
+async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, master, monkeypatch):
+    cut = lambda sock: sockets.end_if_stalled(sock, 1.0)  # noqa: E731
+    monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.end_if_stalled", cut)
+    master.answers["getParam"] = value("x" * 20_000_000)
+
+    async def open_reader() -> socket.socket:
+        sock = socket.socket()
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        sock.setblocking(False)
+        sock.bind((NODE, 0))
+        loop = asyncio.get_running_loop()
+        await loop.sock_connect(sock, proxy.master)
+        await loop.sock_sendall(sock, post(xml("getParam", "/n", "/p")))
+        return sock
+
+    idle, slow = await open_reader(), await open_reader()
+    loop = asyncio.get_running_loop()
+    passes = proxy.app.context.passing
+    await until(lambda: passes.used == 2, "both replies are under way")
+    taken = 0
+    while passes.used == 2:
+        taken += len(await loop.sock_recv(slow, 100_000))
+        await asyncio.sleep(0.05)
+    while taken < 20_000_000:
+        part = await loop.sock_recv(slow, 1_000_000)
+        assert part, f"the slow one was cut after {taken} bytes"
+        taken += len(part)
+    idle.close()
+    slow.close()
+
+
+async def test_a_source_with_too_many_connections_is_refused_and_others_are_not(make_proxy, node):
+    proxy = await make_proxy(max_connections_per_source=20)
+    await node.publish(proxy.master)
+    lease = proxy.lease(node)
+    async with AsyncExitStack() as stack:
+        for number in range(20):
+            wire = await stack.enter_async_context(connect(lease))
+            await wire.send(pid() if number % 2 else topic_header())
+            assert await wire.exactly(1)
+        assert await knock(lease, b"") == "reset"
+        assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
+    assert proxy.metric("refused_total", reason="connections_per_source")
+    await until(lambda: not proxy.app.context.gate._by_source[OUTSIDE], "all have gone")
+    assert (await exchange(lease, pid())).value[0] == 1
+
+
+async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
+    proxy = await make_proxy(max_connections_per_lease=16)
+    one, other = await make_node("/one"), await make_node("/other", OTHER_NODE)
+    for node in (one, other):
+        await node.publish(proxy.master)
+    async with AsyncExitStack() as stack:
+        for number in range(16):
+            wire = await stack.enter_async_context(
+                connect(proxy.lease(one), f"127.0.1.{20 + number}")
+            )
+            await wire.send(topic_header())
+            assert await wire.exactly(1)
+        assert await knock(proxy.lease(one), b"") == "reset"
+        assert (await greet(proxy.lease(other), topic_header()))["callerid"] == "/other"
+
+
+async def test_the_silent_one_that_waited_longest_goes_first(proxy, node, monkeypatch):
+    monkeypatch.setattr(gate, "WAITING", 3)
+    await node.publish(proxy.master)
+    lease = proxy.lease(node)
+    async with AsyncExitStack() as stack:
+        wires = [await stack.enter_async_context(connect(lease)) for _ in range(3)]
+        await wires[0].send(b"P")
+        await wires[1].send(b"POST / HTTP/1.1\r\n")
+        await wires[2].send(topic_header()[:10])
+        await asyncio.sleep(0.1)
+        assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
+        for wire in wires:
+            assert (await exchange(lease, pid())).value[0] == 1
+            assert await wire.outcome() in ("closed", "reset", "answered")
+            await stack.enter_async_context(connect(lease))  # another one takes its place
+            await asyncio.sleep(0.1)
+
+
+async def test_a_compressed_reply_is_not_inflated(proxy, master):
+    master.answers["getParam"] = (
+        b"HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: 5\r\n\r\nxxxxx"
+    )
+    async with connect(proxy.master, NODE) as wire:
+        await wire.send(post(xml("getParam", "/n", "/p")))
+        assert await wire.end() == "reset"
+
+
+async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
+    monkeypatch.setattr("rosproxy.admin.server.MOST_CONNECTIONS", 3)
+    where = proxy.settings.admin.host, proxy.settings.admin.port
+    ask = b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n"
+    async with connect(where) as first, connect(where) as second, connect(where) as third:
+        await second.send(ask)
+        assert (await second.reply()).status == 200
+        assert (await exchange(where, ask, OTHER_NODE)).status == 200
+        assert (await exchange(where, ask)).status == 200
+        assert await first.outcome() == "closed"
+        await third.send(ask)
+        assert (await third.reply()).status == 200
+
+
+async def test_a_half_sent_body_at_the_admin_endpoint_is_408(proxy, monkeypatch):
+    monkeypatch.setattr("rosproxy.admin.server.BODY_TIMEOUT", 0.1)
+    where = proxy.settings.admin.host, proxy.settings.admin.port
+    async with connect(where) as wire:
+        await wire.send(post(b"{", "Content-Length: 10", path="/probe"))
+        assert (await wire.reply()).status == 408
