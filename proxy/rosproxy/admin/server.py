@@ -4,8 +4,12 @@ GET only tells, and is open to whoever reaches the endpoint, which is on loopbac
 changes things: it is for callers on loopback that are no web page, and for those that know the
 token, of which only the hash is held here. What a POST does is given as an action by its path;
 actions wait for each other as far as they have to.
+
+It serves few and friends, so its bounds are tight and no options: a source that has too many
+connections loses its oldest, and who sends half a request or reads no reply is cut.
 """
 
+import asyncio
 import hashlib
 import hmac
 import json
@@ -20,6 +24,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.admin.requests import BodyError
 from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.sockets import end_if_stalled
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
@@ -27,6 +32,12 @@ log = logging.getLogger(__name__)
 INDEX = "rosproxy: /healthz /readyz /metrics /status\n"
 MAX_BODY = 1024 * 1024
 """Longest body in bytes of a POST."""
+MOST_CONNECTIONS = 32
+"""Connections from one address: an operator, a health check and Prometheus have one or two each."""
+IDLE_TIMEOUT = 75.0
+"""Seconds in which the next request must have arrived, the first one as well."""
+BODY_TIMEOUT = 10.0
+"""Seconds in which the body of a POST must have arrived."""
 FORBIDDEN = (
     "rosproxy: POST is for callers on this host's loopback, and for those that send "
     "'Authorization: Bearer TOKEN' with the proxy's --admin-token (ROSPROXY_ADMIN_TOKEN){}\n"
@@ -50,12 +61,34 @@ class AdminServer:
     _unready: Callable[[], str | None]
     _actions: Mapping[str, Action]
     _token_hash: str | None
-    _runner: web.AppRunner | None = None
+    _runner: web.ServerRunner | None = None
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
-        app = web.Application(client_max_size=MAX_BODY)
-        answers: dict[str, Callable[[], web.Response]] = {
+        self._runner = web.ServerRunner(_BoundedServer(self._answer))
+        await self._runner.setup()
+        await web.TCPSite(self._runner, where.host, where.port).start()
+
+    async def stop(self) -> None:
+        """Stop listening."""
+        if self._runner is not None:
+            await self._runner.cleanup()
+
+    async def _answer(self, request: web.BaseRequest) -> web.Response:
+        get = self._pages().get(request.path)
+        posted = request.path in self._actions
+        if get is not None and request.method in ("GET", "HEAD"):
+            return get()
+        if posted and request.method == "POST":
+            return await self._post(request)
+        if get is None and not posted:
+            return web.Response(status=404, text="404: Not Found")
+        allowed = "POST" if posted else "GET,HEAD"
+        text = "405: Method Not Allowed"
+        return web.Response(status=405, text=text, headers={"Allow": allowed})
+
+    def _pages(self) -> dict[str, Callable[[], web.Response]]:
+        return {
             "/": lambda: web.Response(text=INDEX),
             "/healthz": lambda: web.Response(text="ok\n"),
             "/readyz": self._readiness,
@@ -65,30 +98,21 @@ class AdminServer:
             "/status": lambda: web.json_response(self._status()),
         }
 
-        async def get(request: web.Request) -> web.Response:
-            return answers[request.path]()
-
-        app.add_routes([web.get(path, get) for path in answers])
-        app.add_routes([web.post(path, self._post) for path in self._actions])
-        self._runner = web.AppRunner(app, access_log=None)
-        await self._runner.setup()
-        await web.TCPSite(self._runner, where.host, where.port).start()
-
-    async def stop(self) -> None:
-        """Stop listening."""
-        if self._runner is not None:
-            await self._runner.cleanup()
-
     def _readiness(self) -> web.Response:
         reason = self._unready()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
-    async def _post(self, request: web.Request) -> web.Response:
+    async def _post(self, request: web.BaseRequest) -> web.Response:
         if not self._may_post(request):
             hint = "" if self._token_hash else "; this proxy has none"
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
-            body = _read_json(await request.read())
+            async with asyncio.timeout(BODY_TIMEOUT):
+                sent = await request.read()
+        except TimeoutError:
+            return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
+        try:
+            body = _read_json(sent)
             return web.json_response(await self._actions[request.path](body))
         except BodyError as error:
             return web.Response(status=400, text=f"rosproxy: {error}\n")
@@ -96,7 +120,7 @@ class AdminServer:
             log.warning("POST %s could not be carried out: %s", request.path, error)
             return web.Response(status=503, text=f"rosproxy: {error}; try again\n")
 
-    def _may_post(self, request: web.Request) -> bool:
+    def _may_post(self, request: web.BaseRequest) -> bool:
         """Whether a caller may post.
 
         A browser on this host is on loopback too; it says on behalf of which page it calls.
@@ -108,6 +132,29 @@ class AdminServer:
             if hmac.compare_digest(sent, self._token_hash):
                 return True
         return is_loopback(request.remote or "") and "Origin" not in request.headers
+
+
+class _BoundedServer(web.Server):
+    """Serves so many connections from one address."""
+
+    def __init__(self, answer: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]) -> None:
+        super().__init__(
+            answer, access_log=None, keepalive_timeout=IDLE_TIMEOUT, auto_decompress=False
+        )
+
+    def connection_made(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Take a connection in, and end the oldest one of its source if that has too many."""
+        end_if_stalled(transport.get_extra_info("socket"))
+        source = _source(handler)
+        mine = [other for other in self.connections if _source(other) == source]
+        if len(mine) >= MOST_CONNECTIONS:
+            mine[0].force_close()
+        super().connection_made(handler, transport)
+
+
+def _source(handler: web.RequestHandler) -> object:
+    """The address that a connection comes from."""
+    return handler.peername[0] if handler.peername else None
 
 
 def _read_json(body: bytes) -> Any:
