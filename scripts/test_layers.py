@@ -10,7 +10,7 @@ after another, the lanes run side by side, and on two processors they end at abo
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
      already. After that the longest lane begins, docker, which mostly waits, and the one of image,
-     chart and unit.
+     abuse, chart and unit.
   2. After the integration tests real ROS nodes and the Kubernetes cluster have a lane each.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
@@ -106,6 +106,18 @@ def debian_root_obstacle() -> str | None:
     return None
 
 
+def cgroup_obstacle() -> str | None:
+    """Say what keeps this machine from bounding a process's memory."""
+    if platform.system() != "Linux":
+        return "it needs Linux"
+    if os.geteuid() != 0:
+        return "it needs root"
+    groups = Path("/sys/fs/cgroup")
+    if not any(os.access(groups / name, os.W_OK) for name in ("memory", "cgroup.subtree_control")):
+        return f"{groups} can't be written here (a container?)"
+    return None
+
+
 def is_debian() -> bool:
     try:
         release = platform.freedesktop_os_release()
@@ -124,6 +136,7 @@ def effective_capabilities() -> int:
 
 UNIT = Layer("unit", smoke=ALL)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
+ABUSE = Layer("abuse", obstacle=cgroup_obstacle)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
 IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
@@ -131,7 +144,7 @@ DOCKER_ENGINE = Layer(
     "docker", MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
 )
 CLUSTER = Layer("kubernetes", setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle)
-LAYERS = (UNIT, INTEGRATION, CHART, IMAGE, ROS_NODES, DOCKER_ENGINE, CLUSTER)
+LAYERS = (UNIT, INTEGRATION, ABUSE, CHART, IMAGE, ROS_NODES, DOCKER_ENGINE, CLUSTER)
 
 
 class Run:
@@ -150,7 +163,7 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._lane, [INTEGRATION])
             self._prepare()
-            early, late = ([DOCKER_ENGINE], [IMAGE, CHART, UNIT]), ([ROS_NODES], [CLUSTER])
+            early, late = ([DOCKER_ENGINE], [IMAGE, ABUSE, CHART, UNIT]), ([ROS_NODES], [CLUSTER])
             lanes = [integration, *(pool.submit(self._lane, lane) for lane in early)]
             integration.result()
             lanes += [pool.submit(self._lane, lane) for lane in late]
