@@ -22,9 +22,7 @@ def proxy(controller: Controller, net: Inside) -> Proxy:
 
 
 @pytest.fixture(params=["sandbox", "proxy"])
-def forged_image(
-    request: pytest.FixtureRequest, proxy: Proxy, ros_image: str
-) -> Iterator[str]:
+def forged_image(request: pytest.FixtureRequest, proxy: Proxy, ros_image: str) -> Iterator[str]:
     """An image with all that an image can have of one of a proxy's containers."""
     tag, made = unique("image"), docker("create", ros_image, "true")
     name = proxy.sandbox if request.param == "sandbox" else proxy.name
