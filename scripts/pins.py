@@ -13,7 +13,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -47,7 +47,7 @@ def pins(extras: Iterable[str]) -> list[Pin]:
     return [pin for pin in every if pin.name in wanted]
 
 
-def _required(project: dict, extra: str) -> Iterator[str]:  # type: ignore[type-arg]
+def _required(project: dict[str, Any], extra: str) -> Iterator[str]:
     """The names that rosproxy itself (no extra) or one of its extras requires."""
     if extra == "build-system":
         requirements = project["build-system"]["requires"]
