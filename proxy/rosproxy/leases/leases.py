@@ -93,6 +93,7 @@ class Leases(Generic[_H]):
         self._tasks, self._problems = tasks, problems
         self._reserved: dict[int, socket.socket] = {}
         self._acceptors: dict[int, Acceptor] = {}
+        self._closed = False
 
     def reserve_range(self) -> list[int]:
         """Bind all ports of the range; returns those that other programs hold."""
@@ -117,7 +118,7 @@ class Leases(Generic[_H]):
 
     def open(self, endpoint: _H) -> None:
         """Let an endpoint's ports listen, if it still holds the lease."""
-        if self._holders.by_port.get(endpoint.port) is not endpoint:
+        if self._closed or self._holders.by_port.get(endpoint.port) is not endpoint:
             return
         self._kernel.note_change(endpoint)
         if error := self._listen(endpoint, endpoint.port):
@@ -142,7 +143,8 @@ class Leases(Generic[_H]):
             self._holders.remove(endpoint)
 
     def close_all(self) -> None:
-        """Close all ports and give the range back; endpoints and registrations stay."""
+        """Close all ports and give the range back, for good; endpoints and registrations stay."""
+        self._closed = True
         for endpoint in self._holders:
             self.close(endpoint)
         for sock in self._reserved.values():
@@ -201,7 +203,9 @@ class Leases(Generic[_H]):
             pool.give_back(port)
 
     def _reserve(self, port: int) -> bool:
-        """Bind a port, which then refuses; False if another program holds it."""
+        """Bind a port, which then refuses; False if another program holds it, or all is over."""
+        if self._closed:
+            return False
         try:
             self._reserved[port] = bind(self._address, port)
         except OSError as error:
