@@ -1,6 +1,7 @@
 """What the chart makes of its values, alone and in combination."""
 
 import json
+import re
 import shutil
 from functools import cache
 from pathlib import Path
@@ -113,8 +114,11 @@ def test_arguments(combination: str) -> None:
 def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     """What RosProxies may ask for, and who may reach their proxies."""
     allow = values.get("allow", {})
+    (args,) = (one["args"] for one in pod["containers"])
+    tested = [one.partition("=")[2] for one in args if re.search("--allow-master=.*-test[.]", one)]
+    assert len(tested) == bool(allow)
     assert settings.plan.bounds == Bounds(
-        masters=tuple(allow.get("masters", ())),
+        masters=(*allow.get("masters", ()), *tested),
         max_ports=allow.get("maxPorts", MOST_PORTS),
         data_planes=("auto", "kernel") if allow else ("auto", "splice", "copy"),
         images=tuple(allow.get("images", ())),
@@ -240,6 +244,14 @@ def test_the_operator_may_reach_its_proxies() -> None:
     assert "--no-network-policy" not in pod["containers"][0]["args"]
     off = objects({"proxy": {"networkPolicy": {"enabled": False}}})
     assert "--no-network-policy" in operator(off)[0]["containers"][0]["args"]
+
+
+def test_helms_test_may_name_its_master() -> None:
+    found = objects({"namespaces": ["robots"], "allow": {"masters": ["http://192.0.2.*:11311"]}})
+    (pod,), (rosproxy,) = operator(found), of_kind(found, "RosProxy")
+    service = rosproxy["spec"]["master"]["service"]["name"]
+    master = f"http://{service}.{rosproxy['metadata']['namespace']}.svc:11311"
+    assert f"--allow-master={master}" in pod["containers"][0]["args"]
 
 
 def test_cert_manager() -> None:
