@@ -4,12 +4,12 @@ import time
 
 from tests.docker.engine import run, wait_until
 from tests.docker.images import PROXY
-from tests.kubernetes import release
+from tests.kubernetes import api, release
 from tests.kubernetes.cluster.images import load_images
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
-from tests.kubernetes.rosproxies import rosproxy
+from tests.kubernetes.rosproxies import Proxy, rosproxy
 from tests.kubernetes.traffic import flow
 
 OTHER = "rosproxy:other"
@@ -48,6 +48,39 @@ def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
         assert (after.uid_then, after.ports) == (before.uid_then, before.ports)
         assert after.body["spec"]["containers"][0]["image"] == OTHER
     release.upgrade()
+
+
+def test_another_key_of_the_tokens(net: Namespace, robot: Robot) -> None:
+    """Proxies are made anew on their ports, one after the other, and ROS nodes go on."""
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    for node in ("node1", "node2"):
+        net.idle(on=node)
+    with flow(net, robot, "roscpp") as traffic:
+        before = {node: made.the_proxy(node) for node in ("node1", "node2")}
+        hashes = {node: _hash(one) for node, one in before.items()}
+        there: list[int] = []
+
+        def anew() -> bool:
+            now = {one.on: one for one in made.proxies}
+            there.append(len(now))
+            return now.keys() == before.keys() and not (
+                {one.uid_then for one in now.values()} & {one.uid_then for one in before.values()}
+            )
+
+        started = time.time()
+        api.patch("secrets", release.NAMESPACE, f"{release.FULL_NAME}-key", {"data": None})
+        wait_until(anew, 90, made.tell)
+        assert min(there) == 1
+        for node, one in before.items():
+            after = made.the_proxy(node)
+            assert after.ports == one.ports
+            assert _hash(after) not in ("", hashes[node])
+        traffic.wait(since=time.time(), seconds=60)
+        note(f"another key, two proxies made anew: {traffic.gaps(started)}")
+
+
+def _hash(proxy: Proxy) -> str:
+    return str(proxy.environment["ROSPROXY_ADMIN_TOKEN_HASH"])
 
 
 def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
