@@ -1,9 +1,11 @@
 """The Docker engine that the tests use, by its command line."""
 
+import contextlib
 import fcntl
 import json
 import os
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +16,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 _USERS = Path("/run/lock/rosproxy-tests-engine")
 _DOOR = Path("/run/lock/rosproxy-tests-engine-door")
+_STARTED = Path("/run/lock/rosproxy-tests-engine-started")
+"""The process of the engine that was started here, and the policy for forwarding before it."""
+_PID = Path("/run/docker.pid")
 
 
 def run(*command: str | Path, check: bool = True, seconds: float = 60, **options: Any) -> str:
@@ -74,40 +79,52 @@ def running_engine(log: Path) -> Iterator[None]:
     """Use the engine that runs; start one where none does.
 
     Several processes may be in here at the same time: each holds a shared lock as long as it uses
-    the engine. The one that has started it waits for the others before it stops it; who comes
+    the engine. The last one to leave stops it, if it is one that was started here; who comes
     meanwhile waits at the door, and starts one of its own.
     """
     with _DOOR.open("w") as door, _USERS.open("w") as users:
         fcntl.flock(door, fcntl.LOCK_EX)
-        own = None if answers() else _Daemon(log)
+        if not answers():
+            _start_engine(log)
         fcntl.flock(users, fcntl.LOCK_SH)
         fcntl.flock(door, fcntl.LOCK_UN)
         try:
             yield
         finally:
             fcntl.flock(users, fcntl.LOCK_UN)
-            if own:
-                fcntl.flock(door, fcntl.LOCK_EX)
-                fcntl.flock(users, fcntl.LOCK_EX)
-                own.stop()
+            fcntl.flock(door, fcntl.LOCK_EX)
+            with contextlib.suppress(BlockingIOError):  # others use it
+                fcntl.flock(users, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _stop_engine()
 
 
-class _Daemon:
-    """An engine that was started here, and answers."""
+def _start_engine(log: Path) -> None:
+    """Start an engine that outlives this process, and wait until it answers."""
+    policy = forward_policy()
+    run("setsid", "--fork", "sh", "-c", 'exec dockerd >"$0" 2>&1', log)
+    wait_until(answers, 60, log.read_text)
+    _STARTED.write_text(f"{_PID.read_text().strip()} {policy}")
 
-    def __init__(self, log: Path) -> None:
-        self._policy = forward_policy()
-        with log.open("wb") as output:
-            self._process = subprocess.Popen(
-                ["dockerd"], stdout=output, stderr=output, start_new_session=True
-            )
-        wait_until(lambda: self._process.poll() is not None or answers(), 60, log.read_text)
-        assert self._process.poll() is None, log.read_text()
 
-    def stop(self) -> None:
-        self._process.terminate()
-        self._process.wait(60)
-        run("iptables", "-P", "FORWARD", self._policy)
+def _stop_engine() -> None:
+    """Stop the engine, if it is one that was started here."""
+    if not _STARTED.exists():
+        return
+    number, policy = _STARTED.read_text().split()
+    _STARTED.unlink()
+    if not _PID.exists() or _PID.read_text().strip() != number:
+        return
+    os.kill(int(number), signal.SIGTERM)
+    wait_until(lambda: not _runs(number), 60, "the engine has stopped")
+    run("iptables", "-P", "FORWARD", policy)
+
+
+def _runs(process: str) -> bool:
+    """Whether a process is there, and has not ended without anybody asking how."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def forward_policy() -> str:

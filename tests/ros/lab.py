@@ -242,7 +242,18 @@ class Lab:
         return dict(publishers).get(topic, []), dict(subscribers).get(topic, [])
 
     def wait_registered(self, name: str, timeout: float = 60) -> None:
-        wait_until(f"{name} is registered", lambda: self.registered(name), timeout)
+        """Wait until a node is up.
+
+        Its logger's services come last of what every node registers. Before, it is still asking
+        the master for parameters, and rospy gives up for good when one such call fails.
+        """
+        level = f"{_absolute(name)}/set_logger_level"
+
+        def is_up() -> bool:
+            services = dict(self.ask_master("getSystemState")[2])
+            return _absolute(name) in services.get(level, [])
+
+        wait_until(f"{name} is registered", is_up, timeout)
 
     def wait_unregistered(self, name: str, timeout: float = 60) -> None:
         wait_until(f"{name} is unregistered", lambda: not self.registered(name), timeout)
