@@ -9,9 +9,9 @@ after another, the lanes run side by side, and on two processors they end at abo
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
-     already. After that the longest lane begins, docker, which mostly waits, and the one of image,
-     abuse, chart and unit.
-  2. After the integration tests real ROS nodes and the Kubernetes cluster have a lane each.
+     already. After that docker begins, which is the longest and mostly waits, and image.
+  2. After the integration tests the Kubernetes cluster has a lane, and real ROS nodes have one,
+     which ends with the layers of plain computing.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
 machine that is busy with compiling.
@@ -163,7 +163,8 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._lane, [INTEGRATION])
             self._prepare()
-            early, late = ([DOCKER_ENGINE], [IMAGE, ABUSE, CHART, UNIT]), ([ROS_NODES], [CLUSTER])
+            early = [DOCKER_ENGINE], [IMAGE]
+            late = [ROS_NODES, ABUSE, CHART, UNIT], [CLUSTER]
             lanes = [integration, *(pool.submit(self._lane, lane) for lane in early)]
             integration.result()
             lanes += [pool.submit(self._lane, lane) for lane in late]
