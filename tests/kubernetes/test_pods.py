@@ -72,8 +72,10 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
 def test_pod_that_ends_by_itself(made: RosProxy, net: Namespace, robot: Robot) -> None:
     """A Job's pod stays as Succeeded: it counts no longer, and its proxy goes."""
     made.change(graceSeconds=1)
-    pod = net.pod("sh", "-c", "sleep 5", on="node1", restartPolicy="Never")
+    job = "until [ -e /tmp/done ]; do sleep 0.1; done"  # it must not be done before it was seen
+    pod = net.pod("sh", "-c", job, on="node1", restartPolicy="Never")
     made.the_proxy()
+    pod.run("touch", "/tmp/done")
     wait_until(lambda: pod.body["status"].get("phase") == "Succeeded", 60, lambda: str(pod.body))
     wait_until(lambda: not made.proxies, 60, made.tell)
 

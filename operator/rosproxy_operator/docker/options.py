@@ -2,7 +2,7 @@
 
 import click
 
-from rosproxy.cli.options import Command, Parsed
+from rosproxy.cli.options import Command, Parsed, with_options
 from rosproxy_operator.docker.planner.labels.bounds import read_master_pattern
 from rosproxy_operator.docker.planner.model import MOST_PORTS
 from rosproxy_operator.docker.settings import read_memory, read_pids, read_secret
@@ -60,6 +60,4 @@ _OPTIONS = (
 
 def bound_options(command: Command) -> Command:
     """What labels may ask for, what each proxy may take, and the secret of their tokens."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
+    return with_options(command, _OPTIONS)

@@ -189,6 +189,18 @@ class Api:
             self._versions[kind] = newest
         return items
 
+    def fill_secret(self, name: Name, there: Json, entries: Mapping[str, str]) -> None:
+        """Write entries (in base64) into a Secret, if it is as it was when it was read.
+
+        Raises ApiInvalid or ApiConflict if somebody else was faster, other ApiErrors.
+        """
+        version = word(part(there, "metadata"), "resourceVersion")
+        operations: list[Json] = [
+            {"op": "test", "path": "/metadata/resourceVersion", "value": version},
+            {"op": "add", "path": "/data", "value": {**part(there, "data"), **entries}},
+        ]
+        self.patch("secrets", name, operations)
+
     def _items(self, found: Found) -> list[Found]:
         items = found.get("items")
         if not isinstance(items, list):

@@ -3,11 +3,9 @@
 The rest is in `rosproxy_operator.cli`.
 """
 
-from collections.abc import Callable
-
 import click
 
-from rosproxy.cli.options import Command, Parsed
+from rosproxy.cli.options import Command, Parsed, with_options
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import read_glob, read_name, read_peers
 
@@ -16,8 +14,7 @@ GLOB = Parsed("glob", read_glob)
 
 def administrators_options(command: Command) -> Command:
     """What a RosProxy may ask for: the administrator's word."""
-    return _with(
-        command,
+    options = (
         click.option(
             "--allow-master",
             type=GLOB,
@@ -52,12 +49,12 @@ def administrators_options(command: Command) -> Command:
             help="Who may control ROS nodes from outside; a RosProxy may only narrow it.",
         ),
     )
+    return with_options(command, options)
 
 
 def own_options(command: Command) -> Command:
     """Who may reach the proxies, and how the operator proves to them who it is."""
-    return _with(
-        command,
+    options = (
         click.option(
             "--network-policy/--no-network-policy",
             default=True,
@@ -76,9 +73,4 @@ def own_options(command: Command) -> Command:
             "restarts.",
         ),
     )
-
-
-def _with(command: Command, *options: Callable[[Command], Command]) -> Command:
-    for option in reversed(options):
-        command = option(command)
-    return command
+    return with_options(command, options)

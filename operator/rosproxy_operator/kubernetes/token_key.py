@@ -62,17 +62,9 @@ class TokenKey:
 
     def _put(self, secret: Name, key: bytes, there: Json) -> None:
         """Write a key into the Secret. Whoever was faster has the right one. Raises ApiError."""
-        data = {**part(there, "data"), ENTRY: base64.b64encode(key).decode()}
-        version = word(part(there, "metadata"), "resourceVersion")
+        entries = {ENTRY: base64.b64encode(key).decode()}
         try:
-            self._api.patch(
-                "secrets",
-                secret,
-                [
-                    {"op": "test", "path": "/metadata/resourceVersion", "value": version},
-                    {"op": "add", "path": "/data", "value": data},
-                ],
-            )
+            self._api.fill_secret(secret, there, entries)
         except (ApiInvalid, ApiConflict) as error:
             raise ApiAway(f"somebody else writes {secret}: {error}") from None
         log.info("made a key for the proxies' tokens in Secret %s", secret)

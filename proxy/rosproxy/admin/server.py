@@ -24,6 +24,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.admin.requests import BodyError
 from rosproxy.net.addresses import HostPort, is_loopback
+from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.net.sockets import end_if_stalled
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 
@@ -108,9 +109,11 @@ class AdminServer:
             return web.Response(status=403, text=FORBIDDEN.format(hint))
         try:
             async with asyncio.timeout(BODY_TIMEOUT):
-                sent = await request.read()
+                sent = await read_bounded(request.content, MAX_BODY)
         except TimeoutError:
             return web.Response(status=408, text=f"the body took over {BODY_TIMEOUT:g} s\n")
+        except TooLong as error:
+            return web.Response(status=413, text=f"{error}\n")
         try:
             body = _read_json(sent)
             return web.json_response(await self._actions[request.path](body))

@@ -7,7 +7,7 @@ the program, the option, what is wrong and what would be right. The exit status 
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import click
@@ -98,6 +98,13 @@ class Commands(click.Group):
         """Parse the command's words and run it. Raises OneLineError."""
         with _in_one_line(self.program):
             return super().invoke(ctx)
+
+
+def with_options(command: Command, options: Sequence[Callable[[Command], Command]]) -> Command:
+    """A command with these options, which its help shows in this order."""
+    for option in reversed(options):
+        command = option(command)
+    return command
 
 
 def log_options(command: Command) -> Command:

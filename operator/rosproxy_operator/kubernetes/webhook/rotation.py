@@ -20,7 +20,7 @@ from rosproxy_operator.kubernetes.api import (
     ApiInvalid,
 )
 from rosproxy_operator.kubernetes.resources.model import Json, Name
-from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
+from rosproxy_operator.kubernetes.resources.values import part, parts, words
 from rosproxy_operator.kubernetes.settings import WebhookSettings
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -120,7 +120,7 @@ class SelfSigned:
     def _put(self, secret: Name, pair: KeyPair, there: Json) -> None:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
-            self._api.patch("secrets", secret, _secret_patch(pair, there))
+            self._api.fill_secret(secret, there, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
             raise ApiAway(f"somebody else writes {secret}: {error}") from None
         except ApiError as error:
@@ -167,15 +167,6 @@ class SelfSigned:
                 self.problems.append(Problem(_SUBJECT, text))
             return False
         return True
-
-
-def _secret_patch(pair: KeyPair, there: Json) -> list[Json]:
-    """The JSON patch that puts a pair into a Secret, if it is as it was when it was read."""
-    version = word(part(there, "metadata"), "resourceVersion")
-    return [
-        {"op": "test", "path": "/metadata/resourceVersion", "value": version},
-        {"op": "add", "path": "/data", "value": {**part(there, "data"), **pair.secret()}},
-    ]
 
 
 def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:

@@ -7,7 +7,6 @@ they are; long ones, parameters above all, unread.
 """
 
 import asyncio
-import logging
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
@@ -32,8 +31,6 @@ from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.recovery import Recovery
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, eq=False)
@@ -63,7 +60,7 @@ class MasterApi:
             return await counted(metrics, "master", request.method, passed)
         return await counted(metrics, "master", request.method, self._rewrite(request, call))
 
-    def watch(self, method: str, size: int) -> passing.Watch | None:
+    def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
         return _watch(method, size)
 
@@ -131,14 +128,9 @@ class MasterApi:
         return admission
 
     def _refuse(self, reason: str, call: Call, asker: Asker, text: str) -> Refusal:
-        """Refuse a call that is over a bound, and tell of it: of the last one for each reason."""
-        self._context.metrics.refused.labels(reason).inc()
-        subject = f"refused: {reason.replace('_', ' ')}"
-        self._context.problems.solved(subject)
-        self._context.problems.add(subject, f"from {asker.address}: {text}")
-        log.warning(
-            "%s: %s of %s is refused: %s", asker.address, call.method, asker.caller_id, text
-        )
+        """Refuse a call that is over a bound, and tell of it."""
+        what = f"{call.method} of {asker.caller_id}: {text}"
+        self._context.refusals.note(reason, asker.address, what)
         return Refusal(f"rosproxy: {text}")
 
     def _note(self, reply: MasterReply, source: str) -> None:
@@ -180,7 +172,7 @@ class PublishedMaster:
         reply = await upstream.post_to_master(call.body)
         return master_api.rename_master(request, reply, self._address)
 
-    def watch(self, method: str, size: int) -> passing.Watch | None:
+    def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
         return _watch(method, size)
 
@@ -193,10 +185,10 @@ def _passes(method: str) -> bool:
     return row(method) == NO_ROW
 
 
-def _watch(method: str, size: int) -> passing.Watch | None:
+def _watch(method: str, size: int) -> passing.CallWatch | None:
     if method == MULTICALL:
         return passing.MulticallWatch(_passes) if size > MASTER_CALL.size else None
-    return passing.Watch() if _passes(method) else None
+    return passing.CallWatch() if _passes(method) else None
 
 
 async def _is_long_and_passes(body: bytes) -> bool:

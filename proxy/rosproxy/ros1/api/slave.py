@@ -84,9 +84,9 @@ class SlaveApi:
             call.hold(len(results[-1]))
         return multicall.results_reply(results)
 
-    def watch(self, method: str, size: int) -> passing.Watch | None:
+    def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        return passing.Watch() if method in slave_api.LONG else None
+        return passing.CallWatch() if method in slave_api.LONG else None
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""

@@ -8,7 +8,7 @@ from aiohttp import StreamReader, web
 
 from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
 from rosproxy.ros1.clients.master import Unreachable
-from rosproxy.ros1.protocol.xmlrpc.passing import Watch
+from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch
 
 if TYPE_CHECKING:
     from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
@@ -21,7 +21,7 @@ class LongCall:
     """
 
     def __init__(
-        self, method: str, size: int, head: bytes, rest: StreamReader, watch: Watch
+        self, method: str, size: int, head: bytes, rest: StreamReader, watch: CallWatch
     ) -> None:
         self.method, self.size = method, size
         self._head, self._rest, self._watch = head, rest, watch
@@ -49,7 +49,7 @@ class LongCall:
 class LongCalls(Protocol):
     """What a service does with long calls that it need not read."""
 
-    def watch(self, method: str, size: int) -> Watch | None:
+    def watch(self, method: str, size: int) -> CallWatch | None:
         """How to watch a call of a method while it passes; None if it has to be read."""
 
     async def pass_on(self, call: "IncomingCall", long_call: LongCall) -> bytes | LongReply:

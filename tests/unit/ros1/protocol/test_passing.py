@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.protocol.xmlrpc.passing import MulticallWatch, Watch, method_of
+from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, MulticallWatch, method_of
 from tests.unit.builders import cpp_call, py_call
 
 PLAIN = {"setParam", "getParam"}
@@ -25,7 +25,7 @@ def pieces(body: bytes, size: int) -> Iterable[bytes]:
         yield body[start : start + size]
 
 
-def see(watch: Watch, body: bytes, size: int = 1000) -> None:
+def see(watch: CallWatch, body: bytes, size: int = 1000) -> None:
     for piece in pieces(body, size):
         watch.see(piece)
     watch.end()
@@ -102,14 +102,14 @@ def test_what_could_be_another_method_is_refused_however_it_is_cut(
     body = py_call("setParam", "/n", "/key", "x" * 500)
     for place in (body.index(b"<params>"), body.index(b"xxx") + 250, body.index(b"</methodCall>")):
         with pytest.raises(XmlRpcError):
-            see(Watch(), body[:place] + hidden + body[place:], size)
+            see(CallWatch(), body[:place] + hidden + body[place:], size)
 
 
 @given(st.text(max_size=300), st.integers(1, 100))
 def test_parameters_pass_whatever_they_say(text: str, size: int) -> None:
     held = [text, {text: text}, ["methodName", "registerPublisher", "&lt;methodName>"]]
     body = py_call("setParam", "/n", "/key", held).replace(b"\0", b"")
-    see(Watch(), body, size)
+    see(CallWatch(), body, size)
 
 
 @pytest.mark.parametrize("size", [1, 5, 9, 1000])
@@ -118,9 +118,9 @@ def test_nesting_is_bounded(size: int) -> None:
         value = b"<value><array><data>" * depth + b"</data></array></value>" * depth
         return py_call("setParam", "/n", "/key", "x").replace(b"<string>x</string>", value * times)
 
-    see(Watch(), nested(passing.NESTED, times=3), size)
+    see(CallWatch(), nested(passing.NESTED, times=3), size)
     with pytest.raises(XmlRpcError, match="more than 20 arrays"):
-        see(Watch(), nested(passing.NESTED + 1), size)
+        see(CallWatch(), nested(passing.NESTED + 1), size)
 
 
 @pytest.mark.parametrize("size", [1, 13, 1000])

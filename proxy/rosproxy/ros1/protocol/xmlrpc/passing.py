@@ -62,7 +62,7 @@ def method_of(head: bytes) -> str | None:
     return found[2].decode() if found else None
 
 
-class Watch:
+class CallWatch:
     """Sees a document go by, from its head on."""
 
     def __init__(self) -> None:
@@ -91,7 +91,7 @@ class Watch:
         """All of it was seen. Raises XmlRpcError if it should not have ended."""
 
 
-class MulticallWatch(Watch):
+class MulticallWatch(CallWatch):
     """Sees a multicall go by; ``may_pass`` says of each method whether it passes unread."""
 
     def __init__(self, may_pass: Callable[[str], bool]) -> None:
