@@ -49,7 +49,7 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         rotation = CertificateRotation(source(api, settings.webhook), metrics)
         running.append(rotation.run())
         server = WebhookServer(settings.webhook.bind, rotation)
-        webhook = Injector(api, metrics, controller.wake), server
+        webhook = Injector(api, settings.plan, metrics, controller.wake), server
     watch = ClusterWatch(settings, controller, webhook, metrics)
     controller.appeared = watch.restart
     tasks = [asyncio.ensure_future(work) for work in running]

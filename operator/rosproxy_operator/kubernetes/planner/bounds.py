@@ -8,7 +8,7 @@ is, and nothing is made or changed for it; its condition says what would allow i
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 
 from msgspec.structs import replace
@@ -18,6 +18,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
+    Name,
     RosProxy,
     RosProxySpec,
 )
@@ -26,6 +27,8 @@ from rosproxy_operator.kubernetes.resources.values import quoted
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
 NOT_ALLOWED = "NotAllowed"
+Consents = Mapping[Name, frozenset[str]]
+"""By a master's Service, the namespaces whose RosProxies may name it, besides its own."""
 _EVERYBODY = "*"
 _NUMERIC = re.compile(r"http://([0-9.*?]*[0-9][0-9.*?]*|\[.*\])(:[0-9*?]*)?")
 """A pattern whose host has digits and no letters: it is meant for addresses."""
@@ -38,7 +41,7 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     """
     refused: dict[str, InvalidRosProxy] = {}
     for one in observed.rosproxies:
-        text = "" if one.deleting else objection(one, observed, settings)
+        text = "" if one.deleting else objection(one, observed.consents, settings)
         if text:
             refused[one.uid] = InvalidRosProxy(
                 one.id, one.uid, one.generation, text, one.status, NOT_ALLOWED
@@ -52,11 +55,11 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
     )
 
 
-def objection(of: RosProxy, observed: ClusterSnapshot, settings: ClusterSettings) -> str:
+def objection(of: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
     """What a RosProxy asks for that it may not have: field, value, what to do. Empty if nothing."""
     every = (
         *_beyond(of.spec, settings.bounds, settings.image),
-        _unasked(of, observed),
+        _unasked(of, consents),
     )
     return next(filter(None, every), "")
 
@@ -124,7 +127,7 @@ def _fits(text: str, pattern: str) -> bool:
     return fnmatchcase(text, pattern.replace("[", "[[]"))
 
 
-def _unasked(of: RosProxy, observed: ClusterSnapshot) -> str:
+def _unasked(of: RosProxy, consents: Consents) -> str:
     """The command that gives the consent that a RosProxy lacks, where its master is another's.
 
     Whether that Service exists is not told: that is the other namespace's to know.
@@ -132,7 +135,7 @@ def _unasked(of: RosProxy, observed: ClusterSnapshot) -> str:
     service, own = of.spec.master.service, of.id.namespace
     if service is None or service.namespace == own:
         return ""
-    allowed = observed.consents.get(service, frozenset())
+    allowed = consents.get(service, frozenset())
     if allowed & {own, _EVERYBODY}:
         return ""
     value = ",".join(sorted({*allowed, own}))

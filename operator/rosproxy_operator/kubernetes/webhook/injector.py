@@ -17,12 +17,14 @@ from datetime import datetime
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes.api import SOON, Api, ApiAway, ApiError, ApiGone
+from rosproxy_operator.kubernetes.planner.bounds import Consents, objection
 from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
 from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
 from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
+from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +54,15 @@ class NoService(NotWired):
 class Injector:
     """Wires pods. ``wake`` lets the operator look at the cluster soon."""
 
-    def __init__(self, api: Api, metrics: ClusterMetrics, wake: Callable[[], None]) -> None:
-        self._api, self._metrics, self._wake = api, metrics, wake
+    def __init__(
+        self,
+        api: Api,
+        settings: ClusterSettings,
+        metrics: ClusterMetrics,
+        wake: Callable[[], None],
+    ) -> None:
+        self._api, self._settings = api, settings
+        self._metrics, self._wake = metrics, wake
 
     async def wiring(self, body: Json, dry_run: bool) -> Wiring:
         """What a pod needs. Never raises. A ``dry_run`` does not wait for a Service."""
@@ -113,22 +122,41 @@ class Injector:
         Raises NotWired.
         """
         id = service_id(of.id)
-        missing = NoService(
-            f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
-            f"{of.id.name} says why; create the pod anew then"
-        )
         try:
             there = self._api.get("services", id, SOON)
         except ApiGone:
             if dry_run and of.cluster_ip:
                 return of.cluster_ip, 0.0
-            raise missing from None
+            raise self._missing(of) from None
         found = objects.service(there)
         if found is None:
             raise NotWired(f"the Service {id} is not the operator's: delete or rename it")
         if found.owner != of.uid or found.deleting or not found.cluster_ip:
-            raise missing
+            raise self._missing(of)
         if dry_run:
             return found.cluster_ip, 0.0
         made = datetime.fromisoformat(there["metadata"]["creationTimestamp"]).timestamp()
         return found.cluster_ip, min(max(made + YOUNG - time.time(), 0.0), YOUNG)
+
+    def _missing(self, of: RosProxy) -> NotWired:
+        """Why a RosProxy has no Service: it asks for more than it may, or the Service is to come.
+
+        For one that is not to come no pod waits.
+        """
+        if refused := objection(of, self._consents(of), self._settings):
+            return NotWired(f"RosProxy {of.id.name}: {refused}; create the pod anew then")
+        id = service_id(of.id)
+        return NoService(
+            f"the Service {id} has no cluster IP yet: kubectl -n {id.namespace} describe rosproxy "
+            f"{of.id.name} says why; create the pod anew then"
+        )
+
+    def _consents(self, of: RosProxy) -> Consents:
+        """Whose RosProxies may name the Service that a RosProxy names as its master."""
+        service = of.spec.master.service
+        if service is None:
+            return {}
+        try:
+            return {service: objects.allowed_from(self._api.get("services", service, SOON))}
+        except ApiGone:
+            return {}

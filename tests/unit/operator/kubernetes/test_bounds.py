@@ -36,7 +36,7 @@ def bounded(**bounds: Any) -> ClusterSettings:
 
 
 def asks(settings: ClusterSettings = OWN, **changes: Any) -> str:
-    return objection(rosproxy(**changes), observed(), settings)
+    return objection(rosproxy(**changes), {}, settings)
 
 
 def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, str]:
@@ -121,8 +121,8 @@ def test_where_the_master_really_is(changes: dict[str, Any], allowed: bool) -> N
 def test_another_namespaces_master_needs_its_consent(
     consents: tuple[str, ...], allowed: bool, publish: int
 ) -> None:
-    seen = observed(consents={ROSCORE: frozenset(consents)})
-    said = objection(rosproxy(master=replace(THEIRS, publish=publish)), seen, OWN)
+    agreed = {ROSCORE: frozenset(consents)}
+    said = objection(rosproxy(master=replace(THEIRS, publish=publish)), agreed, OWN)
     assert (said == "") is allowed
     command = "kubectl -n other annotate --overwrite service roscore rosproxy.io/allow-from="
     if not allowed:

@@ -18,7 +18,7 @@ from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot
-from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.settings import ClusterSettings, KubernetesSettings
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import INJECT, NAMESPACE, pod_obj, rosproxy_obj
@@ -90,7 +90,7 @@ async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.YOUNG", 0.0)
     await until(lambda: running.looks() > 0)
     put_all(server)
-    injector = Injector(api, running.metrics, running.controller.wake)
+    injector = Injector(api, ClusterSettings(), running.metrics, running.controller.wake)
     wiring = await injector.wiring(pod_obj("talker", INJECT), dry_run=False)
     (service,) = server.all("services")
     uri = f"http://{service['spec']['clusterIP']}:11311"

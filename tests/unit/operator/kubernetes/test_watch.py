@@ -23,7 +23,7 @@ from rosproxy_operator.common.threads import in_thread
 from rosproxy_operator.kubernetes import watch
 from rosproxy_operator.kubernetes.api import Api
 from rosproxy_operator.kubernetes.event_filter import EventFilter
-from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings, KubernetesSettings
 from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook import certificates
 from rosproxy_operator.kubernetes.webhook.injector import Injector
@@ -67,9 +67,10 @@ class Running:
         self.liveness, self.webhook = free_port(), free_port()
         rotation = CertificateRotation(CertificateDirectory(""), self.metrics)
         rotation.pair = PAIR
-        settings = KubernetesSettings(liveness=HostPort("127.0.0.1", self.liveness))
+        plan = ClusterSettings(bounds=Bounds(max_ports=64))
+        settings = KubernetesSettings(plan, liveness=HostPort("127.0.0.1", self.liveness))
         serving = WebhookServer(HostPort("127.0.0.1", self.webhook), rotation)
-        injector = Injector(api, self.metrics, self.controller.wake)
+        injector = Injector(api, settings.plan, self.metrics, self.controller.wake)
         controller: Any = self.controller
         self.watch = ClusterWatch(settings, controller, (injector, serving), self.metrics)
 
@@ -273,6 +274,29 @@ async def test_a_service_that_is_somebody_elses_is_told(running: Running) -> Non
     running.server.put("services", service_obj(labels={}), NAMESPACE)
     found = await running.admit(pod_obj("talker", INJECT))
     assert "is not the operator's: delete or rename it" in found["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ({"ports": 65}, "RosProxy arm: spec.ports: 65 is not what the operator allows"),
+        ({"master": {"service": {"name": "m", "namespace": "other"}}}, "not agreed"),
+    ],
+)
+async def test_a_pod_of_a_rosproxy_that_asks_for_too_much_does_not_wait(
+    running: Running, monkeypatch: pytest.MonkeyPatch, spec: dict[str, Any], said: str
+) -> None:
+    """Nobody is going to make its Service; once it is allowed, the pod waits for that."""
+    monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.injector.LONGEST", 60.0)
+    server = running.server
+    server.put("rosproxies", rosproxy_obj(spec), NAMESPACE)
+    found = await running.admit(pod_obj("talker", INJECT))
+    assert said in found["warnings"][0]
+    agreed = {"metadata": {"name": "m", "annotations": {"rosproxy.io/allow-from": NAMESPACE}}}
+    server.put("services", agreed, "other")
+    server.put("rosproxies", rosproxy_obj(spec | {"ports": 64}), NAMESPACE)
+    running.controller.makes = lambda: server.put("services", service_obj(), NAMESPACE)
+    assert "patch" in await running.admit(pod_obj("talker", INJECT))
 
 
 async def test_a_dry_run_waits_for_no_service(
