@@ -1,0 +1,196 @@
+"""Layers of rules: whose they are, whether they are enforced, and the nodes that they are for.
+
+Each layer decides for itself, by its first rule that matches. Allowed is what every enforcing
+layer allows, so that one more layer can only narrow what the others leave. A layer in audit mode
+only tells what it would deny.
+"""
+
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from rosproxy.access.rules import MOST_RULES, Action, Rule, RuleKind, parse_rules
+from rosproxy.net.addresses import parse_address
+
+MOST_LAYERS = 1024
+"""Layers of one proxy: one for each container that has rules of its own, and some besides."""
+LONGEST_LAYER_NAME = 200
+"""Characters of a layer's name."""
+
+
+class PolicyMode(Enum):
+    """Whether a layer's rules are enforced or only told."""
+
+    ENFORCE = "enforce"
+    AUDIT = "audit"
+
+
+class PolicyLayer(msgspec.Struct, frozen=True):
+    """Rules of one author. ``addresses``: the nodes that they are for; None: all nodes inside."""
+
+    name: str
+    rules: tuple[Rule, ...]
+    mode: PolicyMode = PolicyMode.ENFORCE
+    addresses: frozenset[str] | None = None
+
+    def is_for(self, address: str) -> bool:
+        """Whether it is for the node inside at an address."""
+        return self.addresses is None or address in self.addresses
+
+
+class WrittenLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A layer as JSON has it. What is wrong in it is a ValueError that names layer and rule."""
+
+    name: str
+    rules: tuple[str, ...]
+    mode: PolicyMode = PolicyMode.ENFORCE
+    addresses: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        read_layer(self)
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """Whether something is allowed; ``rule`` of ``layer`` is what denied it.
+
+    Where it is allowed and there is a rule, a layer in audit mode would deny it by that.
+    """
+
+    allowed: bool = True
+    rule: Rule | None = None
+    layer: str = ""
+
+    @property
+    def mode(self) -> PolicyMode:
+        """The mode of the layer that denied it, or would."""
+        return PolicyMode.AUDIT if self.allowed else PolicyMode.ENFORCE
+
+    @property
+    def reason(self) -> str:
+        """What denied it, as people are told: the rule and whose it is; empty if nothing did."""
+        return f"policy of {self.layer}: {self.rule}" if self.rule else ""
+
+
+ALLOWED = Verdict()
+
+
+def decide(
+    layers: Iterable[PolicyLayer], kind: RuleKind, name: str, caller: str, address: str
+) -> Verdict:
+    """Whether a thing is allowed to ``caller``, at the node inside that has the ``address``."""
+    return _verdict(
+        (layer, next((rule for rule in layer.rules if rule.matches(kind, name, caller)), None))
+        for layer in layers
+        if layer.is_for(address)
+    )
+
+
+def decide_below(
+    layers: Iterable[PolicyLayer], kind: RuleKind, prefix: str, caller: str, address: str
+) -> Verdict:
+    """Whether all things are allowed whose names begin with ``prefix``.
+
+    Denied as well where that can't be told for sure.
+    """
+    return _verdict(
+        (layer, _first_below(layer, kind, prefix, caller))
+        for layer in layers
+        if layer.is_for(address)
+    )
+
+
+def may_deny(
+    layers: Iterable[PolicyLayer], kinds: Iterable[RuleKind], callers: Iterable[str], address: str
+) -> bool:
+    """Whether an enforced rule may deny something of these kinds to one of these callers."""
+    wanted, names = frozenset(kinds), list(callers)
+    return any(
+        rule.action is Action.DENY and any(rule.is_about(rule.kind, name) for name in names)
+        for layer in layers
+        if layer.mode is PolicyMode.ENFORCE and layer.is_for(address)
+        for rule in layer.rules
+        if rule.kind in wanted
+    )
+
+
+def read_layer(written: WrittenLayer) -> PolicyLayer:
+    """A layer from what was written. Raises ValueError, which names layer and rule."""
+    shown = written.name[:40]
+    if not written.name.strip() or len(written.name) > LONGEST_LAYER_NAME:
+        text = f"a layer's name has 1 to {LONGEST_LAYER_NAME} characters"
+        raise ValueError(f"layer {shown!r}: {text}")
+    try:
+        rules = tuple(rule for text in written.rules for rule in parse_rules(text))
+        addresses = _addresses(written.addresses)
+    except ValueError as error:
+        raise ValueError(f"layer {shown!r}: {error}") from None
+    return PolicyLayer(written.name, rules, written.mode, addresses)
+
+
+def read_layers(value: object) -> tuple[PolicyLayer, ...]:
+    """The layers of decoded JSON: a list. Raises ValueError, which names what is wrong."""
+    try:
+        written = msgspec.convert(value, tuple[WrittenLayer, ...])
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None
+    return bounded([read_layer(one) for one in written])
+
+
+def layers_as_json(layers: Iterable[PolicyLayer]) -> list[dict[str, Any]]:
+    """Layers as JSON that `read_layers` takes."""
+    return [
+        {
+            "name": layer.name,
+            "mode": layer.mode.value,
+            "rules": [str(rule) for rule in layer.rules],
+            "addresses": None if layer.addresses is None else sorted(layer.addresses),
+        }
+        for layer in layers
+    ]
+
+
+def bounded(layers: Sequence[PolicyLayer]) -> tuple[PolicyLayer, ...]:
+    """The layers, unless they are too many. Raises ValueError."""
+    if len(layers) > MOST_LAYERS:
+        raise ValueError(f"{len(layers)} layers, at most {MOST_LAYERS} are accepted")
+    count = sum(len(layer.rules) for layer in layers)
+    if count > MOST_RULES:
+        raise ValueError(f"{count} rules in all layers, at most {MOST_RULES} are accepted")
+    return tuple(layers)
+
+
+def _verdict(found: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdict:
+    """What follows from the rule that decides in each layer: the first that is enforced denies."""
+    told = ALLOWED
+    for layer, rule in found:
+        if rule is None or rule.action is Action.ALLOW:
+            continue
+        if layer.mode is PolicyMode.ENFORCE:
+            return Verdict(False, rule, layer.name)
+        if told.rule is None:
+            told = Verdict(True, rule, layer.name)
+    return told
+
+
+def _first_below(layer: PolicyLayer, kind: RuleKind, prefix: str, caller: str) -> Rule | None:
+    """The first rule that allows all names below a prefix, or may deny one."""
+    for rule in layer.rules:
+        if not rule.is_about(kind, caller):
+            continue
+        if rule.action is Action.DENY and rule.may_match_below(prefix):
+            return rule
+        if rule.action is Action.ALLOW and rule.covers_below(prefix):
+            return rule
+    return None
+
+
+def _addresses(written: Sequence[str] | None) -> frozenset[str] | None:
+    if written is None:
+        return None
+    found = {text: parse_address(text) for text in written}
+    for text, address in found.items():
+        if address is None:
+            raise ValueError(f"addresses: must be IP addresses, not {text[:40]!r}")
+    return frozenset(address for address in found.values() if address)

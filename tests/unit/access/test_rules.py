@@ -1,0 +1,86 @@
+"""Rules of a policy: read, written, matched."""
+
+import contextlib
+from fnmatch import fnmatchcase
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.access import rules
+from rosproxy.access.rules import Action, Rule, RuleKind, parse_rule, parse_rules
+
+NAMES = st.text("/ab_.[!", max_size=12)
+GLOBS = st.text("/ab_.[!*?", max_size=10)
+WORDS = st.text("/ab*?[]{}-#", min_size=1, max_size=9).map(lambda text: f"/{text}")
+RULES = st.builds(
+    Rule, st.sampled_from(Action), st.sampled_from(RuleKind), WORDS, st.just("*") | WORDS
+)
+
+
+@given(RULES)
+def test_a_rule_is_read_as_it_is_written(rule: Rule) -> None:
+    assert parse_rule(str(rule)) == rule
+
+
+@given(st.lists(RULES).map(tuple))
+def test_rules_are_read_as_they_are_written(found: tuple[Rule, ...]) -> None:
+    assert parse_rules(rules.format_rules(found)) == found
+
+
+@given(st.text())
+def test_any_text_is_rules_or_an_error(text: str) -> None:
+    with contextlib.suppress(ValueError):
+        found = parse_rules(text)
+        assert parse_rules(rules.format_rules(found)) == found
+
+
+def test_lines_semicolons_and_comments() -> None:
+    text = "# cameras; deny publish /x\nallow publish /camera/front/*; deny publish /camera/*\n\n"
+    assert list(map(str, parse_rules(text))) == [
+        "allow publish /camera/front/*",
+        "deny publish /camera/*",
+    ]
+
+
+@given(GLOBS, NAMES)
+def test_a_glob_matches_as_a_shell_s(glob: str, name: str) -> None:
+    literal = glob.replace("[", "[[]")
+    assert rules.matches(glob, name) == fnmatchcase(name, literal)
+
+
+def test_a_hostile_glob_takes_no_time() -> None:
+    assert not rules.matches("/" + "*a" * 127, "/" + "a" * 100 + "b" * 900)
+
+
+@given(GLOBS, NAMES, NAMES)
+def test_what_may_match_below_a_prefix_is_never_missed(glob: str, prefix: str, rest: str) -> None:
+    rule = Rule(Action.DENY, RuleKind.GET_PARAM, glob)
+    matched = rules.matches(glob, prefix + rest)
+    if matched:
+        assert rule.may_match_below(prefix)
+    if rule.covers_below(prefix):
+        assert matched
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("deny publish", "must be ACTION KIND GLOB"),
+        ("deny publish /a from /b", "must be ACTION KIND GLOB"),
+        ("forbid publish /a", "must be allow or deny"),
+        ("deny write /a", "must be one of publish, serve"),
+        ("deny publish camera/*", "must begin with / or *"),
+        ("deny publish /a by talker", "must begin with / or *"),
+        (f"deny publish /{'a' * 256}", "at most 256"),
+    ],
+)
+def test_a_bad_rule_says_what_is_wrong(text: str, says: str) -> None:
+    with pytest.raises(ValueError, match="rule ") as caught:
+        parse_rule(text)
+    assert says in str(caught.value)
+    assert "such as" in str(caught.value)
+
+
+def test_slave_methods_have_no_slash() -> None:
+    assert parse_rule("deny slave get* by /spy").matches(RuleKind.SLAVE, "getBusInfo", "/spy")
