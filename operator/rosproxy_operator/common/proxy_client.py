@@ -1,12 +1,13 @@
 """Asking and telling running proxies, over their admin endpoints."""
 
 import errno
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import aiohttp
 import msgspec
 
+from rosproxy.access.layers import PolicyLayer, layers_as_json
 from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status
 from rosproxy.net.addresses import HostPort
 
@@ -21,12 +22,17 @@ class ProxyError(Exception):
     """A proxy did not do what it was asked.
 
     ``away`` if nothing at all is there: no route, or no answer. ``later`` if it is well, but needs
-    its master, which can't be asked now.
+    its master, which can't be asked now. ``status`` is that of an HTTP answer, 0 without one.
     """
 
-    def __init__(self, message: str, away: bool = False, later: bool = False) -> None:
+    def __init__(self, message: str, away: bool = False, status: int = 0) -> None:
         super().__init__(message)
-        self.away, self.later = away, later
+        self.away, self.status = away, status
+        self.later = status == 503
+
+
+class PolicyRefused(ProxyError):
+    """A proxy does not take its policy; the message says what to do."""
 
 
 class ProxyClient:
@@ -51,6 +57,27 @@ class ProxyClient:
         """Tell which containers are gone, have moved or arrived; how many nodes that concerned."""
         text = await self._ask("POST", where, "/containers", token, body, WITHIN_MASTER)
         return _read(text, where)
+
+    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+        """Tell the layers of its policy, instead of those told before. Raises PolicyRefused, too.
+
+        A proxy of a former release has no policy, which is right if there is none.
+        """
+        try:
+            body = {"layers": layers_as_json(layers)}
+            await self._ask("POST", where, "/policy", token, body, WITHIN_MASTER)
+        except ProxyError as error:
+            if error.status == 404 and layers:
+                text = (
+                    "knows no policies, so that it is told of nobody new who may use it: its image "
+                    "is that of a former release: let it have the operator's"
+                )
+                raise PolicyRefused(text, status=404) from None
+            if error.status == 400:
+                text = f"does not take its policy, and is told of nobody new till then: {error}"
+                raise PolicyRefused(text, status=400) from None
+            if error.status != 404:
+                raise
 
     async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
         """Tell which addresses may use it as their master: those of what its labels select."""
@@ -88,7 +115,7 @@ class ProxyClient:
                 if reply.status == 200:
                     return text
                 message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
-                raise ProxyError(message, later=reply.status == 503)
+                raise ProxyError(message, status=reply.status)
         except TimeoutError:
             raise ProxyError(f"{where} does not answer", away=True) from None
         except (OSError, aiohttp.ClientError) as error:

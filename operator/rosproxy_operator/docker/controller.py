@@ -87,7 +87,7 @@ class DockerController:
         self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
         self._applier = DockerApplier(engine, settings, self._proxies)
         self._executor = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
-        self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings.uplink, loop.wake)
+        self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings, loop.wake)
         self._memory = DockerMemory()
         self._shown: list[Problem] = []
         self._log = ProblemLog()

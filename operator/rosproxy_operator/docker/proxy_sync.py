@@ -1,7 +1,8 @@
 """Keeping the proxies up to date about the containers on their networks, each apart.
 
 Who may use a proxy as its master goes to it by itself and first: the call of a new container waits
-for that, while all other news may take a proxy long (it asks nodes and its master).
+for that, while all other news may take a proxy long (it asks nodes and its master). Before either
+goes its policy, if that is another one than before: nobody is let in whose policy it does not have.
 """
 
 import asyncio
@@ -10,11 +11,12 @@ import logging
 import time
 from collections.abc import Callable, Collection
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
-from rosproxy_operator.docker.planner.model import Member
+from rosproxy_operator.docker.planner.model import Member, PlanSettings
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, facts
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
 
@@ -29,8 +31,8 @@ STARTING = 8.0
 class ProxyUpdater:
     """Keeps one run of one proxy up to date. ``answered`` is called when it begins to answer.
 
-    After each look the proxy is told who may use it as its master, whether or not that has changed,
-    asked for its nodes, and told what is new (`ProxyNews`).
+    After each look the proxy is told its policy if that has changed, and who may use it as its
+    master, whether or not that has, asked for its nodes, and told what is new (`ProxyNews`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
     """
 
@@ -43,6 +45,8 @@ class ProxyUpdater:
         self._name, self._proxies, self._answered = name, proxies, answered
         self._news = ProxyNews()
         self._looked, self._selecting = asyncio.Event(), asyncio.Event()
+        self._policy: tuple[PolicyLayer, ...] | None = None
+        self._telling_policy = asyncio.Lock()
 
     def update(self, known: NetworkFacts) -> None:
         """Take note of what a look has found."""
@@ -64,6 +68,7 @@ class ProxyUpdater:
             self._selecting.clear()
             addresses = self._news.facts.selected
             try:
+                await self._tell_policy()
                 await self._proxies.selected(self.access.admin, self.access.token, addresses)
                 failures, told = 0, ""
             except ProxyError as error:
@@ -74,6 +79,14 @@ class ProxyUpdater:
                 self._selecting.set()
                 await asyncio.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
                 failures += 1
+
+    async def _tell_policy(self) -> None:
+        """Tell the policy, unless this run of the proxy has heard it. Raises ProxyError."""
+        async with self._telling_policy:
+            policy = self._news.policy
+            if policy != self._policy:
+                await self._proxies.policy(self.access.admin, self.access.token, policy)
+                self._policy = policy
 
     async def _keep_told(self) -> None:
         """Tell what else is new."""
@@ -95,6 +108,7 @@ class ProxyUpdater:
     async def _tell(self) -> None:
         self._looked.clear()
         where, token = self.access.admin, self.access.token
+        refusal = await self._policy_refusal()
         status = await self._proxies.status(where)
         # The facts are not older than need be: its nodes may have come since the last look.
         address = self._news.facts.master_address
@@ -104,6 +118,8 @@ class ProxyUpdater:
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
         body = self._news.body(nodes_by_address(status).keys(), now)
+        if refusal:
+            body.pop("arrived", None)  # who is adopted would not be kept to the policy
         if body:
             log.debug("%s is told %s", self._name, body)
             done = await self._proxies.containers(where, token, body)
@@ -111,7 +127,15 @@ class ProxyUpdater:
             if text := ", ".join(f"{count} {word}" for word, count in counts.items() if count):
                 log.info("%s: nodes %s", self._name, text, extra={"proxy": self._name})
         self._news.told(now)
-        self._heard(None)
+        self._heard(refusal)
+
+    async def _policy_refusal(self) -> PolicyRefused | None:
+        """Tell the policy; why the proxy does not take it, if it does not. Raises ProxyError."""
+        try:
+            await self._tell_policy()
+        except PolicyRefused as error:
+            return error
+        return None
 
     def _heard(self, error: ProxyError | None) -> None:
         """Take note that the proxy has answered, or why not."""
@@ -127,10 +151,14 @@ class DockerProxySync:
     """Keeps all running proxies up to date. ``answered``: one answers that did not before."""
 
     def __init__(
-        self, tasks: Tasks, proxies: ProxyClient, uplink: str, answered: Callable[[], None]
+        self,
+        tasks: Tasks,
+        proxies: ProxyClient,
+        settings: PlanSettings,
+        answered: Callable[[], None],
     ) -> None:
         self._tasks, self._proxies = tasks, proxies
-        self._uplink, self._answered = uplink, answered
+        self._settings, self._answered = settings, answered
         self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
 
     def update(self, look: DockerSnapshot, members: Collection[Member]) -> None:
@@ -146,7 +174,8 @@ class DockerProxySync:
             if name not in self._running:
                 updater = ProxyUpdater(name, look.access[name], self._proxies, self._answered)
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
-            self._running[name][0].update(facts(look.state, proxy, members))
+            known = facts(look.state, proxy, members, self._settings.policy)
+            self._running[name][0].update(known)
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""
@@ -156,14 +185,16 @@ class DockerProxySync:
         """The proxies that do not answer, and what to do about it."""
         lately = time.monotonic() - STARTING
         return [
-            silence(name, updater.error, look, self._uplink)
+            silence(name, updater.error, look, self._settings.uplink)
             for name, (updater, _) in self._running.items()
             if updater.error and updater.silent_since and updater.silent_since < lately
         ]
 
 
 def silence(name: str, error: ProxyError, look: DockerSnapshot, uplink: str) -> Problem:
-    """The problem of a proxy that does not answer."""
+    """The problem of a proxy that does not answer, or not as it should."""
+    if isinstance(error, PolicyRefused):
+        return Problem(f"proxy {name}", str(error))
     if error.away and not look.at_host:
         advice = f"attach the operator to network {uplink} or run it with network_mode: host"
     else:

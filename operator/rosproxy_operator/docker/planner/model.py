@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane, SlaveControl
 
@@ -38,6 +40,8 @@ class PlanSettings:
     (docs/performance.md): 32 MiB and 50 KiB for each in the process, 64 MiB of pipes and, where the
     kernel counts them in, 0.7 MiB of socket buffers for each; two threads for each.
 
+    ``policy`` is the administrator's, for all proxies: one layer or none.
+
     ``secret`` is what the proxies' tokens are made of; empty: the one that the uplink network has.
     """
 
@@ -57,6 +61,7 @@ class PlanSettings:
     slave_control: SlaveControl = "any"
     proxy_memory: int = GIBIBYTE
     proxy_pids: int = 8192
+    policy: tuple[PolicyLayer, ...] = ()
     secret: str = field(default="", repr=False)
 
 
@@ -220,8 +225,9 @@ class Member:
     ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label. ``networks`` are
     the names of those on which it wants to meet its proxy. ``needs`` is the host in its
     ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
-    variable, empty where no alias can help it. A container that is not alive only keeps networks
-    joined, the data plane and the slave control for a while.
+    variable, empty where no alias can help it. ``policy`` are rules for its own nodes alone. A
+    container that is not alive only keeps networks joined, the data plane and the slave control for
+    a while.
     """
 
     container: Container
@@ -231,6 +237,7 @@ class Member:
     needs: str = ""
     data_plane: DataPlane | None = None
     slave_control: SlaveControl | None = None
+    policy: tuple[Rule, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

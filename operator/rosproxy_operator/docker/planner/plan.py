@@ -13,6 +13,7 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.allocation import allocate, refused
 from rosproxy_operator.docker.planner.desired import assign, desire
+from rosproxy_operator.docker.planner.label_policy import within_bounds
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.specs import master
@@ -72,6 +73,7 @@ def plan(
     monotonic clock that goes on as long as the memory does.
     """
     members, unplaced = find_members(labels, observed)
+    members, crowded = within_bounds(members, settings)
     memory = noticed(memory, members, now)
     desired, bad_networks = desire(observed, settings, members, memory, now)
     memory = looked(memory, observed, desired, settings.grace, now)
@@ -88,7 +90,7 @@ def plan(
             names = aliases.get(one.key, {})
             context = PlanContext(observed, settings, one, ports, names, creatable)
             planned[one.key] = wanted_steps(context)
-    problems = [*labels.problems, *unplaced, *bad_networks, *missed, *tight]
+    problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *missed, *tight]
     problems += _unwell(observed, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))

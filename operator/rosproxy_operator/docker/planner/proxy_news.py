@@ -11,7 +11,9 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 from typing import Any
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.addresses import is_address, is_inside
+from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layer
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
@@ -55,7 +57,7 @@ class NetworkFacts:
     ``taken`` those of all containers and gateways. ``subnets`` are those of its networks,
     ``running`` the ids of all containers that run. ``master_address`` is empty if there is nothing
     to be told. ``selected`` are the addresses, on its networks, of all containers whose labels mean
-    this proxy: those that may use it as their master.
+    this proxy: those that may use it as their master. ``policy`` are all layers of its policy.
     """
 
     master_address: str = ""
@@ -65,6 +67,7 @@ class NetworkFacts:
     arrivals: frozenset[ContainerArrival] = frozenset()
     running: frozenset[str] = frozenset()
     selected: frozenset[str] = frozenset()
+    policy: tuple[PolicyLayer, ...] = ()
 
 
 class Places:
@@ -129,10 +132,12 @@ class Places:
 
 
 class ProxyNews:
-    """What one run of a proxy has yet to be told."""
+    """What one run of a proxy has yet to be told. ``policy`` is all of its policy."""
 
     def __init__(self) -> None:
         self.facts = NetworkFacts()
+        self.policy: tuple[PolicyLayer, ...] = ()
+        self._layers = RecentLayers()
         self._subnets: set[IPv4Network] = set()
         self._places = Places()
         self._due: dict[ContainerArrival, list[float]] = {}
@@ -141,6 +146,9 @@ class ProxyNews:
     def look(self, known: NetworkFacts, now: float) -> None:
         """Take note of what a look has found."""
         self.facts = known
+        common = tuple(layer for layer in known.policy if layer.addresses is None)
+        own = (layer for layer in known.policy if layer.addresses is not None)
+        self.policy = (*common, *self._layers.look(own, known.taken, now))
         self._subnets |= set(known.subnets)
         self._due = {
             arrival: self._due.get(arrival, [now + after for after in AGAIN])
@@ -187,12 +195,25 @@ class ProxyNews:
         return max(min(times) - now, 0.0) if times else None
 
 
-def facts(observed: HostState, proxy: Proxy, members: Collection[Member]) -> NetworkFacts:
-    """What a look says to a proxy. ``members`` are those of all proxies."""
+def facts(
+    observed: HostState,
+    proxy: Proxy,
+    members: Collection[Member],
+    policy: tuple[PolicyLayer, ...] = (),
+) -> NetworkFacts:
+    """What a look says to a proxy. ``members`` are those of all, ``policy`` the administrator's."""
     host, box = master(proxy.key).host.lower(), observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
     by_id = {container.id: container for container in observed.containers}
     running = [container for container in observed.containers if container.state in STARTED]
+    mine = [member for member in members if member.key == proxy.key]
+    alive = [member for member in mine if member.container.alive]
+    at = {
+        member.container.id: [
+            place.address for place in _places(_host(member.container, by_id), joined)
+        ]
+        for member in alive
+    }
     return NetworkFacts(
         master_address="" if is_address(host) else observed.masters.get(host, ""),
         addresses={
@@ -208,17 +229,17 @@ def facts(observed: HostState, proxy: Proxy, members: Collection[Member]) -> Net
             for subnet in network.subnets
         ),
         arrivals=frozenset(
-            arrival
-            for member in members
-            if member.key == proxy.key
-            for arrival in _arrivals(member.container, by_id, joined)
+            arrival for member in mine for arrival in _arrivals(member.container, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
-        selected=frozenset(
-            place.address
-            for member in members
-            if member.key == proxy.key and member.container.alive
-            for place in _places(_host(member.container, by_id), joined)
+        selected=frozenset(address for addresses in at.values() for address in addresses),
+        policy=(
+            *policy,
+            *(
+                label_layer(member, at[member.container.id])
+                for member in alive
+                if member.policy and at[member.container.id]
+            ),
         ),
     )
 

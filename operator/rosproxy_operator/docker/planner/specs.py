@@ -1,5 +1,6 @@
 """The containers of a proxy: what they are made of, and what is read back from their labels."""
 
+import dataclasses
 import hashlib
 import hmac
 import json
@@ -14,6 +15,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import SettingError, hash_token, parse_range
+from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
@@ -146,6 +148,9 @@ def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secre
     Neither its name, its sandbox nor the master's address are in it. The hash of its token is: a
     proxy that knows another one would not listen to the operator.
     """
+    # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
+    # is started again while the operator is away begins with the policy of its creation.
+    settings = dataclasses.replace(settings, policy=())
     body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
     return _digest({**body, "Image": image_id})
 
@@ -200,6 +205,7 @@ def container_config(
         "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
+        POLICY_VARIABLE: as_variable(settings.policy),
     }
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from rosproxy.access.layers import PolicyMode
 from rosproxy_operator.cli import main
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.model import PlanSettings
@@ -48,6 +49,8 @@ def test_the_defaults() -> None:
         ("--proxy-pids", "9", "'9' is not a number from 256 on"),
         ("--proxy-pids", "-1", "'-1' is not a number from 256 on"),
         ("--secret-file", "/nowhere", "/nowhere can't be read: No such file or directory"),
+        ("--policy", "hide /camera", "rule 'hide /camera': must be ACTION KIND GLOB"),
+        ("--policy-mode", "tell", "'tell' is not one of"),
         ("--grace", "-1", "-1 s is not between 0 and 86400 s"),
         ("--resync", "0", "0 s is not between 1 and 86400 s"),
     ],
@@ -144,3 +147,20 @@ def test_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch
     assert done.exit_code == 1
     assert "pip install 'rosproxy[docker]'" in done.stderr
     assert "Traceback" not in done.output
+
+
+def test_a_policy_can_stand_in_a_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blanks in it separate no values, as they do in other variables."""
+    monkeypatch.setenv("ROSPROXY_POLICY", "deny publish /camera/*;\ndeny serve * by /driver")
+    monkeypatch.setenv("ROSPROXY_POLICY_MODE", "audit")
+    words = ["--policy=deny call *"]
+    for given, rules in (
+        ([], ["deny publish /camera/*", "deny serve * by /driver"]),
+        (words, ["deny call *"]),
+    ):
+        context = main.commands["docker"].make_context(
+            "docker", given, auto_envvar_prefix="ROSPROXY"
+        )
+        (layer,) = make_plan_settings(context.params).policy
+        assert [str(rule) for rule in layer.rules] == rules
+        assert layer.mode is PolicyMode.AUDIT

@@ -1,42 +1,57 @@
-"""Telling proxies who may use them as their master, whatever else there is to be told."""
+"""Telling proxies their policy and who may use them, whatever else there is to be told."""
 
 import asyncio
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import parse_rules
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
-from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.docker import proxy_sync
 from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import Attachment, Member
-from rosproxy_operator.docker.proxy_sync import DockerProxySync
+from rosproxy_operator.docker.proxy_sync import DockerProxySync, silence
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
-from tests.unit.operator.docker.builders import KEY, both, container, observed
+from tests.unit.operator.docker.builders import KEY, SETTINGS, both, container, observed
 
 WHERE = HostPort("172.30.0.2", 11312)
 FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token", "run 2")
 
 
 class Proxies(ProxyClient):
-    """A proxy that notes whom it is told of, and never answers anything else."""
+    """A proxy that notes whom it is told of, and never answers anything else.
+
+    ``calls`` are all that came, in order: addresses, or the names of layers.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.told: list[list[str]] = []
+        self.calls: list[list[str]] = []
+        self.refuses: ProxyError | None = None
         self.heard = asyncio.Event()
         self.errors: list[ProxyError] = []
 
     async def status(self, where: HostPort) -> Any:
         await asyncio.Event().wait()
 
+    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+        assert (where, token) == (WHERE, "token")
+        self.calls.append([layer.name for layer in layers])
+        if self.refuses:
+            raise self.refuses
+
     async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
         assert (where, token) == (WHERE, "token")
         if self.errors:
             raise self.errors.pop()
+        self.calls.append(sorted(addresses))
         self.told.append(sorted(addresses))
         self.heard.set()
 
@@ -53,8 +68,13 @@ async def tasks() -> AsyncIterator[Tasks]:
     await tasks.cancel()
 
 
-def look(*addresses: str, access: ProxyAccess = FIRST) -> tuple[DockerSnapshot, list[Member]]:
-    """Containers at these addresses, which a proxy's labels select, on its network."""
+def look(
+    *addresses: str, access: ProxyAccess = FIRST, policy: str = ""
+) -> tuple[DockerSnapshot, list[Member]]:
+    """Containers at these addresses, which a proxy's labels select, on its network.
+
+    ``policy`` is that of each.
+    """
     nodes = [
         container(f"node{number}", networks=[Attachment("app", address)])
         for number, address in enumerate(addresses)
@@ -66,12 +86,12 @@ def look(*addresses: str, access: ProxyAccess = FIRST) -> tuple[DockerSnapshot, 
     state = observed(*nodes, **own)
     name = state.proxies[0].container.name
     seen = DockerSnapshot(state, LabelReading(), {name: access}, at_host=True)
-    return seen, [Member(node, KEY) for node in nodes]
+    return seen, [Member(node, KEY, policy=parse_rules(policy)) for node in nodes]
 
 
 async def test_who_may_use_it_is_told_though_the_proxy_is_busy_with_all_else(tasks: Tasks) -> None:
     proxies = Proxies()
-    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     sync.update(*look("172.18.0.5"))
     assert await proxies.next() == ["172.18.0.5"]
     sync.update(*look("172.18.0.5", "172.18.0.6"))
@@ -82,7 +102,7 @@ async def test_who_may_use_it_is_told_though_the_proxy_is_busy_with_all_else(tas
 
 async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: Tasks) -> None:
     proxies = Proxies()
-    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     for access in (FIRST, FIRST, SECOND):
         sync.update(*look("172.18.0.5", access=access))
         assert await proxies.next() == ["172.18.0.5"]
@@ -94,8 +114,50 @@ async def test_what_was_not_heard_is_told_again(
     monkeypatch.setattr(proxy_sync, "PAUSES", (0.0, 0.0))
     proxies = Proxies()
     proxies.errors = [ProxyError("answers HTTP 400: selected: unknown field")] * 5
-    sync = DockerProxySync(tasks, proxies, "0-rosproxy", lambda: None)
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
     sync.update(*look("172.18.0.5"))
     assert await proxies.next() == ["172.18.0.5"]
     (told,) = caplog.messages
     assert "could not be told who may use it: answers HTTP 400" in told
+
+
+RULE = "deny publish /camera/*"
+COMMON = administrators_policy([parse_rules(RULE)], "enforce")
+
+
+async def test_a_policy_is_told_before_who_may_use_it_and_only_when_it_has_changed(
+    tasks: Tasks,
+) -> None:
+    proxies = Proxies()
+    settings = replace(SETTINGS, policy=COMMON)
+    sync = DockerProxySync(tasks, proxies, settings, lambda: None)
+    label, addresses = "label of container node0", ["172.18.0.5"]
+    for policy, access, calls in (
+        ("", FIRST, [["administrator"], addresses]),
+        ("", FIRST, [addresses]),
+        (RULE, FIRST, [["administrator", label], addresses]),
+        (RULE, FIRST, [addresses]),
+        (RULE, SECOND, [["administrator", label], addresses]),  # it was started again
+    ):
+        proxies.calls.clear()
+        sync.update(*look(*addresses, access=access, policy=policy))
+        await proxies.next()
+        assert proxies.calls == calls
+
+
+async def test_without_its_policy_nobody_new_is_let_in(
+    tasks: Tasks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proxy_sync, "PAUSES", (0.0, 0.0))
+    proxies = Proxies()
+    proxies.refuses = PolicyRefused("knows no policies")
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
+    seen, members = look("172.18.0.5", policy=RULE)
+    sync.update(seen, members)
+    while len(proxies.calls) < 3:
+        await asyncio.sleep(0)
+    assert proxies.told == []
+    proxies.refuses = None
+    assert await proxies.next() == ["172.18.0.5"]
+    found = silence("p", PolicyRefused("knows no policies"), seen, "0-rosproxy")
+    assert (found.subject, found.text, found.fatal) == ("proxy p", "knows no policies", True)

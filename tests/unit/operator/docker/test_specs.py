@@ -1,5 +1,6 @@
 """What containers are made of, when they must be made anew, and what their labels tell."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,8 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
+from rosproxy.access.layers import read_layers
+from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
+from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key
 from rosproxy_operator.docker.planner.specs import (
@@ -83,6 +87,16 @@ def test_both_are_hardened(body: dict) -> None:
     assert host["SecurityOpt"] == ["no-new-privileges:true"]
     assert host["RestartPolicy"] == {"Name": "unless-stopped"}
     assert not {"Privileged", "CapAdd", "Binds", "Devices"} & host.keys()
+
+
+def test_a_policy_is_there_from_the_start_and_makes_no_proxy_anew() -> None:
+    rules = parse_rules("deny publish /camera/*")
+    other = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
+    body = container_config(PROXY, other, SECRET, "")
+    (found,) = [one for one in body["Env"] if one.startswith("ROSPROXY_POLICY_LAYERS=")]
+    assert read_layers(json.loads(found.partition("=")[2])) == other.policy
+    made = (proxy_fingerprint(PROXY, each, IMAGE, SECRET) for each in (other, SETTINGS))
+    assert len({*made}) == 1
 
 
 def test_an_unknown_address_is_not_given() -> None:

@@ -1,16 +1,18 @@
 """What is known of proxies that start, answer, fall silent and go."""
 
 import asyncio
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Collection, Sequence
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import parse_rules
 from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
-from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.kubernetes import proxy_sync
 from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync, token_for
 from rosproxy_operator.kubernetes.resources.model import ProxyPod
@@ -35,6 +37,8 @@ class Told(ProxyClient):
         self.told: list[Any] = []
         self.callers: list[Any] = []
         self.deaf = False
+        self.policies: list[Any] = []
+        self.refuses: ProxyError | None = None
 
     async def status(self, where: HostPort) -> ProxyStatus:
         self.asked += 1
@@ -46,8 +50,13 @@ class Told(ProxyClient):
     async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)
         if not self.hears:
-            raise ProxyError("its master is away", later=True)
+            raise ProxyError("its master is away", status=503)
         return {}
+
+    async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
+        self.policies.append((token, *layers))
+        if self.refuses:
+            raise self.refuses
 
     async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
         self.callers.append((token, *addresses))
@@ -211,6 +220,53 @@ async def test_a_proxy_that_was_started_again_is_told_anew(talk: Talk) -> None:
     await until(lambda: len(talk.proxies.callers) == 2)
     talk.proxies.failing = 1  # or it did not answer for a moment
     await until(lambda: len(talk.proxies.callers) == 3)
+
+
+LAYER = PolicyLayer("RosProxy robots/arm", parse_rules("deny publish /camera/*"))
+
+
+async def test_its_policy_is_told_when_it_changes(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    await talk.asked()
+    assert talk.proxies.policies == []  # nobody knows yet
+    token = token_of(KEY, proxy().pod.id, "node1")
+    for policy, told in (
+        ((), [(token,)]),
+        ((LAYER,), [(token,), (token, LAYER)]),
+        ((LAYER,), [(token,), (token, LAYER)]),
+    ):
+        talk.all.report_policies({UID: policy, "nobody": ()})
+        await until(lambda told=told: len(talk.proxies.policies) == len(told))  # type: ignore[misc]
+        await talk.asked()
+        assert talk.proxies.policies == told
+
+
+async def test_its_policy_is_told_anew_when_it_was_started_again(talk: Talk) -> None:
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_policies({UID: (LAYER,)})
+    await until(lambda: len(talk.proxies.policies) == 1)
+    talk.all.follow([replace(proxy(), restarts=1)], KEY)
+    await until(lambda: len(talk.proxies.policies) == 2)
+    talk.proxies.failing = 1  # or it did not answer for a moment
+    await until(lambda: len(talk.proxies.policies) == 3)
+
+
+async def test_without_its_policy_nobody_is_let_in(talk: Talk) -> None:
+    """And the operator can say why; what else it is told and asked goes on."""
+    talk.proxies.says, talk.proxies.refuses = UP, PolicyRefused("knows no policies")
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_policies({UID: (LAYER,)})
+    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await until(lambda: UID in talk.all.reports)
+    assert talk.all.reports[UID].refusal == "knows no policies"
+    assert talk.proxies.callers == []
+    assert talk.proxies.told == [{"gone": ["10.0.0.1"]}]
+    talk.proxies.refuses = None
+    await until(lambda: bool(talk.proxies.callers))
+    await until(lambda: talk.all.reports[UID].refusal == "")
 
 
 async def test_it_is_told_now_and_then(talk: Talk, monkeypatch: pytest.MonkeyPatch) -> None:

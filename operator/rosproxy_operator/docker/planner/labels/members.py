@@ -104,6 +104,7 @@ def _request(
         networks=values.networks(container, observed, settings.uplink),
         data_plane=values.data_plane(container.labels),
         slave_control=values.slave_control(container.labels),
+        policy=values.policy(container.labels),
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping
 from typing import get_args
 from urllib.parse import urlsplit
 
+from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane, SlaveControl
@@ -29,12 +30,17 @@ ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
 SLAVE_CONTROL = "rosproxy.slave-control"
-LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, SLAVE_CONTROL)
+POLICY = "rosproxy.policy"
+LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, SLAVE_CONTROL, POLICY)
 
 ALIAS = "rosproxy"
 """The name under which every proxy is found on the networks of its containers."""
 BUILT_IN = frozenset({"bridge", "host", "none"})
 """Networks that every engine has. No names resolve on them, so no proxy can be found there."""
+MOST_LABEL_RULES = 100
+"""Rules that a container may have."""
+LONGEST_POLICY = 16 * 1024
+"""Characters of all of them."""
 _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
@@ -105,6 +111,25 @@ def slave_control(labels: Labels) -> SlaveControl | None:
         f"{named(SLAVE_CONTROL, labels)} is none of {', '.join(words)}: write {SLAVE_CONTROL}="
         "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
     )
+
+
+def policy(labels: Labels) -> tuple[Rule, ...]:
+    """The rules for a container's own nodes, none without the label.
+
+    One that can't be read leaves the container out: what its user wants to hide is not to be seen.
+    """
+    text = labels.get(POLICY, "")
+    if len(text) > LONGEST_POLICY:
+        many = f"label {POLICY} has more than {LONGEST_POLICY} characters: join rules by globs"
+        raise UnusableLabel(many)
+    try:
+        rules = parse_rules(text)
+    except ValueError as error:
+        raise UnusableLabel(f"label {POLICY}: {error}") from None
+    if len(rules) > MOST_LABEL_RULES:
+        many = f"label {POLICY} has {len(rules)} rules, more than {MOST_LABEL_RULES}: join some by"
+        raise UnusableLabel(f"{many} globs")
+    return rules
 
 
 def advertise_host(labels: Labels, settings: PlanSettings) -> str:

@@ -1,0 +1,47 @@
+"""Policies, as operators hand them to proxies: whose rules they are, and how they get there.
+
+A proxy gets its policy twice. With a variable, when it is created, so that it serves for no moment
+without: there stand the layers for all of its nodes, as no others are known by then. And by
+``POST /policy``, all layers, whenever they have changed or the proxy has been started: another
+policy makes no proxy anew. So one that is started again while its operator is away begins with the
+policy of its creation.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+
+from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json
+from rosproxy.access.rules import MOST_RULES, Rule
+from rosproxy.settings import SettingError
+
+ADMINISTRATOR = "administrator"
+"""Name of the layer that the operator's options make, which is for every proxy."""
+POLICY_VARIABLE = "ROSPROXY_POLICY_LAYERS"
+MOST_AUTHORS_RULES = MOST_RULES // 2
+"""Rules of one author, so that those of the administrator and of another always fit together."""
+LONGEST_POLICY = 32 * 1024
+"""Bytes, as JSON, of one author's layer: Linux starts no program with a variable of 128 KiB."""
+
+
+def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple[PolicyLayer, ...]:
+    """The layer of the operator's options, none if they give no rules. Raises SettingError."""
+    every = tuple(rule for some in rules for rule in some)
+    layers = (PolicyLayer(ADMINISTRATOR, every, PolicyMode(mode)),) if every else ()
+    if problem := too_much(layers):
+        raise SettingError("--policy", f"{problem}; join some by globs")
+    return layers
+
+
+def too_much(layers: Sequence[PolicyLayer]) -> str:
+    """Why these are more than a proxy can take from one author; empty if they are not."""
+    count = sum(len(layer.rules) for layer in layers)
+    if count > MOST_AUTHORS_RULES:
+        return f"{count} rules, at most {MOST_AUTHORS_RULES} are accepted"
+    size = len(as_variable(layers).encode())
+    return f"{size} bytes, at most {LONGEST_POLICY} are accepted" if size > LONGEST_POLICY else ""
+
+
+def as_variable(layers: Iterable[PolicyLayer]) -> str:
+    """Those for all nodes, as a proxy takes them at its creation; empty if there are none."""
+    common = [layer for layer in layers if layer.addresses is None]
+    return json.dumps(layers_as_json(common)) if common else ""

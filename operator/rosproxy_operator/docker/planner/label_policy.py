@@ -1,0 +1,95 @@
+"""The policies in containers' labels: layers of rules for the nodes at their addresses alone.
+
+A proxy holds a bounded number of rules. Where those of its containers are too many together, the
+containers with the most are left out: who has many takes nothing from who has few.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+
+from msgspec import structs
+
+from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
+from rosproxy.access.rules import MOST_RULES, format_rules
+from rosproxy_operator.common.problem import Problem, bounded
+from rosproxy_operator.docker.planner.labels.values import POLICY
+from rosproxy_operator.docker.planner.model import Key, Member, PlanSettings
+
+OUTLIVES = 10.0
+"""Seconds for which an address keeps its layers after its container has gone.
+
+What its nodes have registered goes a moment later, and must not come to light before it does.
+"""
+
+
+def within_bounds(
+    members: Collection[Member], settings: PlanSettings
+) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
+    """The members whose rules their proxies can hold, and what the others are told."""
+    common = sum(len(layer.rules) for layer in settings.policy)
+    rules: Counter[Key] = Counter()
+    layers: Counter[Key] = Counter()
+    crowded: list[Member] = []
+    asking = [member for member in members if member.policy and member.container.alive]
+    for member in sorted(asking, key=lambda one: (len(one.policy), one.container.name)):
+        key = member.key
+        many = common + rules[key] + len(member.policy) > MOST_RULES
+        if many or layers[key] + len(settings.policy) >= MOST_LAYERS:
+            crowded.append(member)
+            continue
+        rules[key] += len(member.policy)
+        layers[key] += 1
+    text = (
+        f"label {POLICY}: its proxy can't hold its rules besides those of others (at most "
+        f"{MOST_RULES} of all together): join some by globs, here or there"
+    )
+    return (
+        tuple(member for member in members if member not in crowded),
+        tuple(Problem(f"container {member.container.name}", text) for member in crowded),
+    )
+
+
+def label_layer(member: Member, addresses: Iterable[str]) -> PolicyLayer:
+    """The layer of a container whose nodes are at these addresses."""
+    name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
+    return PolicyLayer(name, member.policy, addresses=frozenset(addresses))
+
+
+class RecentLayers:
+    """The layers of containers' labels, and for some seconds those of containers that are gone."""
+
+    def __init__(self) -> None:
+        self._seen: dict[tuple[PolicyLayer, str], float] = {}
+
+    def look(
+        self, layers: Iterable[PolicyLayer], taken: Collection[str], now: float
+    ) -> tuple[PolicyLayer, ...]:
+        """All that a proxy is to have, with those that a look has found.
+
+        ``taken`` are the addresses of all containers: whose address another one has is gone.
+        """
+        current = {
+            (structs.replace(layer, addresses=None), address): now
+            for layer in layers
+            for address in layer.addresses or ()
+        }
+        recent = {
+            pair: since
+            for pair, since in self._seen.items()
+            if now < since + OUTLIVES and pair[1] not in taken
+        }
+        self._seen = recent | current
+        found = _joined(self._seen)
+        fits = sum(len(layer.rules) for layer in found) <= MOST_RULES and len(found) < MOST_LAYERS
+        return found if fits else _joined(current)
+
+
+def _joined(seen: Mapping[tuple[PolicyLayer, str], float]) -> tuple[PolicyLayer, ...]:
+    """Layers with all their addresses, in a steady order."""
+    addresses: dict[PolicyLayer, set[str]] = {}
+    for layer, address in seen:
+        addresses.setdefault(layer, set()).add(address)
+    whole = (
+        structs.replace(layer, addresses=frozenset(found)) for layer, found in addresses.items()
+    )
+    return tuple(sorted(whole, key=lambda layer: (layer.name, format_rules(layer.rules))))

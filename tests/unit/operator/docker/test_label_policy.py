@@ -1,0 +1,161 @@
+"""Labels with rules: whose nodes they are for, how long, and how many."""
+
+from dataclasses import replace
+
+import pytest
+
+from rosproxy.access.layers import PolicyLayer
+from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
+from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, within_bounds
+from rosproxy_operator.docker.planner.labels.values import MOST_LABEL_RULES
+from rosproxy_operator.docker.planner.model import Attachment, Key, Member
+from rosproxy_operator.docker.planner.proxy_news import ProxyNews, facts
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    ENABLED,
+    KEY,
+    SETTINGS,
+    both,
+    container,
+    observed,
+    planned,
+    read_members,
+)
+
+RULES = parse_rules("deny publish /camera/*")
+COMMON = administrators_policy([parse_rules("deny slave shutdown")], "enforce")
+A, B = "172.18.0.5", "172.18.0.6"
+
+
+def layer(name: str, *addresses: str, rules: tuple[Rule, ...] = RULES) -> PolicyLayer:
+    return PolicyLayer(f"label of container {name}", rules, addresses=frozenset(addresses))
+
+
+# the label
+
+
+def read(text: str) -> tuple[tuple[Member, ...], str]:
+    one = container(labels={**ENABLED, "rosproxy.policy": text})
+    members, problems = read_members(observed(one))
+    assert all((one.subject, one.fatal) == ("container talker", True) for one in problems)
+    return members, "".join(problem.text for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("text", "rules"),
+    [
+        ("", 0),
+        ("deny publish /camera/*", 1),
+        ("allow publish /camera/info\n# not the rest\n deny publish * ; deny serve * by /a", 3),
+        ("; ".join(["deny publish /a"] * MOST_LABEL_RULES), MOST_LABEL_RULES),
+    ],
+)
+def test_the_rules_of_a_label(text: str, rules: int) -> None:
+    (member,), told = read(text)
+    assert (len(member.policy), told) == (rules, "")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("hide /camera", "label rosproxy.policy: rule 'hide /camera': must be ACTION KIND GLOB"),
+        ("deny publish camera", "'camera' must begin with / or *"),
+        ("; ".join(["deny publish /a"] * (MOST_LABEL_RULES + 1)), "has 101 rules, more than 100"),
+        ("#" * 20_000, "has more than 16384 characters: join rules by globs"),
+    ],
+)
+def test_with_rules_that_can_not_be_read_a_container_is_not_served(text: str, told: str) -> None:
+    members, said = read(text)
+    assert members == ()
+    assert told in said
+
+
+# what a proxy is told
+
+
+def test_a_layer_is_for_the_addresses_of_its_container() -> None:
+    talker = container("talker", networks=[Attachment("app", A)])
+    guest = container("guest", networks=[], mode="container:id-talker")
+    soon = container("soon", networks=[Attachment("app", "")], state="created")
+    ended = container("ended", networks=[Attachment("app", B)], state="exited")
+    own = both()
+    box = own["sandboxes"][0]
+    home = replace(box.container, attachments=(Attachment("app", "172.18.0.2"),))
+    seen = observed(
+        talker, guest, soon, ended, **{**own, "sandboxes": [replace(box, container=home)]}
+    )
+    members = [Member(one, KEY, policy=RULES) for one in (talker, guest, soon, ended)]
+    plain = Member(container("plain", networks=[Attachment("app", B)]), KEY)
+    other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
+    known = facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
+    assert known.policy == (*COMMON, layer("talker", A), layer("guest", A))
+
+
+def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gone() -> None:
+    recent = RecentLayers()
+    assert recent.look([layer("a", A)], {A}, 0.0) == (layer("a", A),)
+    assert recent.look([], set(), 1.0) == (layer("a", A),)
+    assert recent.look([], set(), OUTLIVES) == ()
+    recent.look([layer("a", A)], {A}, 0.0)
+    assert recent.look([], {A}, 1.0) == ()  # another container has it
+
+
+def test_a_container_that_comes_back_elsewhere_has_one_layer() -> None:
+    recent = RecentLayers()
+    recent.look([layer("a", A)], {A}, 0.0)
+    assert recent.look([layer("a", B)], {B}, 1.0) == (layer("a", A, B),)
+    assert recent.look([layer("a", B)], {B}, OUTLIVES) == (layer("a", B),)
+
+
+def test_those_of_gone_containers_take_no_room_from_others() -> None:
+    many = RULES * (MOST_RULES // 2 + 1)
+    recent = RecentLayers()
+    recent.look([layer("a", A, rules=many)], {A}, 0.0)
+    new = layer("b", B, rules=many)
+    assert recent.look([new], {B}, 1.0) == (new,)
+
+
+def test_the_same_look_is_the_same_policy() -> None:
+    layers = [layer("b", B, A), layer("a", A), layer("a", B, rules=RULES * 2)]
+    first, second = ProxyNews(), ProxyNews()
+    for news, order in ((first, layers), (second, layers[::-1])):
+        seen = observed(**both())
+        known = replace(facts(seen, seen.proxies[0], ()), policy=(*COMMON, *order))
+        news.look(known, 0.0)
+    assert first.policy == second.policy
+    assert first.policy[0] == COMMON[0]
+
+
+# how many
+
+
+def crowd(**rules: int) -> list[Member]:
+    return [Member(container(name), KEY, policy=RULES * count) for name, count in rules.items()]
+
+
+def test_who_has_many_rules_takes_no_room_from_who_has_few() -> None:
+    settings = replace(SETTINGS, policy=administrators_policy([RULES * 400], "enforce"))
+    members = crowd(a=100, b=100, c=1, d=100, e=100, f=100, g=100, h=0)
+    left, (problem,) = within_bounds(members, settings)
+    assert {one.container.name for one in left} == set("abcdefh")
+    assert (problem.subject, problem.fatal) == ("container g", True)
+    assert "can't hold its rules besides those of others (at most 1000" in problem.text
+    assert within_bounds(members, SETTINGS) == (tuple(members), ())
+
+
+def test_proxies_are_bounded_each_for_itself() -> None:
+    other = Key("http://other:11311", "192.0.2.10")
+    more = [replace(one, key=other) for one in crowd(x=100)]
+    members = [*crowd(**{f"c{number}": 100 for number in range(10)}), *more]
+    assert within_bounds(members, SETTINGS)[1] == ()
+
+
+def test_the_plan_leaves_out_whom_a_proxy_can_not_hold() -> None:
+    label = {"rosproxy.policy": "; ".join(["deny publish /a"] * MOST_LABEL_RULES)}
+    seen = observed(*(container(f"c{n:02}", labels={**ENABLED, **label}) for n in range(11)))
+    found = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    assert [one.container.name for one in found.members] == [f"c{n:02}" for n in range(10)]
+    assert [one.subject for one in found.problems if "rosproxy.policy" in one.text] == [
+        "container c10"
+    ]

@@ -1,0 +1,108 @@
+"""The administrator's policy, and its way to a proxy."""
+
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+from aiohttp import web
+from aiohttp.test_utils import TestServer
+
+from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json, read_layers
+from rosproxy.access.rules import parse_rules
+from rosproxy.net.addresses import HostPort
+from rosproxy.settings import SettingError
+from rosproxy_operator.common.policy import (
+    LONGEST_POLICY,
+    MOST_AUTHORS_RULES,
+    administrators_policy,
+    as_variable,
+)
+from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
+
+RULES = parse_rules("deny publish /camera/*; deny slave shutdown by /a?")
+OWN = PolicyLayer("label of container a", RULES, addresses=frozenset({"172.18.0.5"}))
+
+
+def test_the_options_make_one_layer_or_none() -> None:
+    assert administrators_policy([], "audit") == ()
+    assert administrators_policy([()], "audit") == ()
+    (layer,) = administrators_policy([RULES, parse_rules("allow call *")], "audit")
+    assert (layer.name, layer.mode) == ("administrator", PolicyMode.AUDIT)
+    assert list(map(str, layer.rules)) == [*map(str, RULES), "allow call *"]
+    assert layer.addresses is None
+
+
+@pytest.mark.parametrize(
+    ("count", "glob", "told"),
+    [
+        (MOST_AUTHORS_RULES, "/a", ""),
+        (MOST_AUTHORS_RULES + 1, "/a", "501 rules, at most 500 are accepted"),
+        (200, "/" + "a" * 255, f"at most {LONGEST_POLICY} are accepted"),
+    ],
+)
+def test_a_policy_is_bounded(count: int, glob: str, told: str) -> None:
+    """A program whose variables are too long could not be started."""
+    rules = [parse_rules(f"deny publish {glob}")] * count
+    if not told:
+        assert administrators_policy(rules, "enforce")
+        return
+    with pytest.raises(SettingError, match=told) as error:
+        administrators_policy(rules, "enforce")
+    assert error.value.option == "--policy"
+
+
+def test_at_its_creation_a_proxy_gets_what_is_for_all_its_nodes() -> None:
+    common = administrators_policy([RULES], "enforce")
+    assert read_layers(json.loads(as_variable([*common, OWN]))) == common
+    assert as_variable([OWN]) == ""
+
+
+class Answers:
+    """A proxy's admin endpoint that answers as it is told, and notes what it hears."""
+
+    def __init__(self) -> None:
+        self.status, self.text = 200, "{}"
+        self.told: list[Any] = []
+
+    async def policy(self, request: web.Request) -> web.Response:
+        self.told.append((request.headers.get("Authorization"), await request.json()))
+        return web.Response(status=self.status, text=self.text)
+
+
+@asynccontextmanager
+async def proxy(*routes: web.RouteDef) -> AsyncIterator[tuple[ProxyClient, HostPort]]:
+    application = web.Application()
+    application.router.add_routes(routes)
+    client = ProxyClient()
+    async with TestServer(application, host="127.0.0.1") as server:
+        yield client, HostPort("127.0.0.1", server.port or 0)
+        await client.close()
+
+
+async def test_a_proxy_is_told_all_layers() -> None:
+    answers = Answers()
+    async with proxy(web.post("/policy", answers.policy)) as (client, where):
+        await client.policy(where, "token", [OWN])
+    assert answers.told == [("Bearer token", {"layers": layers_as_json([OWN])})]
+
+
+async def test_one_of_a_former_release_has_no_policy_at_all() -> None:
+    async with proxy() as (client, where):
+        await client.policy(where, "token", [])
+        with pytest.raises(PolicyRefused, match="its image is that of a former release"):
+            await client.policy(where, "token", [OWN])
+
+
+@pytest.mark.parametrize(
+    ("status", "kind"), [(400, PolicyRefused), (403, ProxyError), (503, ProxyError)]
+)
+async def test_one_that_does_not_take_it(status: int, kind: type[ProxyError]) -> None:
+    answers = Answers()
+    answers.status, answers.text = status, "layer 'x': too long"
+    async with proxy(web.post("/policy", answers.policy)) as (client, where):
+        with pytest.raises(ProxyError, match="layer 'x': too long") as error:
+            await client.policy(where, "token", [OWN])
+    assert type(error.value) is kind
+    assert (error.value.status, error.value.later) == (status, status == 503)
