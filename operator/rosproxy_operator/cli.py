@@ -279,6 +279,7 @@ def plan(settings: PlanSettings) -> None:
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
 @administrators_options
+@policy_options
 @own_options
 @_resync_option
 @_bind_option(

@@ -76,6 +76,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
                 "dataPlanes": ["Auto", "Kernel"],
                 "images": ["registry.example/*"],
             },
+            "policy": {"rules": ["deny publish /camera/* by /driver"], "mode": "Audit"},
             "imagePullSecrets": [{"name": "registry"}],
             "serviceAccount": {"annotations": {"a.example/role": "x"}},
             "podAnnotations": {"a": "b"},

@@ -90,6 +90,7 @@ class KubernetesController:
         self._metrics.look_time.observe(took)
         log.debug("looked in %.3f s", took)
         self.event_filter.last = seen
+        self._proxy_sync.report_policies(planned.policies)
         self._proxy_sync.report_callers(planned.callers)
         self._proxy_sync.report_gone(planned.gone)
         await self._applier.carry_out(planned.actions, seen)

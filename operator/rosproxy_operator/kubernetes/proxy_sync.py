@@ -1,10 +1,10 @@
 """Keeping proxies and operator in step, over the proxies' admin endpoints.
 
 Each proxy's pod that has an address is asked for its ``/status`` every few seconds, by a
-`ProxyPoller` of its own, and told (``/containers``) which pods may use it as their master and
-which are gone, until it has confirmed that. What it says lands in `ClusterProxySync.reports`, from
-where the operator takes it with each look; a report that is another one than before wakes the
-operator.
+`ProxyPoller` of its own, and told its policy (``/policy``), which pods may use it as their master
+and which are gone (``/containers``), until it has confirmed that. What it says lands in
+`ClusterProxySync.reports`, from where the operator takes it with each look; a report that is
+another one than before wakes the operator.
 """
 
 import asyncio
@@ -13,12 +13,13 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.admin.status_document import ProxyStatus
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
 from rosproxy_operator.common.proxy_status import nodes_by_address
 from rosproxy_operator.kubernetes.resources.model import ProxyPod, ProxyReport
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, token_of
@@ -62,6 +63,9 @@ class ProxyPoller:
         self._proxies, self._room, self._changed = proxies, room, changed
         self._gone: set[str] = set()
         self._restarts = proxy.restarts
+        self._policy: tuple[PolicyLayer, ...] | None = None
+        self._known_policy: tuple[PolicyLayer, ...] | None = None
+        self._refusal = ""
         self._callers: tuple[str, ...] | None = None
         self._known: tuple[str, ...] | None = None
         self._known_at = 0.0
@@ -75,6 +79,12 @@ class ProxyPoller:
         if self._gone:
             self._pending.set()
 
+    def report_policy(self, policy: tuple[PolicyLayer, ...]) -> None:
+        """Let it know all layers of its policy."""
+        self._policy = policy
+        if policy != self._known_policy:
+            self._pending.set()
+
     def report_callers(self, callers: tuple[str, ...]) -> None:
         """Let it know the addresses of all pods that may use it as their master."""
         self._callers = callers
@@ -84,7 +94,8 @@ class ProxyPoller:
     def restarted(self, restarts: int) -> None:
         """Take notice of how often its container was started again: it knows nothing then."""
         if restarts != self._restarts:
-            self._restarts, self._known = restarts, None
+            self._restarts = restarts
+            self._forget()
             self._pending.set()
 
     async def run(self) -> None:
@@ -92,7 +103,8 @@ class ProxyPoller:
         while True:
             async with self._room:
                 self._pending.clear()
-                await self._tell_callers()
+                if await self._tell_policy():  # nobody is let in whose policy it does not have
+                    await self._tell_callers()
                 told = await self._tell_gone()
                 await self._ask()
                 self._recheck = told
@@ -104,10 +116,10 @@ class ProxyPoller:
 
     async def _ask(self) -> None:
         try:
-            found = report(await self._proxies.status(self.where))
+            found = report(await self._proxies.status(self.where), self._refusal)
             self._failures = 0
         except ProxyError as error:
-            self._known = None  # who answers next may have been started meanwhile
+            self._forget()  # who answers next may have been started meanwhile
             self._failures += 1
             if self._failures < SILENT or not (self.report or self._waited(STARTING)):
                 return
@@ -119,6 +131,26 @@ class ProxyPoller:
         if found != self.report or self._recheck:
             self.report = found
             self._changed()
+
+    def _forget(self) -> None:
+        """Take it that the proxy knows nothing."""
+        self._known = self._known_policy = None
+
+    async def _tell_policy(self) -> bool:
+        """Tell its policy, if it does not know that; whether it does now."""
+        policy = self._policy
+        if policy is None or policy == self._known_policy:
+            return True
+        try:
+            await self._proxies.policy(self.where, self.token, policy)
+        except PolicyRefused as error:
+            self._refusal = _short(str(error))
+            return False
+        except ProxyError as error:
+            log.debug("%s was not told its policy: %s", self.where, error)
+            return False
+        self._known_policy, self._refusal = policy, ""
+        return True
 
     async def _tell_callers(self) -> None:
         """Tell which pods may use it, if it does not know.
@@ -184,6 +216,12 @@ class ClusterProxySync:
                 task = self._tasks.spawn(one.run(), f"polling {proxy.pod.id}")
                 self._all[uid] = one, task
 
+    def report_policies(self, policies: Mapping[str, tuple[PolicyLayer, ...]]) -> None:
+        """Let proxies know, by the uid of their pod, the layers of their policy."""
+        for uid, policy in policies.items():
+            if uid in self._all:
+                self._all[uid][0].report_policy(policy)
+
     def report_callers(self, callers: Mapping[str, tuple[str, ...]]) -> None:
         """Let proxies know, by the uid of their pod, which addresses may use them."""
         for uid, addresses in callers.items():
@@ -214,8 +252,11 @@ def _way(proxy: ProxyPod, key: bytes) -> tuple[HostPort, str]:
     return address_of(proxy), token_for(proxy, key)
 
 
-def report(status: ProxyStatus) -> ProxyReport:
-    """What a proxy says. Nodes that it has given up already are not among its nodes."""
+def report(status: ProxyStatus, refusal: str = "") -> ProxyReport:
+    """What a proxy says, and why it does not take its policy.
+
+    Nodes that it has given up already are not among its nodes.
+    """
     master, nodes = status.master, nodes_by_address(status)
     every = [node for there in nodes.values() for node in there]
     return ProxyReport(
@@ -227,6 +268,7 @@ def report(status: ProxyStatus) -> ProxyReport:
             for address, there in nodes.items()
         },
         topics=frozenset(topic for node in every for topic in node.publishes + node.subscribes),
+        refusal=refusal,
         problems=tuple(
             _short(f"{one.subject}: {one.text}") for one in status.problems if one.age <= RECENT
         ),

@@ -8,9 +8,11 @@ from typing import Any
 
 import msgspec
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import DataPlane, SettingError
+from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
@@ -47,6 +49,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     ``ephemeral`` the range from which the nodes' kernels take ports for connections: no hostPort
     is taken from either. ``network_policy``: whether RosProxies get one; ``admin_from`` are the
     NetworkPolicyPeers that it lets reach the proxies' admin endpoints, everybody if it is None.
+    ``policy`` is the administrator's, for all proxies: one layer or none.
     """
 
     image: str = "rosproxy:latest"
@@ -56,6 +59,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     bounds: Bounds = Bounds()
     network_policy: bool = True
     admin_from: tuple[Json, ...] | None = None
+    policy: tuple[PolicyLayer, ...] = ()
 
 
 class WebhookSettings(msgspec.Struct, frozen=True):
@@ -112,6 +116,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
             ),
             network_policy=options["network_policy"],
             admin_from=options["admin_from"],
+            policy=administrators_policy(options["policy"], options["policy_mode"]),
         ),
         namespaces=tuple(dict.fromkeys(options["namespace"])),
         resync=options["resync"],

@@ -9,6 +9,8 @@ import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
+from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
+from rosproxy_operator.kubernetes.planner.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
@@ -85,8 +87,8 @@ def slave_control_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
 def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     """A proxy's pod.
 
-    The fingerprint says what the pod is made of, but for its image, which can be exchanged; then
-    as what its nodes know it, see `finds_again`.
+    The fingerprint says what the pod is made of, but for its image, which can be exchanged, and its
+    policy; then as what its nodes know it, see `finds_again`.
     """
     of, container = site.rosproxy, _container(site, settings)
     notes = {
@@ -95,7 +97,10 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
         ADVERTISE_HOST: site.advertise_host,
     }
     meta = metadata(of, proxy_id(of.id, site.node.name), notes)
-    spec = {**_spec(site), "containers": [{**container, "image": ""}]}
+    # A running proxy is told its policy: another one makes no pod anew. A proxy that is started
+    # again while the operator is away begins with the policy of its pod's creation.
+    env = [one for one in container["env"] if one["name"] != POLICY_VARIABLE]
+    spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
     notes[FINGERPRINT] = f"{_fingerprint(body)}-{known_as}"
@@ -256,6 +261,7 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
+        POLICY_VARIABLE: as_variable(policy_of(site.rosproxy, settings)),
     }
     return {name: value for name, value in variables.items() if value}
 

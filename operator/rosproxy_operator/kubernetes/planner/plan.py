@@ -4,7 +4,7 @@
 for more than he may. `view` puts in order what is seen: who is wanted where. `state.learn` draws
 conclusions from it, `allocation.allocate` gives each wanted proxy its ports, `reconcile` and
 `network_policy` say what is to be done to Services, proxies and NetworkPolicies, `status` and
-`events` what users are told of it, `departures` and `callers` what proxies are told.
+`events` what users are told of it, `departures`, `callers` and `policies` what proxies are told.
 """
 
 import json
@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import msgspec
 from msgspec.structs import replace
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy_operator.kubernetes.planner import departures
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
@@ -23,6 +24,7 @@ from rosproxy_operator.kubernetes.planner.network_policy import (
     reconcile_orphaned_policies,
     reconcile_policy,
 )
+from rosproxy_operator.kubernetes.planner.policies import policies
 from rosproxy_operator.kubernetes.planner.reconcile import (
     ClusterContext,
     advertise_host,
@@ -57,8 +59,8 @@ class ClusterPlan(msgspec.Struct, frozen=True):
 
     One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
     proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that may use the
-    proxy: it is to be told. ``again_in`` is in how many seconds to look again even if nothing
-    happens; None: no need.
+    proxy, ``policies`` the layers of its policy: it is to be told. ``again_in`` is in how many
+    seconds to look again even if nothing happens; None: no need.
     """
 
     actions: tuple[Action, ...] = ()
@@ -66,6 +68,7 @@ class ClusterPlan(msgspec.Struct, frozen=True):
     state: ClusterState = ClusterState()
     gone: Mapping[str, tuple[str, ...]] = {}
     callers: Mapping[str, tuple[str, ...]] = {}
+    policies: Mapping[str, tuple[PolicyLayer, ...]] = {}
     again_in: float | None = None
 
 
@@ -114,6 +117,7 @@ def plan(
         state=replace(gone.state, attempts=retries.noted, reported=new.reported),
         gone=gone.gone,
         callers=callers(whole),
+        policies=policies(whole, settings),
         again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
     )
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane
 from rosproxy_operator.common.problem import Problem
@@ -70,8 +71,8 @@ class RosProxySpec(msgspec.Struct, frozen=True):
 
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
     RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
-    operator's default. ``resources``, ``tolerations``, ``host_aliases`` and
-    ``image_pull_secrets`` go into the pods as they are.
+    operator's default. ``policy`` is one layer or none. ``resources``, ``tolerations``,
+    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are.
     """
 
     master: MasterSpec
@@ -84,6 +85,7 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     cleanup_after: float = 30.0
     grace: float = 60.0
     slave_control: str = "any"
+    policy: tuple[PolicyLayer, ...] = ()
     data_plane: DataPlane = "auto"
     image: str = ""
     image_pull_policy: str = ""
@@ -216,7 +218,8 @@ class ProxyReport(msgspec.Struct, frozen=True):
     """What a proxy says of itself (``/status``), as far as it matters here.
 
     ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
-    warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer.
+    warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer;
+    ``refusal`` why it does not take its policy.
     """
 
     answered: bool
@@ -225,6 +228,7 @@ class ProxyReport(msgspec.Struct, frozen=True):
     nodes: Mapping[str, tuple[str, ...]] = {}
     topics: frozenset[str] = frozenset()
     problems: tuple[str, ...] = ()
+    refusal: str = ""
 
 
 class Obstacle(msgspec.Struct, frozen=True):

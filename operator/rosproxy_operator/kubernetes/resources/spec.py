@@ -6,13 +6,16 @@ pod is admitted) is checked here again. Names, types, bounds and defaults are th
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from urllib.parse import urlsplit
 
+from rosproxy.access.layers import PolicyLayer, PolicyMode
+from rosproxy.access.rules import Action, Rule, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.settings import DataPlane
+from rosproxy_operator.common.policy import too_much
 from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, bare
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
@@ -46,6 +49,18 @@ RESOURCES: Json = {
     "limits": {"memory": "512Mi"},
 }
 _SLAVE_CONTROL = {"Any": "any", "Master": "master"}
+_POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
+_ACTION = {"Allow": Action.ALLOW, "Deny": Action.DENY}
+_RULE_KIND = {
+    "Publish": RuleKind.PUBLISH,
+    "Serve": RuleKind.SERVE,
+    "Subscribe": RuleKind.SUBSCRIBE,
+    "Call": RuleKind.CALL,
+    "GetParam": RuleKind.GET_PARAM,
+    "SetParam": RuleKind.SET_PARAM,
+    "Slave": RuleKind.SLAVE,
+}
+_GLOB = re.compile(r"[^\s;]{1,256}")
 _DATA_PLANE: dict[str, DataPlane] = {
     "Auto": "auto",
     "Kernel": "kernel",
@@ -116,6 +131,7 @@ def _spec(given: Field, of: Name) -> RosProxySpec:
         cleanup_after=given["cleanupAfterSeconds"].number(30.0, 0, _DAY),
         grace=given["graceSeconds"].number(60.0, 0, _DAY),
         slave_control=given["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
+        policy=_policy(given["policy"], of),
         data_plane=given["dataPlane"].one_of(_DATA_PLANE, "Auto"),
         image=given["image"].text(),
         image_pull_policy=given["imagePullPolicy"].one_of(_PULL_POLICY, ""),
@@ -123,6 +139,38 @@ def _spec(given: Field, of: Name) -> RosProxySpec:
         resources=given["resources"].map(RESOURCES),
         host_aliases=tuple(_host_alias(one) for one in given["hostAliases"].each()),
     )
+
+
+def _policy(given: Field, of: Name) -> tuple[PolicyLayer, ...]:
+    """The layer of its policy; none if it has no rules."""
+    mode = given["mode"].one_of(_POLICY_MODE, "Enforce")
+    rules = tuple(rule for one in given["rules"].each() for rule in _rules(one))
+    layers = (PolicyLayer(f"RosProxy {of}", rules, mode),) if rules else ()
+    if problem := too_much(layers):
+        raise InvalidField(f"{given['rules'].path}: {problem}: join names or nodes by globs")
+    return layers
+
+
+def _rules(given: Field) -> Iterator[Rule]:
+    """One for each of the names that are listed, with each of the nodes."""
+    action = given["action"].one_of(_ACTION, "")
+    kind = given["kind"].one_of(_RULE_KIND, "")
+    names = [_glob(one, kind is not RuleKind.SLAVE) for one in given["names"].each()]
+    nodes = [_glob(one, True) for one in given["nodes"].each()]
+    if not names:
+        raise given["names"].refused("is empty", "name what the rule is about, or write ['*']")
+    for name in names:
+        yield from (Rule(action, kind, name, node) for node in nodes or ["*"])
+
+
+def _glob(given: Field, ros_name: bool) -> str:
+    """A glob, for a ROS name or for a method of the slave API."""
+    glob = given.text()
+    if not _GLOB.fullmatch(glob) or (ros_name and glob[0] not in "/*?"):
+        begins = ", and begins with / or *" if ros_name else ""
+        fix = f"it has 1 to 256 characters without blanks and ;{begins}"
+        raise given.refused("is no glob of names", fix)
+    return glob
 
 
 def _window(given: Field, ports: int) -> PortRange:

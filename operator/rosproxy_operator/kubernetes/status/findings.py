@@ -27,6 +27,7 @@ STUCK = "ProxyStuck"
 SILENT = "ProxyUnreachable"
 NO_MASTER = "MasterUnreachable"
 WARNS = "ProxyWarns"
+REFUSES = "PolicyRefused"
 _LONGEST = 600
 _ENFORCE = "pod-security.kubernetes.io/enforce"
 
@@ -114,6 +115,8 @@ def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator
             # No Event: an operator that is cut off would make one for each proxy.
             yield ClusterFinding(subject, text, reason=SILENT, of=rosproxy.id)
         return
+    if answer.refusal:
+        yield _finding(rosproxy, subject, f"it {answer.refusal}", REFUSES)
     if not answer.master_up:
         text = f"it does not reach the master ({answer.error}): {_master_remedy(rosproxy)}"
         yield _finding(rosproxy, subject, text, NO_MASTER)

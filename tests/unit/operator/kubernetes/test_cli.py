@@ -3,6 +3,7 @@
 import pytest
 from click.testing import CliRunner, Result
 
+from rosproxy.access.layers import PolicyMode
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator import cli
@@ -45,6 +46,9 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--allow-data-plane=kernel",
         "--allow-image=registry.example/*",
         "--slave-control=master",
+        "--policy=deny publish /camera/*; deny call *",
+        "--policy=deny serve *",
+        "--policy-mode=audit",
         "--no-network-policy",
         '--admin-from=[{"podSelector":{}},{"ipBlock":{"cidr":"192.0.2.0/24"}}]',
         "--key-secret=ns/key",
@@ -58,6 +62,11 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
     (settings,) = given
     assert settings.namespaces == ("one", "two")
     assert settings.plan.image == "rosproxy:1"
+    (layer,) = settings.plan.policy
+    assert (layer.name, layer.mode) == ("administrator", PolicyMode.AUDIT)
+    assert [str(rule) for rule in layer.rules] == [
+        *("deny publish /camera/*", "deny call *", "deny serve *")
+    ]
     assert settings.plan.image_pull_policy == "Never"
     assert settings.plan.node_ports == PortRange(31000, 31999)
     assert settings.plan.ephemeral == PortRange(40000, 50000)

@@ -120,6 +120,15 @@ def test_a_proxy_that_does_not_answer_the_controller():
     assert judged(found, "MasterReachable") == ("Unknown", "NotAsked")
 
 
+def test_a_proxy_that_does_not_take_its_policy():
+    refusal = "knows no policies: its image is that of a former release"
+    found = status(state(answer=ProxyReport(True, True, refusal=refusal)))
+
+    assert judged(found, "Ready") == ("True", "Serving")
+    assert judged(found, "Degraded") == ("True", "PolicyRefused")
+    assert "it knows no policies" in message(found, "Degraded")
+
+
 def test_what_proxies_warn_of_keeps_nobody_from_being_served():
     found = status(state(answer=answer("/a", problems=("/a: does not answer",))))
 

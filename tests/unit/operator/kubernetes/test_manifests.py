@@ -1,12 +1,16 @@
 """What is created: hardened, bound to its node, and recognized when it is seen again."""
 
+import json
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
+from rosproxy.access.layers import PolicyLayer, read_layers
+from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
+from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -50,6 +54,18 @@ def test_the_proxy_understands_all_of_its_variables() -> None:
     assert list(map(str, found.inside_networks)) == ["10.244.1.0/24", "fd00::/64"]
     assert (found.cleanup_after, found.slave_control) == (0.5, "master")
     assert found.admin_token is None
+
+
+def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
+    """The administrator's layer first; the RosProxy's can only narrow it."""
+    rules = parse_rules("deny publish /camera/*")
+    settings = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
+    own = PolicyLayer("RosProxy ros/robot", parse_rules("deny serve *"))
+    made = manifests.proxy_pod(site(rosproxy(policy=(own,)), node()), settings)
+    found = read_layers(json.loads(env_of(made)["ROSPROXY_POLICY_LAYERS"]))
+    assert found == (*settings.policy, own)
+    assert manifests.fingerprint_of(made) == manifests.fingerprint_of(body())
+    assert "ROSPROXY_POLICY_LAYERS" not in env()
 
 
 def test_what_is_not_known_is_left_to_the_proxy() -> None:

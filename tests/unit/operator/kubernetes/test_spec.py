@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.access.rules import RuleKind, format_rules, parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.resources.fields import InvalidField
 from rosproxy_operator.kubernetes.resources.model import Advertise, MasterSpec, Name, Selector
@@ -286,3 +287,74 @@ def test_a_bad_field_beside_good_ones(spec):
     text = _refusal(rosproxy_obj(spec))
 
     assert not text or text.startswith("spec.")
+
+
+# its policy
+
+
+def policy(*rules: Any, **more: Any) -> Any:
+    return rosproxy(rosproxy_obj({"policy": {"rules": list(rules), **more}})).spec.policy
+
+
+def rule(**changes: Any) -> dict[str, Any]:
+    return {"action": "Deny", "kind": "Publish", "names": ["/camera/*"], **changes}
+
+
+def test_rules_of_a_policy_are_one_layer():
+    (layer,) = policy(
+        rule(names=["/a", "/b"], nodes=["/x", "/y*"]),
+        rule(action="Allow", kind="GetParam", names=["*"], nodes=[]),
+        rule(kind="Slave", names=["shutdown"]),
+        mode="Audit",
+    )
+
+    assert (layer.name, layer.mode.value, layer.addresses) == (
+        f"RosProxy {NAMESPACE}/arm", "audit", None,
+    )  # fmt: skip
+    assert [str(each) for each in layer.rules] == [
+        "deny publish /a by /x",
+        "deny publish /a by /y*",
+        "deny publish /b by /x",
+        "deny publish /b by /y*",
+        "allow get-param *",
+        "deny slave shutdown",
+    ]
+    assert parse_rules(format_rules(layer.rules)) == layer.rules
+
+
+def test_without_rules_there_is_no_layer():
+    assert policy() == policy(mode="Audit") == rosproxy(rosproxy_obj()).spec.policy == ()
+
+
+@pytest.mark.parametrize("kind", [one.value for one in RuleKind])
+def test_every_kind_of_rule_has_a_word(kind):
+    word = "".join(part.capitalize() for part in kind.split("-"))
+    assert policy(rule(kind=word))[0].rules[0].kind.value == kind
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        (rule(action="Hide"), "spec.policy.rules[0].action: 'Hide' is unknown: write one of Allow"),
+        (rule(kind="Topic"), "spec.policy.rules[0].kind: 'Topic' is unknown: write one of Call"),
+        (rule(kind=None), "spec.policy.rules[0].kind"),
+        (rule(names=[]), "spec.policy.rules[0].names: [] is empty: name what"),
+        (rule(names=["camera"]), "names[0]: 'camera' is no glob of names: it has 1 to 256 char"),
+        (rule(names=["/a; allow publish *"]), "is no glob of names"),
+        (rule(names=["/a by /b"]), "is no glob of names"),
+        (rule(names=["/" + "a" * 256]), "is no glob of names"),
+        (rule(names=[""]), "is no glob of names"),
+        (rule(nodes=["driver"]), "spec.policy.rules[0].nodes[0]: 'driver' is no glob of names"),
+        (rule(kind="Slave", names=["shutdown"], nodes=["x"]), "nodes[0]: 'x' is no glob"),
+        (rule(names=["/a"] * 501), "spec.policy.rules: 501 rules, at most 500 are accepted"),
+        (rule(names=["/" + "a" * 200] * 300), "bytes, at most 32768 are accepted: join names"),
+    ],
+)
+def test_a_bad_rule_is_told(bad, said):
+    with pytest.raises(InvalidField, match=re.escape(said)):
+        policy(bad)
+
+
+def test_a_mode_that_can_not_be():
+    with pytest.raises(InvalidField, match=re.escape("spec.policy.mode: 'Tell' is unknown")):
+        policy(mode="Tell")
