@@ -13,8 +13,17 @@ import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rosproxy.access.layers import read_layer
+from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
 from rosproxy.admin.range_probe import probe_range
-from rosproxy.admin.requests import ContainerNews, MasterAddress, Nothing, read_body
+from rosproxy.admin.requests import (
+    BodyError,
+    ContainerNews,
+    MasterAddress,
+    Nothing,
+    PolicyNews,
+    read_body,
+)
 from rosproxy.admin.server import AdminServer
 from rosproxy.admin.status import ProxyState
 from rosproxy.admin.status_document import to_json
@@ -30,11 +39,14 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
+from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
+from rosproxy.ros1.upkeep.matchmaker import Matchmaker
+from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -59,14 +71,18 @@ class App:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.context = context = Context(settings)
-        self.tcpros = TcprosServer(context)
+        self._judge = judge = PolicyJudge(
+            context.policy, context.registry, context.addressing, context.upstream
+        )
+        self.tcpros = TcprosServer(context, judge)
         self.plane = plane = KernelPlane(
             settings, context.registry, context.tasks, context.problems, context.now
         )
         self._callers, self._probing = Callers(context), asyncio.Lock()
         self.alias = Alias(context)
-        self.registrar = registrar = Registrar(context, self.alias)
-        self._resubscriber = Resubscriber(context, registrar, self.tcpros, plane)
+        self._matchmaker = matchmaker = Matchmaker(context, self.alias)
+        self.registrar = registrar = Registrar(context, matchmaker)
+        self._resubscriber = Resubscriber(context, registrar, matchmaker, self.tcpros, plane)
         self.leases = leases = Leases(
             context.registry,
             settings.bind,
@@ -76,13 +92,18 @@ class App:
             context.problems,
             context.gate,
         )
-        self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane)
+        self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane, judge)
+        self._enforcer = PolicyEnforcer(
+            context, leases, registrar, self._recovery, self.tcpros, plane, judge
+        )
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
         self.master_monitor = monitor = MasterMonitor(context, self._recovery, registrar)
         self._state = ProxyState(context, monitor, self.tcpros, self.alias, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
-        leases.server = slave = SlaveApi(context, leases, self.alias, self._adopter, self.tcpros)
+        leases.server = slave = SlaveApi(
+            context, leases, self.alias, self._adopter, self.tcpros, judge
+        )
         self._servers = [slave.server]
         self._acceptors: list[Acceptor] = []
         self._containers = ContainerEvents(
@@ -93,6 +114,7 @@ class App:
             "/containers": self._handle_news,
             "/master-address": self._set_master_address,
             "/retire": self._retire,
+            "/policy": self._set_policy,
         }
         metrics, token_hash = context.metrics.registry, settings.token_hash
         self._admin = AdminServer(metrics, self.status, self._unready, actions, token_hash)
@@ -102,9 +124,19 @@ class App:
         settings, context = self.settings, self.context
         with _binding("--bind", settings.bind):
             sockets.bind(settings.bind, 0).close()
+        policy_file = self._read_policy_file()
         self._reserve_range()
         await self.plane.start()
-        master = MasterApi(context, self._admission, self.alias, self._recovery, self._adopter)
+        master = MasterApi(
+            context,
+            self._admission,
+            self.alias,
+            self._recovery,
+            self._adopter,
+            self._judge,
+            self._matchmaker,
+            self._enforcer,
+        )
         guard, what = self._callers.refusal, "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, what, guard)
         if settings.publish_master is not None:
@@ -121,6 +153,9 @@ class App:
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
         repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
+        repeat(self._enforcer.look, ENFORCE_TICK, "enforcing the policy")
+        if policy_file is not None:
+            repeat(policy_file.look, LOOK_INTERVAL, "looking at the policy's file")
         log.info(
             "ready: nodes use http://<this host>:%d as ROS_MASTER_URI; master %s; outside sees "
             "%s:%s",
@@ -185,6 +220,28 @@ class App:
             upstream.master_address = address
             self.context.tasks.spawn(self.master_monitor.look(), "looking for the master")
         return {"address": address}
+
+    async def _set_policy(self, body: Any) -> dict[str, Any]:
+        """``POST /policy``: how many registrations are hidden and shown now, and what was cut."""
+        written = read_body(body, PolicyNews).layers
+        try:
+            self.context.policy.use_told([read_layer(one) for one in written])
+        except ValueError as error:
+            raise BodyError(f"layers: {error}") from None
+        return to_json(await self._enforcer.enforce())
+
+    def _read_policy_file(self) -> PolicyFile | None:
+        settings, context = self.settings, self.context
+        if not settings.policy_file:
+            return None
+        file = PolicyFile(
+            settings.policy_file, settings.policy_mode, context.policy, context.problems
+        )
+        try:
+            file.read()
+        except ValueError as error:
+            raise SettingError(OPTION, str(error)) from None
+        return file
 
     def _reserve_range(self) -> None:
         ports = self.settings.ports.listen

@@ -6,12 +6,15 @@ raises SettingError where they don't go together.
 """
 
 import hashlib
+import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
 from typing import Any, Literal, TypeVar
 
+from rosproxy.access.layers import PolicyLayer, PolicyMode, bounded, read_layers
+from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
@@ -47,6 +50,8 @@ class Settings:
     ``master_address``: the IP address of the master's host where the proxy can't resolve its name
     or would find itself. ``admin_token``: what callers that are not on loopback must know, or
     ``admin_token_hash``: its SHA-256 in hex digits, for a proxy that is not to hold the token.
+    ``policy`` are the layers of the options, in ``policy_mode`` as is that of the ``policy_file``;
+    ``policy_layers`` are those that an operator gives for the start.
     Raises SettingError if two of them want the same port, or both a token and a hash are given.
     """
 
@@ -72,10 +77,18 @@ class Settings:
     max_buffered: int = 32
     max_connections_per_source: int = 4096
     max_connections_per_lease: int = 2048
+    policy: tuple[PolicyLayer, ...] = ()
+    policy_mode: PolicyMode = PolicyMode.ENFORCE
+    policy_file: str | None = None
+    policy_layers: tuple[PolicyLayer, ...] = ()
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:
             raise SettingError("--admin-token-hash", "goes instead of --admin-token, not with it")
+        try:
+            bounded((*self.policy, *self.policy_layers))
+        except ValueError as error:
+            raise SettingError("--policy", str(error)) from None
         taken: dict[int, str] = {}
         for option, port in (
             ("--master-port", self.master_port),
@@ -111,6 +124,8 @@ def make_settings(
     advertise_port_range: PortRange | None,
     admin_bind: HostPort,
     inside_network: tuple[Network, ...],
+    policy: tuple[tuple[Rule, ...], ...] = (),
+    policy_mode: str = PolicyMode.ENFORCE.value,
     **others: Any,
 ) -> Settings:
     """Settings from the values of the command line's options, by their names.
@@ -125,7 +140,15 @@ def make_settings(
             f"{len(port_range)}; both need the same number",
         )
     ports = PortMap(port_range, advertise)
-    return Settings(ports=ports, admin=admin_bind, inside_networks=inside_network, **others)
+    mode, rules = PolicyMode(policy_mode), tuple(rule for given in policy for rule in given)
+    return Settings(
+        ports=ports,
+        admin=admin_bind,
+        inside_networks=inside_network,
+        policy=(PolicyLayer("--policy", rules, mode),) if rules else (),
+        policy_mode=mode,
+        **others,
+    )
 
 
 def read_range(text: str) -> PortRange:
@@ -211,6 +234,14 @@ def read_token_hash(text: str) -> str | None:
             'must be the 64 hex digits of a SHA-256: printf %s "$TOKEN" | sha256sum gives them'
         )
     return digits or None
+
+
+def read_policy_layers(text: str) -> tuple[PolicyLayer, ...]:
+    """The layers of a policy as JSON; none for no text. Raises ValueError."""
+    try:
+        return read_layers(json.loads(text)) if text.strip() else ()
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def parse_range(option: str, text: str) -> PortRange:

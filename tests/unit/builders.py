@@ -172,7 +172,7 @@ def exchange(
     ]
     exported = master_api.export_request(request, admissions, addressing)
     if exported.body is None:
-        return Exchange(b"", exported.refused_reply())
+        return Exchange(b"", exported.local_reply())
     answer = master_api.read_reply(exported, reply)
     facts = answer.facts(7.0)
     for fact in facts:

@@ -5,7 +5,7 @@ layer allows, so that one more layer can only narrow what the others leave. A la
 only tells what it would deny.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -101,17 +101,28 @@ def decide_below(
     )
 
 
+def strictest(verdicts: Iterable[Verdict]) -> Verdict:
+    """The one of some verdicts that counts: a denial, else what would be denied."""
+    return min(verdicts, key=lambda one: (one.allowed, one.rule is None))
+
+
 def may_deny(
-    layers: Iterable[PolicyLayer], kinds: Iterable[RuleKind], callers: Iterable[str], address: str
+    layers: Iterable[PolicyLayer],
+    kinds: Collection[RuleKind],
+    callers: Collection[str],
+    address: str | None,
 ) -> bool:
-    """Whether an enforced rule may deny something of these kinds to one of these callers."""
-    wanted, names = frozenset(kinds), list(callers)
+    """Whether an enforced rule may deny something of these kinds to one of these callers.
+
+    No callers: to anybody. ``address`` is that of the node inside; None: any.
+    """
     return any(
-        rule.action is Action.DENY and any(rule.is_about(rule.kind, name) for name in names)
+        rule.action is Action.DENY
+        and (not callers or any(rule.is_about(rule.kind, name) for name in callers))
         for layer in layers
-        if layer.mode is PolicyMode.ENFORCE and layer.is_for(address)
+        if layer.mode is PolicyMode.ENFORCE and (address is None or layer.is_for(address))
         for rule in layer.rules
-        if rule.kind in wanted
+        if rule.kind in kinds
     )
 
 

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import msgspec
 
+from rosproxy.access.layers import WrittenLayer
 from rosproxy.net.addresses import parse_address
 from rosproxy.telemetry.text import clean, shorten
 
@@ -78,6 +79,12 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.selected is not None:
             told = (_address(f"selected[{i}]", each) for i, each in enumerate(self.selected))
             msgspec.structs.force_setattr(self, "selected", tuple(told))
+
+
+class PolicyNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The body of ``POST /policy``: the layers of rules that replace those told before."""
+
+    layers: tuple[WrittenLayer, ...]
 
 
 class PortProbe(msgspec.Struct, frozen=True):

@@ -18,6 +18,7 @@ from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
+from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
@@ -50,6 +51,7 @@ class ProxyState(Collector):
             ports=self._ports(),
             data_plane=msgspec.convert(self._plane.status(), document.DataPlaneStatus),
             alias_ports=msgspec.convert(self._alias.status(), tuple[document.AliasPortStatus, ...]),
+            policy=self._policy(),
             nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
             problems=tuple(
                 document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
@@ -146,6 +148,25 @@ class ProxyState(Collector):
             free=fast_ports.left(registry.pool, registry),
             blocked=len(registry.pool.blocked),
         )
+
+    def _policy(self) -> document.PolicyStatus:
+        policy = self._context.policy
+        layers = [
+            document.LayerStatus(
+                layer.name,
+                layer.mode.value,
+                tuple(map(str, layer.rules)),
+                None if layer.addresses is None else len(layer.addresses),
+            )
+            for layer in policy.layers
+        ]
+        hidden = []
+        for (kind, name), holders in sorted(self._context.registry.hidden.items(), key=str):
+            for node, endpoint in sorted(holders.items()):
+                asked = KINDS[kind]
+                verdict = policy.judge(asked, name, [node], endpoint.address)
+                hidden.append(document.HiddenStatus(asked.value, name, node, verdict.reason))
+        return document.PolicyStatus(tuple(layers), tuple(hidden))
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
         problems = self._context.problems.at(endpoint.port)

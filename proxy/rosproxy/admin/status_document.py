@@ -138,6 +138,31 @@ class EndpointStatus(msgspec.Struct, frozen=True):
         return self.state == "cleaned"
 
 
+class LayerStatus(msgspec.Struct, frozen=True):
+    """A layer of rules in force; ``addresses``: how many nodes' it is for, None: for all."""
+
+    name: str = ""
+    mode: str = ""
+    rules: Names = ()
+    addresses: Count | None = None
+
+
+class HiddenStatus(msgspec.Struct, frozen=True):
+    """What the policy keeps from the master: ``kind`` of rule, name, node, and the rule."""
+
+    kind: str = ""
+    name: str = ""
+    node: str = ""
+    reason: str = ""
+
+
+class PolicyStatus(msgspec.Struct, frozen=True):
+    """The layers of rules in force, and what is hidden by them."""
+
+    layers: tuple[LayerStatus, ...] = ()
+    hidden: tuple[HiddenStatus, ...] = ()
+
+
 class ProblemStatus(msgspec.Struct, frozen=True):
     """What the user should know, of which subject, and how long ago it was noted."""
 
@@ -163,6 +188,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     ports: PortsStatus = PortsStatus()
     data_plane: DataPlaneStatus | None = None
     alias_ports: tuple[AliasPortStatus, ...] = ()
+    policy: PolicyStatus | None = None
     nodes: tuple[EndpointStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
 

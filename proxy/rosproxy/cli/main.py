@@ -111,6 +111,31 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     help="Who may call shutdown, publisherUpdate and paramUpdate at inside nodes.",
 )
 @click.option(
+    "--policy",
+    type=options.POLICY_RULES,
+    multiple=True,
+    help="What outside may see and do, and what inside may take from outside: rules such as "
+    "'deny publish /camera/*', separated by ; (repeatable).",
+)
+@click.option(
+    "--policy-mode",
+    type=click.Choice(["enforce", "audit"]),
+    default="enforce",
+    help="Whether the rules of --policy and --policy-file are enforced, or only told.",
+)
+@click.option(
+    "--policy-file",
+    type=click.Path(),
+    help="A file with more such rules, a line each; it is read again when it changes.",
+)
+@click.option(
+    "--policy-layers",
+    type=options.POLICY_LAYERS,
+    default=(),
+    show_default=False,
+    help="For operators: the layers of rules at the start, as POST /policy takes them.",
+)
+@click.option(
     "--data-plane",
     type=click.Choice(["auto", "kernel", "splice", "copy"]),
     default="auto",

@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 from rosproxy import settings
+from rosproxy.access.rules import parse_rules
 
 Command = Callable[..., Any]
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -33,6 +34,17 @@ class Parsed(click.ParamType):  # type: ignore[type-arg] # no generic type befor
             return self._read(value) if isinstance(value, str) else value
         except ValueError as error:
             self.fail(str(error), param, ctx)
+
+
+class PolicyRules(Parsed):
+    """Rules of a policy; a variable's value is one text, in which spaces separate no values."""
+
+    def __init__(self) -> None:
+        super().__init__("rules", parse_rules)
+
+    def split_envvar_value(self, rv: str) -> Sequence[str]:
+        """The value of a variable, whole."""
+        return [rv]
 
 
 class Seconds(click.FloatRange):
@@ -67,6 +79,8 @@ HOST_PORT = Parsed("address:port", settings.read_host_port)
 NETWORK = Parsed("CIDR", settings.read_network)
 MASTER_URI = Parsed("URI", settings.read_master_uri)
 TOKEN = Parsed("token", settings.read_token)
+POLICY_RULES = PolicyRules()
+POLICY_LAYERS = Parsed("JSON", settings.read_policy_layers)
 TOKEN_HASH = Parsed("hash", settings.read_token_hash)
 
 

@@ -27,6 +27,8 @@ LEAST_NAME = 20
 MOST_LINES = 3
 """Lines that the topics, services or connections of one node may take, each."""
 MOST_CONNECTIONS = 8
+MOST_HIDDEN = 20
+"""Hidden names that are listed."""
 INDENT = "    "
 
 
@@ -34,7 +36,8 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
-    full = [*head, "", *_nodes(status, columns, True), *problems]
+    hidden = [*_hidden(status, columns)]
+    full = [*head, "", *_nodes(status, columns, True), *hidden, *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
     short = [*head, *problems, "", *_nodes(status, columns, False)]
@@ -50,6 +53,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     yield f"ports    {_ports(status)}"
     if plane := status.data_plane:
         yield f"topics   {_plane(plane)}"
+    if (policy := status.policy) and policy.layers:
+        yield f"policy   {_policy(policy)}"
     networks = listed(map(clean, settings.inside_networks)) or "none"
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
     selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
@@ -77,6 +82,16 @@ def _ports(status: document.ProxyStatus) -> str:
     mapped = "" if advertise == listen else f", here {listen}"
     blocked = f", {ports.blocked} held by other programs" if ports.blocked else ""
     return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
+
+
+def _policy(policy: document.PolicyStatus) -> str:
+    """Whose rules there are, and how many names they hide."""
+    layers = (
+        f"{clean(layer.name)}: {plural(len(layer.rules), 'rule')}"
+        + (" (audit only)" if layer.mode == "audit" else "")
+        for layer in policy.layers
+    )
+    return f"{listed(layers)}; {plural(len(policy.hidden), 'name')} hidden"
 
 
 def _plane(plane: document.DataPlaneStatus) -> str:
@@ -176,6 +191,18 @@ def _connection(connection: document.ConnectionStatus) -> str:
     what = f"{clean(connection.kind)} {clean(connection.name)}"
     who = f"{clean(connection.caller_id) or '?'} at {clean(connection.peer)}"
     return f"{what} with {who}: {size(connection.sent)} out, {size(connection.received)} in"
+
+
+def _hidden(status: document.ProxyStatus, columns: int) -> Iterator[str]:
+    """What outside does not see, and by which rule."""
+    found = status.policy.hidden if status.policy else ()
+    if found:
+        yield from ("", "hidden from outside:")
+    for one in found[:MOST_HIDDEN]:
+        what = f"{clean(one.kind)} {clean(one.name)} of {clean(one.node)}"
+        yield from wrap(f"{what}  {clean(one.reason)}", columns, INDENT, "  ")
+    if len(found) > MOST_HIDDEN:
+        yield f"{INDENT}… {plural(len(found) - MOST_HIDDEN, 'name')} more: rosproxy status --json"
 
 
 def _problems(status: document.ProxyStatus, columns: int) -> Iterator[str]:

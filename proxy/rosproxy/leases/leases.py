@@ -155,6 +155,14 @@ class Leases(Generic[_H]):
         """Take the fast port back that is needed least, if there is one."""
         return self._give_fast_port_back() is not None
 
+    def take_fast_port(self, endpoint: _H) -> None:
+        """Take the fast port of an endpoint back: its topics have to go through the lease."""
+        port = endpoint.fast_port
+        self._refuse(port)
+        fast_ports.give_back(self._holders.pool, endpoint)
+        self._kernel.note_change(endpoint)
+        self._watch([endpoint])
+
     def end_idle(self) -> bool:
         """End the lease that is needed least, if nobody needs it."""
         oldest = self._holders.reclaimable()
@@ -246,9 +254,6 @@ class Leases(Generic[_H]):
         if holder is None:
             return None
         port = holder.fast_port
-        self._refuse(port)
         log.info("%s: port %s is needed otherwise", holder.label, port)
-        fast_ports.give_back(self._holders.pool, holder)
-        self._kernel.note_change(holder)
-        self._watch([holder])
+        self.take_fast_port(holder)
         return port

@@ -7,6 +7,7 @@ import asyncio
 import time
 import uuid
 
+from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.net.addresses import is_inside
 from rosproxy.net.budget import Budget
 from rosproxy.net.gate import Gate
@@ -24,6 +25,8 @@ from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
 from rosproxy.telemetry.refusals import Refusals
 
+REGISTRATION_GRACE = 0.5
+"""Seconds that a publisherUpdate waits at most for a registration of the same node."""
 NETWORKS_TTL = 5.0
 """Seconds for which the list of the machine's own networks is taken as current."""
 MOST_PASSING = 256
@@ -39,13 +42,16 @@ class Context:
     ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
     ``passing`` the calls that pass unread; ``turn`` is for who is about to read a large document;
-    ``refusals`` tells what is over these and other bounds.
+    ``refusals`` tells what is over these and other bounds. ``policy``: what outside may see and do.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings, self.instance = settings, uuid.uuid4().hex
         self.metrics, self.tasks, self.problems = Metrics(KNOWN_METHODS), Tasks(), Problems()
         self.refusals = Refusals(self.metrics, self.problems, self.now)
+        self.policy = AccessPolicy(
+            settings.policy, settings.policy_layers, self.metrics, self.refusals
+        )
         self.gate = Gate(
             settings.max_connections_per_source,
             settings.max_connections_per_lease,
@@ -77,6 +83,16 @@ class Context:
     def standing(self, address: str) -> Standing:
         """Whether an address may use the proxy as its master, as far as is known now."""
         return standing(address, self.addressing.networks, self.selected)
+
+    async def after_registration(self, endpoint: Endpoint) -> None:
+        """Let the reply to a registration that is under way reach a node first.
+
+        A node that applies an older list of publishers after a newer one loses a publisher; the
+        way through the proxy must not make that race of ROS more likely.
+        """
+        deadline = self.now() + REGISTRATION_GRACE
+        while endpoint.pending and self.now() < deadline:  # noqa: ASYNC110 - rare, short
+            await asyncio.sleep(0.002)
 
     def refresh_networks(self, source: str = "") -> None:
         """Take in the networks that the proxy's interfaces are in now.

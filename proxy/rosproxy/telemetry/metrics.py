@@ -66,6 +66,8 @@ class Metrics:
         self.exhausted = counter("range_exhausted", refused)
         bounds = "Requests and connections refused because they were over a bound."
         self.refused = counter("refused", bounds, "reason")
+        denied = "What the policy denied, or would deny in audit mode, by kind of rule."
+        self.policy_denied = counter("policy_denied", denied, "kind", "mode")
         strangers = "Calls refused for the address that they came from, by what that is."
         self.strangers = counter("strangers", strangers, "standing")
         self.master_round_trip = Histogram(

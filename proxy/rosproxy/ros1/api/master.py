@@ -4,10 +4,14 @@ A call that registers or names an address goes one way: its node is admitted (`a
 addresses are exported, the master is called, what it accepted is noted in the registry, and the
 addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
 they are; long ones, parameters above all, unread.
+
+The policy is asked twice (`PolicyJudge`): about what needs no endpoint before, and about
+registrations once their node is admitted. What it denies the master does not get; the nodes inside
+that have to know are told (`Matchmaker`).
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
@@ -22,14 +26,17 @@ from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Admission, MasterReply, Refusal, Request
+from rosproxy.ros1.rewriting.master_api import Admission, LocalReply, Noted, Refusal, Request
 from rosproxy.ros1.servers.admission import NodeAdmission
+from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.ros1.upkeep.matchmaker import Matchmaker
+from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
 from rosproxy.ros1.upkeep.recovery import Recovery
 
 
@@ -42,31 +49,38 @@ class MasterApi:
     _alias: Alias
     _recovery: Recovery
     _adopter: Adopter
+    _judge: PolicyJudge
+    _matchmaker: Matchmaker
+    _enforcer: PolicyEnforcer
 
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
         asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics, upstream = self._context.metrics, self._context.upstream
-        if await _is_long_and_passes(call.body):
+        judged = self._judge.judges_parameters(call.source)
+        if not judged and await _is_long_and_passes(call.body):
             return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
             request = master_api.read_request(call.body, asker)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
-        if request.plain:
-            passed = upstream.pass_to_master(request.body)
-            return await counted(metrics, "master", request.method, passed)
-        return await counted(metrics, "master", request.method, self._rewrite(request, call))
+        return await counted(metrics, "master", request.method, self._answer(request, call))
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
+        if method == MULTICALL and self._judge.judges_parameters(None):
+            return None
         return _watch(method, size)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
+        denied = self._judge.judge_long(long_call.method, call.body, call.source)
+        if denied is not None:
+            self._context.metrics.count("master", long_call.method, "refused")
+            return xmlrpc.dump_reply(denied.triple())
         reply = self._context.upstream.pass_to_master(long_call)
         return await counted(self._context.metrics, "master", long_call.method, reply)
 
@@ -78,23 +92,45 @@ class MasterApi:
                 what = f"--master-uri {self._context.settings.master_uri}"
             raise xmlrpc.XmlRpcError(xmlrpc.SYSTEM_ERROR, f"{what} leads back to the proxy itself")
 
-    async def _rewrite(self, request: Request, call: IncomingCall) -> bytes:
+    async def _answer(self, request: Request, call: IncomingCall) -> bytes | LongReply:
+        """The reply to a request that was read; what needs no change passes untouched."""
+        if not request.plain:
+            await self._recovery.ensure()
+        replies = await self._judge.judge_request(request)
+        if request.plain and not any(replies) and not self._judge.filters_names(request):
+            return await self._context.upstream.pass_to_master(request.body)
+        return await self._rewrite(request, replies, call)
+
+    async def _rewrite(
+        self, request: Request, replies: Sequence[LocalReply | None], call: IncomingCall
+    ) -> bytes:
         """Admit, export, call the master, note, import."""
-        await self._recovery.ensure()
-        addressing = self._context.addressing
-        async with self._admitted(request, call) as admissions:
+        addressing, version = self._context.addressing, self._context.policy.version
+        async with self._admitted(request, replies, call) as admitted:
+            admissions = self._judge_registrations(request, admitted)
             exported = master_api.export_request(request, admissions, addressing)
+            self._note(exported.facts(), request.asker.address)
             if exported.body is None:
-                return exported.refused_reply()
+                return exported.local_reply()
             answer = await self._context.upstream.post_to_master(exported.body)
             reply = master_api.read_reply(exported, answer)
-            self._note(reply, request.asker.address)
+            self._note(reply.facts(self._context.now()), request.asker.address)
             await self._alias.listen_for(reply.uris())
-            return master_api.import_reply(reply, addressing)
+            if self._context.policy.version != version:
+                self._enforcer.look_again()
+            return master_api.import_reply(reply, addressing, self._judge.unseen(reply))
+
+    def _judge_registrations(
+        self, request: Request, admissions: Sequence[Admission]
+    ) -> list[Admission]:
+        """The admissions, with the proxy's own replies to what the master does not get."""
+        judge, now = self._judge.judge_registration, self._context.now()
+        pairs = zip(request.calls, admissions, strict=True)
+        return [judge(call, one, request.asker, now) if call else one for call, one in pairs]
 
     @asynccontextmanager
     async def _admitted(
-        self, request: Request, incoming: IncomingCall
+        self, request: Request, replies: Sequence[LocalReply | None], incoming: IncomingCall
     ) -> AsyncIterator[Sequence[Admission]]:
         """What becomes of each call of a request. Raises Unreachable.
 
@@ -104,10 +140,13 @@ class MasterApi:
         self._context.refresh_networks(request.asker.address)
         admissions: list[Admission] = []
         try:
-            for call in request.calls:  # one after the other: they may register the same new node
+            # One after the other: they may register the same new node.
+            for call, reply in zip(request.calls, replies, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has gone")
-                admission = await self._admit(call, request.asker) if call else None
+                admission: Admission = reply
+                if call and reply is None:
+                    admission = await self._admit(call, request.asker)
                 admissions.append(admission)
                 if isinstance(admission, Endpoint):
                     admission.hold()
@@ -133,20 +172,34 @@ class MasterApi:
         self._context.refusals.note(reason, asker.address, what)
         return Refusal(f"rosproxy: {text}")
 
-    def _note(self, reply: MasterReply, source: str) -> None:
-        """Take in what the master accepted.
+    def _note(self, facts: Iterable[Noted], source: str) -> None:
+        """Take in what the master accepted, and what it is not told.
 
         A service's port is believed only from the node's own address: anybody may register a
         service in another node's name, and its port would be opened to outside.
         """
         registry = self._context.registry
-        for fact in reply.facts(self._context.now()):
+        for fact in facts:
             held = fact.registration
             if fact.endpoint is None:
                 registry.unregister(held.kind, held.name, held.caller_id)
             elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
                 own = source == fact.endpoint.place.address
+                held = self._as_known(fact.endpoint, held)
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
+            self._matchmaker.note(held)
+
+    def _as_known(self, endpoint: Endpoint, held: Registration) -> Registration:
+        """A registration to note; one that is hidden from now on is shown until it is taken back.
+
+        So the policy may have changed a moment ago; and where anything of a node is hidden, no
+        topic of it may bypass the proxy.
+        """
+        known = endpoint.registrations.get(held.key)
+        shown = known is not None and not known.hidden
+        if held.hidden and (shown or endpoint.fast_port is not None):
+            self._enforcer.look_again()
+        return replace(held, hidden=held.hidden and not shown)
 
 
 @dataclass(slots=True, eq=False)

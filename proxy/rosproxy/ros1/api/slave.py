@@ -5,13 +5,13 @@ addresses in it imported and those in its reply exported (`rosproxy.ros1.rewriti
 the calls tell is noted: the TCPROS port that a node names, and that a node refuses.
 """
 
-import asyncio
 import logging
 import socket
 from collections.abc import Awaitable
 from functools import partial
 from typing import TypeVar
 
+from rosproxy.access.rules import RuleKind
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
@@ -25,8 +25,9 @@ from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.rewriting import slave_api
+from rosproxy.ros1.rewriting import policing, slave_api
 from rosproxy.ros1.rewriting.slave_api import Visit
+from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
@@ -35,8 +36,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 log = logging.getLogger(__name__)
 
 _Answer = TypeVar("_Answer")
-REGISTRATION_GRACE = 0.5
-"""Seconds that a publisherUpdate waits at most for a registration of the same node."""
+NOT_THE_MASTER = "only the master may call this"
 
 
 class SlaveApi:
@@ -49,9 +49,10 @@ class SlaveApi:
         alias: Alias,
         adopter: Adopter,
         tcpros: TcprosServer,
+        judge: PolicyJudge,
     ) -> None:
         self._context, self._leases, self._alias = context, leases, alias
-        self._adopter, self._tcpros = adopter, tcpros
+        self._adopter, self._tcpros, self._judge = adopter, tcpros, judge
         greeting = "rosproxy: slave API of a ROS node behind it\n"
         self.server = XmlRpcServer(context, self, greeting, LEASE_CALL, self)
 
@@ -67,8 +68,8 @@ class SlaveApi:
         """The node's reply to a call, rewritten. Raises XmlRpcError, Unreachable."""
         endpoint = self._endpoint(call)
         method = passing.method_of(call.body)
-        if method is not None and not await self._may(method, call.source):
-            return self._refused(method)  # before it is read
+        if method is not None and not await self._is_for(method, call.source):
+            return self._refused(method, NOT_THE_MASTER)  # before it is read
         try:
             parsed = xmlrpc.parse_call(call.body, LEASE_CALL)
         except xmlrpc.XmlRpcError:
@@ -91,8 +92,10 @@ class SlaveApi:
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         endpoint = self._endpoint(call)
-        if not await self._may(long_call.method, call.source):
-            return self._refused(long_call.method)
+        caller_id = next(iter(passing.first_strings(call.body, 1)), None)
+        why = await self._why_not(endpoint, long_call.method, caller_id or "", call.source)
+        if why is not None:
+            return self._refused(long_call.method, why)
         reply = self._pass(endpoint, long_call)
         return await counted(self._context.metrics, "slave", long_call.method, reply)
 
@@ -132,18 +135,33 @@ class SlaveApi:
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
     ) -> bytes | LongReply:
         """The reply to one call, whose document is ``body``, of those that came as ``call``."""
-        if not await self._may(parsed.method, call.source):
-            return self._refused(parsed.method)
+        caller_id = parsed.string(0) or ""
+        why = await self._why_not(endpoint, parsed.method, caller_id, call.source)
+        if why is not None:
+            return self._refused(parsed.method, why)
         if too_long := too_long_to_ask(parsed):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
+        if parsed.method == "requestTopic" and (denied := self._deny_topic(endpoint, parsed, call)):
+            return denied
         reply = self._forward(endpoint, parsed, body, call)
         return await counted(self._context.metrics, "slave", parsed.method, reply)
 
-    def _refused(self, method: str) -> bytes:
-        """The reply to a call that only the master may make."""
+    def _refused(self, method: str, why: str) -> bytes:
+        """The reply to a call that its caller may not make."""
         self._context.metrics.count("slave", method, "refused")
-        return xmlrpc.dump_reply([-1, "rosproxy: only the master may call this", 0])
+        return xmlrpc.dump_reply([-1, f"rosproxy: {why}", 0])
+
+    def _deny_topic(
+        self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall
+    ) -> bytes | None:
+        """The reply to requestTopic for a topic that outside may not have; None if it may."""
+        topic, caller_id = parsed.string(1) or "", parsed.string(0) or ""
+        why = self._judge.outside_may_not(RuleKind.PUBLISH, topic, endpoint, call.source, caller_id)
+        if why is None:
+            return None
+        self._context.metrics.count("slave", parsed.method, "refused")
+        return xmlrpc.dump_reply(policing.no_publisher(topic, why))
 
     async def _forward(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall
@@ -153,9 +171,10 @@ class SlaveApi:
         if not slave_api.rewritten(parsed):
             return await self._pass(endpoint, body)
         if parsed.method == "publisherUpdate":
-            await self._after_registration(endpoint)
-            announced = slave_api.announced_publishers(parsed)
-            await self._alias.listen_for_announced(parsed.string(1) or "", announced)
+            await self._context.after_registration(endpoint)
+            topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
+            await self._alias.listen_for_announced(topic, announced)
+            body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
         node, addressing = self._context.node_asker(endpoint), self._context.addressing
         body = self._alias.import_call(body, parsed)
@@ -163,11 +182,23 @@ class SlaveApi:
         port, said = endpoint.port, slave_api.topic_port(parsed, reply)
         if said is not None:
             endpoint.note_tcpros_port(said, parsed.string(1) or "")
-            port = await self._leases.fast_port(endpoint, said) or port
+            if self._judge.may_bypass(endpoint):
+                port = await self._leases.fast_port(endpoint, said) or port
         near = call.reached_locally
         reached = HostPort(call.local.host, port) if near else addressing.outside(port)
         visit = Visit(node, reached, self._context.settings.master_uri)
         return slave_api.export_reply(parsed, reply, visit, addressing)
+
+    def _with_hidden(
+        self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes
+    ) -> tuple[bytes, xmlrpc.Call]:
+        """A publisherUpdate with what the node is to hear of; as it came if that is the same."""
+        topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
+        found = policing.publishers_for(endpoint, topic, announced, self._context.addressing)
+        if found == [*dict.fromkeys(announced)]:
+            return body, parsed
+        body = xmlrpc.dump_call(parsed.method, parsed.string(0) or "", topic, found)
+        return body, xmlrpc.parse_call(body)
 
     async def _is_void(self, endpoint: Endpoint, parsed: xmlrpc.Call) -> bool:
         """Whether a call only follows from how a node came to be behind the proxy."""
@@ -177,16 +208,6 @@ class SlaveApi:
         if parsed.method != "publisherUpdate":
             return False
         return slave_api.is_outdated(parsed, self._context.addressing, self._context.now())
-
-    async def _after_registration(self, endpoint: Endpoint) -> None:
-        """Let the reply to a registration that is under way reach the node first.
-
-        A node that applies an older list of publishers after a newer one loses a publisher; the
-        way through the proxy must not make that race of ROS more likely.
-        """
-        deadline = self._context.now() + REGISTRATION_GRACE
-        while endpoint.pending and self._context.now() < deadline:  # noqa: ASYNC110 - rare, short
-            await asyncio.sleep(0.002)
 
     async def _ask(self, endpoint: Endpoint, body: bytes) -> bytes:
         return await self._heard(
@@ -212,7 +233,16 @@ class SlaveApi:
         health.note(ProbeResult.ANSWERED, self._context.now())
         return reply
 
-    async def _may(self, method: str, source: str) -> bool:
+    async def _why_not(
+        self, endpoint: Endpoint, method: str, caller_id: str, source: str
+    ) -> str | None:
+        """Why a caller may not call a method of a node; None if he may."""
+        if not await self._is_for(method, source):
+            return NOT_THE_MASTER
+        return await self._judge.outside_may_not_call(method, endpoint, source, caller_id)
+
+    async def _is_for(self, method: str, source: str) -> bool:
+        """Whether ``--slave-control`` lets a source call a method."""
         anybody = self._context.settings.slave_control == "any"
         if anybody or method not in slave_api.MASTER_ONLY:
             return True

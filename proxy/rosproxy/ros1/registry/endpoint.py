@@ -43,7 +43,8 @@ class Registration:
     """One registration at the master, on behalf of an endpoint.
 
     ``type`` is the topic's message type, ``service_api`` the service URI as the node gave it
-    (None after a recovery, when only the node knows it).
+    (None after a recovery, when only the node knows it). ``hidden``: the policy denies it, so that
+    the master knows nothing of it; see `rosproxy.ros1.registry.hidden`.
     """
 
     kind: Kind
@@ -52,6 +53,7 @@ class Registration:
     type: str = "*"
     service_api: str | None = None
     since: float = 0.0
+    hidden: bool = False
 
     @property
     def key(self) -> tuple[Kind, str, str]:
@@ -270,6 +272,16 @@ class Endpoint:
         """The topics, services or parameters registered as ``kind``."""
         return sorted(held.name for held in self.registrations.values() if held.kind is kind)
 
+    def shown(self, kind: Kind) -> list[str]:
+        """Those of them that the master knows of."""
+        found = self.registrations.values()
+        return sorted(held.name for held in found if held.kind is kind and not held.hidden)
+
+    def callers_of(self, kind: Kind, name: str) -> list[str]:
+        """The nodes here that have registered something; all that are here if none has."""
+        found = [caller for caller in self.callers if (kind, name, caller) in self.registrations]
+        return found or self.caller_ids
+
     def publishes(self, topic: str) -> bool:
         """Whether a topic is registered as published."""
         return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
@@ -305,3 +317,7 @@ class Endpoint:
         """Whether nobody needs the lease: nothing holds, nobody is connected or calls."""
         held = self.registrations and not self.health.cleaned
         return not (held or self.connected or self.pending)
+
+
+Held = tuple[Endpoint, Registration]
+"""A registration and the endpoint that has it."""

@@ -6,6 +6,7 @@ topics each a copy per call would make registration quadratic.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
@@ -28,7 +29,8 @@ class RangeExhausted(Exception):
 class Registry:
     """All endpoints, found by port, by address, by URI, by service and by node name.
 
-    ``by_port``, ``by_slave``, ``by_caller`` and ``services`` are for others to read only.
+    ``by_port``, ``by_slave``, ``by_caller``, ``services`` and ``hidden`` (what the master does not
+    know, by kind and name) are for others to read only.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -37,6 +39,7 @@ class Registry:
         self.by_slave: dict[HostPort, Endpoint] = {}
         self.by_caller: dict[str, Endpoint] = {}
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
+        self.hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
         self._by_uri: dict[str, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
@@ -172,6 +175,7 @@ class Registry:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.characters += held.characters - (former.characters if former else 0)
         endpoint.registrations[held.key] = held
+        self._index_hidden(endpoint, held)
         self.by_caller[held.caller_id] = endpoint
         endpoint.note_used()
 
@@ -263,11 +267,22 @@ class Registry:
         if not same:
             del self._by_uri[endpoint.uri]
 
+    def _index_hidden(self, endpoint: Endpoint, held: Registration) -> None:
+        """Note by kind and name that a registration is hidden, or no longer."""
+        found = self.hidden.setdefault((held.kind, held.name), {})
+        if held.hidden:
+            found[held.caller_id] = endpoint
+        elif found.get(held.caller_id) is endpoint:
+            del found[held.caller_id]
+        if not found:
+            del self.hidden[held.kind, held.name]
+
     def _drop(self, endpoint: Endpoint, key: tuple[Kind, str, str]) -> None:
         held = endpoint.registrations.pop(key, None)
         if held is None:
             return
         endpoint.characters -= held.characters
+        self._index_hidden(endpoint, replace(held, hidden=False))
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self.services.pop(name, None)

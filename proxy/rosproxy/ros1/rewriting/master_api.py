@@ -8,12 +8,12 @@ known which nodes are admitted), `read_reply`, which tells what the registry has
 ros_comm/tools/rosmaster/src/rosmaster/master_api.py.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, row
+from rosproxy.ros1.protocol.master_methods import NO_ROW, Kind, Reply, resolve_name, row
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
@@ -39,9 +39,39 @@ class Refusal(msgspec.Struct, frozen=True):
         return [-1, self.reason, 0]
 
 
+class Answered(msgspec.Struct, frozen=True):
+    """A call that the proxy answers itself, in the master's place; ``fact`` follows from it.
+
+    ``value`` is the third element of the triple, whose status is ``code``.
+    """
+
+    code: int
+    text: str
+    value: object
+    fact: "Noted | None" = None
+
+    def triple(self) -> list[object]:
+        """The ROS status triple."""
+        return [self.code, self.text, self.value]
+
+
+class Unseen(msgspec.Struct, frozen=True):
+    """What a reply has to say otherwise than the master does.
+
+    ``publishers`` are those by topic that the master does not know of, as it would have them;
+    ``params`` the names that getParamNames leaves out.
+    """
+
+    publishers: Mapping[str, Sequence[str]] = {}
+    params: Collection[str] = ()
+
+
+NOTHING_UNSEEN = Unseen()
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
-Admission = Endpoint | Refusal | None
-"""What became of a call that registers or unregisters: its endpoint, or why it has none."""
+LocalReply = Refusal | Answered
+"""The reply to a call that the master does not get."""
+Admission = Endpoint | LocalReply | None
+"""What became of a call: the endpoint that it registers, or the proxy's own reply to it."""
 
 
 class Request(msgspec.Struct, frozen=True):
@@ -73,19 +103,24 @@ class Request(msgspec.Struct, frozen=True):
 class Exported(msgspec.Struct, frozen=True):
     """A request made ready for the master, and what became of each of its calls.
 
-    ``body`` is what the master gets; None if it gets nothing, since all calls were refused.
+    ``body`` is what the master gets; None if it gets nothing, since the proxy answers all calls.
     An ``outcome`` is the endpoint whose registration the call makes or ends, None for another
-    call, or a refusal.
+    call, or the proxy's own reply.
     """
 
     request: Request
     outcomes: tuple[Admission, ...]
     body: bytes | None
 
-    def refused_reply(self) -> bytes:
+    def local_reply(self) -> bytes:
         """The whole reply to a request of which the master gets nothing."""
-        triples = [one.triple() for one in self.outcomes if isinstance(one, Refusal)]
+        triples = [one.triple() for one in self.outcomes if isinstance(one, LocalReply)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
+
+    def facts(self) -> "list[Noted]":
+        """What the registry has to learn from the calls that the proxy answers."""
+        local = (one for one in self.outcomes if isinstance(one, Answered))
+        return [one.fact for one in local if one.fact]
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -122,6 +157,12 @@ class MasterReply(msgspec.Struct, frozen=True):
     value: Value | None
     results: tuple[Result, ...]
 
+    def param_names(self) -> Iterator[str]:
+        """The names of parameters that it lists."""
+        for result in self.results:
+            if result.call.method == "getParamNames":
+                yield from (item.text for item in result.triple.items[2].items)
+
     def facts(self, now: float) -> list[Noted]:
         """What the registry has to learn from the calls that the master accepted.
 
@@ -130,7 +171,7 @@ class MasterReply(msgspec.Struct, frozen=True):
         """
         found = []
         for result in self.results:
-            held = _registration(result.call, now)
+            held = registration(result.call, now)
             if held and result.accepted and result.endpoint:
                 made = row(result.call.method).registers is not None
                 found.append(Noted(held, result.endpoint if made else None))
@@ -165,7 +206,7 @@ def registering_uri(call: Call | None) -> str | None:
 def export_request(
     request: Request, admissions: Sequence[Admission], addressing: Addressing
 ) -> Exported:
-    """The request for the master: URIs exported, refused calls left out.
+    """The request for the master: URIs exported, calls that the proxy answers left out.
 
     ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
     registration instead.
@@ -173,15 +214,15 @@ def export_request(
     asker, edits, outcomes = request.asker, list[Edit](), list[Admission]()
     for call, admission in zip(request.calls, admissions, strict=True):
         outcome = admission
-        if call and row(call.method).unregisters:
-            outcome = _holder(call, asker, addressing)
-        if call and not isinstance(outcome, Refusal):
+        if call and outcome is None and row(call.method).unregisters:
+            outcome = holder(call, asker, addressing)
+        if call and not isinstance(outcome, LocalReply):
             edits += _export_call(call, outcome, asker, addressing)
         outcomes.append(outcome)
-    refused = [isinstance(outcome, Refusal) for outcome in outcomes]
-    if refused and all(refused):
+    local = [isinstance(outcome, LocalReply) for outcome in outcomes]
+    if local and all(local):
         return Exported(request, tuple(outcomes), None)
-    edits += [xmlrpc.remove(item) for item, out in zip(request.items, refused, strict=False) if out]
+    edits += [xmlrpc.remove(item) for item, out in zip(request.items, local, strict=False) if out]
     return Exported(request, tuple(outcomes), xmlrpc.apply(request.body, edits))
 
 
@@ -191,19 +232,21 @@ def read_reply(exported: Exported, reply: bytes) -> MasterReply:
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
 
-def import_reply(reply: MasterReply, addressing: Addressing) -> bytes:
-    """The reply for the inside node: URIs imported, refused calls answered."""
+def import_reply(
+    reply: MasterReply, addressing: Addressing, unseen: Unseen = NOTHING_UNSEEN
+) -> bytes:
+    """The reply for the inside node: URIs imported, the proxy's own replies put in."""
     edits: list[Edit] = []
     request = reply.exported.request
     for result in reply.results:
         asker = request.asker
         if result.endpoint:
             asker = replace(asker, endpoint=result.endpoint)
-        edits += _import_result(result, asker, addressing)
+        edits += _import_result(result, asker, addressing, unseen)
     if request.multicall and reply.value and reply.value.items:
         outcomes = enumerate(reply.exported.outcomes)
-        refused = [(i, one.triple()) for i, one in outcomes if isinstance(one, Refusal)]
-        results = [(i, xmlrpc.dump_value([triple])) for i, triple in refused]
+        local = [(i, one.triple()) for i, one in outcomes if isinstance(one, LocalReply)]
+        results = [(i, xmlrpc.dump_value([triple])) for i, triple in local]
         edits += insert_items(reply.value, results)
     return xmlrpc.apply(reply.body, edits)
 
@@ -227,21 +270,23 @@ def _caller_id(call: Call) -> str:
     return call.string(0) or ""
 
 
-def _name(call: Call) -> str:
+def second_name(call: Call) -> str:
     """The topic, service or node that a call's second parameter names."""
     return resolve_name(call.string(1) or "", _caller_id(call))
 
 
-def _holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None:
+def holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
-    found, holder = row(call.method), addressing.registry.by_caller.get(_caller_id(call))
-    if holder is None:
+    found, known = row(call.method), addressing.registry.by_caller.get(_caller_id(call))
+    if known is None:
         return None
     if found.caller_api is None:
-        uri = addressing.export_service(call.string(found.service_api) or "", _name(call), asker)
-        return holder if uri == addressing.advertised_service(holder) else None
+        uri = addressing.export_service(
+            call.string(found.service_api) or "", second_name(call), asker
+        )
+        return known if uri == addressing.advertised_service(known) else None
     uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
-    return holder if uri == addressing.advertised_uri(holder) else None
+    return known if uri == addressing.advertised_uri(known) else None
 
 
 def _export_call(
@@ -258,7 +303,7 @@ def _export_call(
     if caller_api:
         yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, asker))
     if service_api:
-        text = addressing.export_service(service_api.text, _name(call), asker)
+        text = addressing.export_service(service_api.text, second_name(call), asker)
         yield xmlrpc.replace(service_api, text)
 
 
@@ -268,34 +313,59 @@ def _results(exported: Exported, value: Value) -> Iterator[Result]:
     if exported.request.multicall:
         triples = [item.items[0] if item.items else None for item in value.items]
     pairs = zip(exported.request.calls, exported.outcomes, strict=True)
-    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, Refusal)]
+    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
     for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
             yield Result(call, triple, endpoint)
 
 
-def _import_result(result: Result, asker: Asker, addressing: Addressing) -> list[Edit]:
-    held, kind = result.triple.items[2], row(result.call.method).reply
-    text = held.string()
+def _import_result(
+    result: Result, asker: Asker, addressing: Addressing, unseen: Unseen
+) -> list[Edit]:
     if not result.accepted:
         return []
-    if kind is Reply.SLAVE_URIS:
-        return [
-            xmlrpc.replace(item, addressing.import_slave(item.text, asker))
-            for item in held.items
-            if item.kind == "string"
-        ]
+    if row(result.call.method).reply is Reply.SLAVE_URIS:
+        return _import_uris(result, asker, addressing, unseen)
+    if result.call.method == "getParamNames":
+        names = result.triple.items[2].items
+        return [xmlrpc.remove(item) for item in names if item.text in unseen.params]
+    return _import_uri(result, asker, addressing)
+
+
+def _import_uri(result: Result, asker: Asker, addressing: Addressing) -> list[Edit]:
+    held, kind = result.triple.items[2], row(result.call.method).reply
+    text = held.string()
     if text and kind is Reply.SLAVE_URI:
         return replace_held(result.triple, addressing.import_slave(text, asker))
     if text and kind is Reply.SERVICE_URI:
-        uri = addressing.import_service(text, _name(result.call), asker)
+        uri = addressing.import_service(text, second_name(result.call), asker)
         return replace_held(result.triple, uri)
     if text and kind is Reply.MASTER_URI and asker.master:
         return replace_held(result.triple, f"http://{asker.master}/")
     return []
 
 
-def _registration(call: Call, now: float) -> Registration | None:
+def _import_uris(
+    result: Result, asker: Asker, addressing: Addressing, unseen: Unseen
+) -> list[Edit]:
+    """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
+    held = result.triple.items[2]
+    more: Sequence[str] = ()
+    if row(result.call.method).registers is Kind.SUBSCRIBER:
+        more = unseen.publishers.get(second_name(result.call), ())
+    if more:
+        uris = [*(item.text for item in held.items), *more]
+        imported = dict.fromkeys(addressing.import_slave(uri, asker) for uri in uris)
+        return [Edit(*held.outer, xmlrpc.dump_value([*imported]))]
+    return [
+        xmlrpc.replace(item, addressing.import_slave(item.text, asker))
+        for item in held.items
+        if item.kind == "string"
+    ]
+
+
+def registration(call: Call, now: float) -> Registration | None:
+    """What a call registers or unregisters; None for any other call."""
     found, caller_id = row(call.method), _caller_id(call)
     kind, name = found.registers or found.unregisters, call.string(found.name)
     if kind is None or not name:

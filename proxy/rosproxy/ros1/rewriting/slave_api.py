@@ -7,6 +7,7 @@ clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_
 import msgspec
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
@@ -80,7 +81,7 @@ def is_outdated(call: Call, addressing: Addressing, now: float) -> bool:
     topic, listed = call.string(1) or "", set(announced_publishers(call))
     return any(
         endpoint.settles_at > now
-        and endpoint.publishes(topic)
+        and topic in endpoint.shown(Kind.PUBLISHER)
         and addressing.advertised_uri(endpoint) not in listed
         for endpoint in addressing.registry
     )

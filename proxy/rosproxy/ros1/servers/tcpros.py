@@ -10,6 +10,7 @@ import logging
 import socket
 from functools import partial
 
+from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
@@ -20,11 +21,14 @@ from rosproxy.ros1.protocol.bounds import too_long_to_connect
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
 
 RATE_INTERVAL = 2.0
+UNREGISTERED = "unregistered"
+"""What a relay's topic or service is called that its node has not registered."""
 
 
 class TcprosServer:
@@ -34,8 +38,8 @@ class TcprosServer:
     a reply or registration is never used, so none can lead to another inside host.
     """
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(self, context: Context, judge: PolicyJudge) -> None:
+        self._context, self._judge = context, judge
         self._may_splice = context.settings.data_plane != "copy"
         self.relays = OpenRelays()
         self._ended = Traffic()
@@ -67,20 +71,25 @@ class TcprosServer:
             if too_long := too_long_to_connect(fields):
                 raise HeaderError(too_long)
         except HeaderError as error:
-            reply = encode_header({"error": f"rosproxy: {error}"})
-            await asyncio.get_running_loop().sock_sendall(conn, reply)
-            conn.close()
-            self._context.metrics.relay_errors.labels("bad header").inc()
+            await self._refuse(conn, str(error), "bad header")
             return
         kind = "service" if "service" in fields else "topic"
-        name = fields.get(kind, "")
+        name, version = fields.get(kind, ""), self._context.policy.version
+        if why := self._why_not(endpoint, kind, name, peer):
+            await self._refuse(conn, why, "denied")
+            return
         inside = await self._connect(endpoint, kind, name)
         if inside is None or not await hand_on(header, inside):
             self._fail(endpoint, conn, name)
             return
+        changed = self._context.policy.version != version
+        if changed and self._why_not(endpoint, kind, name, peer):
+            inside.close()
+            self._fail(endpoint, conn, name)
+            return
         wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
         if name not in endpoint.names(wanted):  # a label that outsiders can't multiply
-            name = "unregistered"
+            name = UNREGISTERED
         caller_id, splice = fields.get("callerid", ""), self._may_splice
         relay = Relay(endpoint.port, kind, name, caller_id, peer, conn, inside, splice=splice)
         endpoint.note_connection()
@@ -92,6 +101,18 @@ class TcprosServer:
         for relay in self.relays:
             if relay.port == port:
                 relay.end()
+
+    def _why_not(self, endpoint: Endpoint, kind: str, name: str, peer: str) -> str | None:
+        """Why somebody may not have a topic or service; None if he may."""
+        asked = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
+        return self._judge.outside_may_not(asked, name, endpoint, peer)
+
+    async def _refuse(self, conn: socket.socket, why: str, reason: str) -> None:
+        """Say why in a header, as ROS's servers do, and close."""
+        reply = encode_header({"error": f"rosproxy: {why}"})
+        await asyncio.get_running_loop().sock_sendall(conn, reply)
+        conn.close()
+        self._context.metrics.relay_errors.labels(reason).inc()
 
     async def _connect(self, endpoint: Endpoint, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; its port is asked for anew if the known one refuses."""

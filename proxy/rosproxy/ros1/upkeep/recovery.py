@@ -31,6 +31,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.upkeep.policy import recovery as policy
 from rosproxy.ros1.upkeep.policy.recovery import Claim
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -56,8 +57,10 @@ class Recovery:
         registrar: Registrar,
         resubscriber: Resubscriber,
         plane: KernelPlane,
+        judge: PolicyJudge,
     ) -> None:
         self._context, self._leases, self._plane = context, leases, plane
+        self._judge = judge
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
         self._inspecting: set[Endpoint] = set()
@@ -131,7 +134,7 @@ class Recovery:
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served = {id(claim) for claim, endpoint in restored if endpoint is not None}
         left = [claim for claim in found if id(claim) not in served]
-        self._plane.recovered(endpoints)
+        self._plane.recovered([e for e in endpoints if self._judge.may_bypass(e)])
         if left and self._context.settings.cleanup_after:
             self._context.tasks.spawn(self._sweep(left), "taking back what former proxies left")
         self.verifying |= set(endpoints)
@@ -190,6 +193,7 @@ class Recovery:
                     await self._registrar.take_back(claim.advertised, claim.registrations)
                 elif endpoint := self._restore(claim):
                     await self.serve(endpoint)
+                    await self._registrar.apply_policy()
             except (Unreachable, MasterError) as error:
                 log.warning("%s stays at the master as it is: %s", claim.advertised, error)
 

@@ -4,7 +4,8 @@ Everything that the proxy itself registers or unregisters goes through the `Regi
 beside this one decide when. `Registrar.register` is the way for all of it: it asks the master who
 has each name now, leaves a name to whoever else has it, frees one that the master has by a former
 URI of the same node, makes the calls, and hands subscribers the publishers that the replies name,
-as the master does with ``publisherUpdate``.
+as the master does with ``publisherUpdate``. What the policy denies it hides instead, and takes back
+where the master has it (`_conceal`).
 """
 
 import asyncio
@@ -12,23 +13,21 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.alias.alias import Alias
+from rosproxy.access.layers import Verdict
 from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
-from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
+from rosproxy.ros1.rewriting.policing import KINDS
+from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy import registration as policy
-from rosproxy.ros1.upkeep.policy.registration import Held
 
 log = logging.getLogger(__name__)
 
 Former = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
-PARALLEL_CALLS = 32
 SETTLE_TIME = 2.0
 """Seconds in which the master's news of a publisher that is registered anew come in."""
 
@@ -36,20 +35,8 @@ SETTLE_TIME = 2.0
 class Registrar:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, alias: Alias) -> None:
-        self._context, self._alias = context, alias
-        self._limit = asyncio.Semaphore(PARALLEL_CALLS)
-
-    async def update(self, subscriber: str, topic: str, publishers: Sequence[str]) -> bool:
-        """Hand the node at a slave URI the publishers of a topic; whether it has answered.
-
-        All URIs are given as the master holds them.
-        """
-        endpoint = self._context.addressing.stands_for(subscriber)
-        if endpoint:
-            return await self._update_inside(endpoint, topic, publishers)
-        where = parse_slave_uri(subscriber)
-        return where is not None and await self._update(where, topic, publishers)
+    def __init__(self, context: Context, matchmaker: Matchmaker) -> None:
+        self._context, self._matchmaker = context, matchmaker
 
     async def register(self, held: Sequence[Held]) -> None:
         """Register again what the master has lost. Raises Unreachable, MasterError.
@@ -86,7 +73,8 @@ class Registrar:
         the publishers have gone before it is told that they are there.
         """
         topics = [(e, topic) for e in endpoints for topic in e.names(Kind.SUBSCRIBER)]
-        await asyncio.gather(*(self._update_inside(e, topic, []) for e, topic in topics))
+        update = self._matchmaker.update_inside
+        await asyncio.gather(*(update(e, topic, []) for e, topic in topics))
         await self.register([(e, held) for e in endpoints for held in e.registrations.values()])
         for endpoint in endpoints:
             endpoint.note_settled()
@@ -184,11 +172,73 @@ class Registrar:
             await self._forget(endpoint, policy.vanished(endpoint, info, started))
             await self.register_missing(endpoint, info)
 
+    async def apply_policy(self) -> tuple[int, int]:
+        """Hide what is denied now and show what no longer is; how many registrations of each.
+
+        Raises Unreachable, MasterError.
+        """
+        to_hide, to_show = list[Held](), list[Held]()
+        for endpoint in self._context.registry:
+            for held in list(endpoint.registrations.values()):
+                if self._verdict(endpoint, held).allowed == held.hidden:
+                    (to_show if held.hidden else to_hide).append((endpoint, held))
+            await asyncio.sleep(0)  # rules are many, and so are registrations
+        await self._conceal(to_hide)
+        alive = [(e, held) for e, held in to_show if e.answers and not e.health.cleaned]
+        await self.register(alive)
+        return len(to_hide), len(alive)
+
+    def _verdict(self, endpoint: Endpoint, held: Registration) -> Verdict:
+        judge = self._context.policy.judge
+        return judge(KINDS[held.kind], held.name, [held.caller_id], endpoint.address)
+
+    async def _conceal(self, held: Sequence[Held]) -> None:
+        """Hide registrations, and take back what the master has of them. Raises Unreachable.
+
+        They are hidden before the master is told: the lists of publishers that it then sends are
+        completed on their way, and nobody inside is cut off. Parameters can't be hidden.
+        """
+        registry = self._context.registry
+        held = [(e, one) for e, one in held if e.registrations.get(one.key) is one]
+        params = [(e, one) for e, one in held if one.kind is Kind.PARAM]
+        shown = [(e, one) for e, one in held if not one.hidden and one.kind is not Kind.PARAM]
+        concealed = [(e, replace(one, hidden=True)) for e, one in shown]
+        for endpoint, one in concealed:
+            registry.register(endpoint, one)
+        try:
+            await self._take_back([*shown, *params])
+        except Unreachable:
+            for endpoint, one in concealed:
+                if endpoint.registrations.get(one.key) is one:
+                    registry.register(endpoint, replace(one, hidden=False))
+            raise
+        for _, one in params:
+            registry.unregister(one.kind, one.name, one.caller_id)
+        subscribers = [(e, one) for e, one in held if one.kind is Kind.SUBSCRIBER]
+        update = self._matchmaker.update_inside
+        await asyncio.gather(*(update(e, one.name, []) for e, one in subscribers))
+        self._matchmaker.tell({one.name for _, one in held if one.kind is Kind.PUBLISHER})
+
+    async def _take_back(self, held: Iterable[Held]) -> None:
+        addressing = self._context.addressing
+        calls = [
+            policy.unregister_call(
+                one, addressing.advertised_uri(e), addressing.advertised_service(e)
+            )
+            for e, one in held
+        ]
+        await self._context.upstream.multicall(calls)
+
     async def _register(self, held: Sequence[Held]) -> None:
-        """Register at the master; subscribers are handed the publishers that the replies name."""
+        """Register at the master; subscribers are handed the publishers that the replies name.
+
+        What the policy denies is hidden.
+        """
         if self._context.retired:
             return
-        addressing, wanted = self._context.addressing, policy.to_register(held)
+        addressing, current = self._context.addressing, policy.to_register(held)
+        wanted = [(e, one) for e, one in current if self._verdict(e, one).allowed]
+        await self._conceal([(e, o) for e, o in current if not self._verdict(e, o).allowed])
         calls = [
             policy.register_call(
                 one, addressing.advertised_uri(e), addressing.advertised_service(e)
@@ -196,32 +246,17 @@ class Registrar:
             for e, one in wanted
         ]
         values = await self._context.upstream.multicall(calls)
+        for endpoint, one in wanted:
+            if one.hidden and endpoint.registrations.get(one.key) is one:
+                self._context.registry.register(endpoint, replace(one, hidden=False))
         updates = (
-            self._update_inside(endpoint, one.name, publishers)
+            self._matchmaker.update_inside(endpoint, one.name, publishers)
             for (endpoint, one), publishers in zip(wanted, values, strict=True)
             if one.kind is Kind.SUBSCRIBER and isinstance(publishers, list)
         )
         await asyncio.gather(*updates)
-
-    async def _update_inside(
-        self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
-    ) -> bool:
-        """The same for an endpoint's node, with URIs that it can use."""
-        asker, addressing = self._context.node_asker(endpoint), self._context.addressing
-        imported = [addressing.import_slave(uri, asker) for uri in publishers]
-        await self._alias.listen_for(publishers)
-        return await self._update(endpoint.slave, topic, imported)
-
-    async def _update(self, where: HostPort, topic: str, publishers: Sequence[str]) -> bool:
-        body = xmlrpc.dump_call("publisherUpdate", "/master", topic, list(publishers))
-        async with self._limit:
-            try:
-                timeout = self._context.settings.probe_timeout
-                await self._context.upstream.post_to_node(where, body, timeout)
-            except Unreachable as error:
-                log.debug("publisherUpdate of %s: %s", topic, error)
-                return False
-        return True
+        topics = {one.name for _, one in wanted if one.kind is Kind.PUBLISHER}
+        self._matchmaker.tell(topics, everybody=False)
 
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
@@ -231,10 +266,10 @@ class Registrar:
 
     async def _unregister(self, endpoint: Endpoint, held: Iterable[Registration]) -> None:
         """Take back what an endpoint's node holds by its advertised URI."""
-        uri = self._context.addressing.advertised_uri(endpoint)
-        service = self._context.addressing.advertised_service(endpoint)
-        calls = [policy.unregister_call(one, uri, service) for one in held]
-        await self._context.upstream.multicall(calls)
+        ended = list(held)
+        await self._take_back((endpoint, one) for one in ended if not one.hidden)
+        for one in ended:
+            self._matchmaker.note(one)
 
     async def _free(self, former: Former) -> list[Held]:
         """All that some names hold, once it is taken back at the master.
@@ -252,7 +287,7 @@ class Registrar:
                 endpoint.expect_updates(self._context.now() + SETTLE_TIME)
             else:
                 service = addressing.advertised_service(endpoint)
-                held = _held_by(endpoint, name)
+                held = [one for one in _held_by(endpoint, name) if not one.hidden]
                 calls += [policy.unregister_call(one, uri, service) for one in held]
         await self._context.upstream.multicall(calls)
         freed, known = await self._free_direct(direct)

@@ -27,10 +27,11 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.upkeep.matchmaker import PARALLEL_CALLS, Matchmaker
 from rosproxy.ros1.upkeep.policy import resubscription as policy
 from rosproxy.ros1.upkeep.policy.registration import one_publisher_per_topic
 from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
-from rosproxy.ros1.upkeep.registrar import PARALLEL_CALLS, Registrar
+from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
 
@@ -49,9 +50,14 @@ class Resubscriber:
     """Looks after the subscribers of publishers that were out of reach for a time."""
 
     def __init__(
-        self, context: Context, registrar: Registrar, tcpros: TcprosServer, plane: KernelPlane
+        self,
+        context: Context,
+        registrar: Registrar,
+        matchmaker: Matchmaker,
+        tcpros: TcprosServer,
+        plane: KernelPlane,
     ) -> None:
-        self._context, self._registrar = context, registrar
+        self._context, self._registrar, self._matchmaker = context, registrar, matchmaker
         self._tcpros, self._plane = tcpros, plane
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
@@ -178,7 +184,7 @@ class Resubscriber:
             missed.setdefault((one.topic, one.caller_id), set()).add(one.endpoint)
         publishers, addressing = graph.by_topic(Kind.PUBLISHER), self._context.addressing
         calls = (
-            self._registrar.update(
+            self._matchmaker.update(
                 graph.uris[node],
                 topic,
                 policy.publishers_left(publishers.get(topic, []), endpoints, addressing),

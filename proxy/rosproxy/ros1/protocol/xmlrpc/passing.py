@@ -21,6 +21,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import (
     XmlRpcError,
 )
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
+from rosproxy.ros1.protocol.xmlrpc.values import text_of
 
 SHORT = 64 * 1024
 """Bytes up to which a document is read whole, whatever it is: that takes some milliseconds."""
@@ -33,6 +34,11 @@ _HEAD = re.compile(
     (?:\s+encoding=(["'])(?i:utf-8|us-ascii|ascii|iso-8859-1)\1)?\s*\?>)?
     \s*<methodCall>\s*<methodName>([\w./]{1,200})</methodName>""",
     re.VERBOSE,
+)
+_PARAMS_BEGIN = re.compile(rb"\s*<params>\s*")
+_STRING_PARAM = re.compile(
+    rb"\s*<param>\s*<value>(?:\s*<string>([^<&\x80-\xff]*)</string>\s*|([^<&\x80-\xff]*))"
+    rb"</value>\s*</param>\s*"
 )
 _FORBIDDEN = re.compile(rb"[<:]methodName[\s/>]|<!DOCTYPE|<!ENTITY|\0")
 _HINTS = (b"methodName", b"<!DOCTYPE", b"<!ENTITY", b"\0")
@@ -60,6 +66,24 @@ def method_of(head: bytes) -> str | None:
     """The method of a call whose document begins so; None if that can't be told from its head."""
     found = _HEAD.match(head, 0, HEAD)
     return found[2].decode() if found else None
+
+
+def first_strings(head: bytes, count: int) -> list[str | None]:
+    """The first parameters of a call whose document begins so, as far as each is a string.
+
+    None for one that can't be told for sure, and fewer from there on.
+    """
+    found = _HEAD.match(head, 0, HEAD)
+    position, strings = found.end() if found else 0, list[str | None]()
+    opening = _PARAMS_BEGIN.match(head, position) if found else None
+    position = opening.end() if opening else 0
+    for _ in range(count if opening else 0):
+        param = _STRING_PARAM.match(head, position)
+        if param is None:
+            break
+        strings.append(text_of(param[1] if param[1] is not None else param[2], "utf-8"))
+        position = param.end()
+    return strings
 
 
 class CallWatch:

@@ -15,13 +15,11 @@ from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, row
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 
 MethodCall = tuple[str, list[Any]]
 """A method and its parameters, the caller_id first."""
-Held = tuple[Endpoint, Registration]
-"""A registration and the endpoint that has it."""
 
 COMMON_PARAMETER = "/rosout_disable_topics_generation"
 """roscpp and rospy subscribe to it with their first log message; it need not exist."""
@@ -57,7 +55,7 @@ def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[Held]:
     topics: dict[str, Held] = {}
     for endpoint in endpoints:
         for held in endpoint.registrations.values():
-            if held.kind is Kind.PUBLISHER:
+            if held.kind is Kind.PUBLISHER and not held.hidden:
                 topics.setdefault(held.name, (endpoint, held))
     return list(topics.values())
 
@@ -184,6 +182,7 @@ def lost(
     Those made after ``before``, the time at which the master was asked, don't count; nor do
     parameter subscriptions, which the master's state leaves out, unless their node is unknown.
     """
+    ours = [held for held in ours if not held.hidden]
     known = {held.key for registrations in state.values() for held in registrations}
     params = [held for held in ours if held.kind is Kind.PARAM]
     gone = [h for h in ours if h.since < before and h.key not in known and h.kind is not Kind.PARAM]

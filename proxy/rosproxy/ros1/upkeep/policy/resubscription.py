@@ -51,7 +51,7 @@ def subscriptions(
         place = endpoint.place
         literal = place.named and not place.stale
         joint = _networks_of(place.address, addressing) if literal else frozenset()
-        for topic in dict.fromkeys(endpoint.names(Kind.PUBLISHER)):
+        for topic in dict.fromkeys(endpoint.shown(Kind.PUBLISHER)):
             publishers.setdefault(topic, {}).setdefault(joint, []).append(endpoint)
     found: list[TopicSubscription] = []
     for node, registrations in held.items():

@@ -1,0 +1,153 @@
+"""The policy's part in calls: what of a call is asked about, and what is answered in its place.
+
+A registration that is denied is answered as the master would have answered it, with what the nodes
+inside are to know; `rosproxy.ros1.registry.hidden` tells what that is. Texts and values of replies:
+ros_comm/tools/rosmaster/src/rosmaster/master_api.py and registrations.py, and for a topic that a
+node does not publish clients/rospy/src/rospy/impl/masterslave.py (requestTopic).
+"""
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.registry import hidden
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.master_api import Answered, Noted, second_name
+
+KINDS = {
+    Kind.PUBLISHER: RuleKind.PUBLISH,
+    Kind.SUBSCRIBER: RuleKind.SUBSCRIBE,
+    Kind.SERVICE: RuleKind.SERVE,
+    Kind.PARAM: RuleKind.GET_PARAM,
+}
+"""Which rules a registration is asked about."""
+_EVERYTHING = "/"
+_READS = {"getParam": 1, "hasParam": 1, "searchParam": 1, "subscribeParam": 2}
+_WRITES = {"setParam": 1, "deleteParam": 1}
+_WHOLE = frozenset({"getParam", "subscribeParam", "setParam", "deleteParam"})
+"""Those that are about a whole namespace, if the name is one."""
+
+
+class ParamUse(msgspec.Struct, frozen=True):
+    """What a call does with parameters: the names that it may mean, and whether all below them."""
+
+    kind: RuleKind
+    names: tuple[str, ...]
+    below: bool
+
+
+def param_use(method: str, caller_id: str, name: str | None) -> ParamUse | None:
+    """What a call does with parameters; None if nothing. ``name`` is None if it can't be told."""
+    kind = RuleKind.SET_PARAM if method in _WRITES else RuleKind.GET_PARAM
+    if method not in _READS and method not in _WRITES:
+        return None
+    if name is None:
+        return ParamUse(kind, (_EVERYTHING,), True)
+    if method == "searchParam":
+        return ParamUse(kind, _searched(caller_id, name), False)
+    return ParamUse(kind, (resolve_name(name, caller_id),), method in _WHOLE)
+
+
+def param_use_of(call: Call) -> ParamUse | None:
+    """The same of a call that was read."""
+    place = _READS.get(call.method) or _WRITES.get(call.method)
+    return param_use(call.method, call.string(0) or "", call.string(place))
+
+
+def prefix(name: str) -> str:
+    """What all names below a parameter's begin with."""
+    return name if name.endswith("/") else f"{name}/"
+
+
+def hidden_registration(
+    held: Registration, endpoint: Endpoint, asker: Asker, addressing: Addressing
+) -> Answered:
+    """The answer to a registration that the master is not told of."""
+    asker, registry = replace(asker, endpoint=endpoint), addressing.registry
+    fact = Noted(held, endpoint)
+    if held.kind is Kind.SERVICE:
+        text = f"Registered [{held.caller_id}] as provider of [{held.name}]"
+        return Answered(1, text, 1, fact)
+    if held.kind is Kind.PUBLISHER:
+        found: Iterable[Endpoint] = (e for e, _ in hidden.subscribers_inside(registry, held.name))
+        text = f"Registered [{held.caller_id}] as publisher of [{held.name}]"
+    else:
+        found = hidden.publishers_inside(registry, held.name)
+        text = f"Subscribed to [{held.name}]"
+    return Answered(1, text, _imported(dict.fromkeys(found), asker, addressing), fact)
+
+
+def hidden_end(held: Registration) -> Answered:
+    """The answer to a call that ends a registration of which the master knows nothing."""
+    text = f"Unregistered [{held.caller_id}] as provider of [{held.name}]"
+    return Answered(1, text, 1, Noted(held, None))
+
+
+def hidden_service(call: Call, asker: Asker, addressing: Addressing) -> Answered | None:
+    """The answer to lookupService, if the master does not know of the service."""
+    endpoint = hidden.service(addressing.registry, second_name(call))
+    if endpoint is None:
+        return None
+    uri = addressing.advertised_service(endpoint)
+    found = addressing.import_service(uri, second_name(call), asker)
+    return Answered(1, f"rosrpc URI: [{found}]", found)
+
+
+def hidden_node(call: Call, asker: Asker, addressing: Addressing) -> Answered | None:
+    """The answer to lookupNode, if the master knows nothing of that node."""
+    endpoint = hidden.node(addressing.registry, second_name(call))
+    if endpoint is None:
+        return None
+    uri = addressing.import_slave(addressing.advertised_uri(endpoint), asker)
+    return Answered(1, "node api", uri)
+
+
+def no_provider(reason: str) -> Answered:
+    """The answer to lookupService for a service that the node is not to find."""
+    return Answered(-1, f"no provider (rosproxy: {reason})", "")
+
+
+def no_publisher(topic: str, reason: str) -> list[object]:
+    """The ROS triple of requestTopic for a topic that outside is not to have."""
+    return [-1, f"Not a publisher of [{topic}] (rosproxy: {reason})", []]
+
+
+def publishers_for(
+    endpoint: Endpoint | None, topic: str, at_master: Sequence[str], addressing: Addressing
+) -> list[str]:
+    """The publishers of a topic that the node of an endpoint is told of, as the master has them.
+
+    ``at_master`` are those that the master has told. No endpoint: somebody outside.
+    """
+    registry = addressing.registry
+    if endpoint is None:
+        return [*at_master]
+    if hidden.is_hidden_subscriber(registry, endpoint, topic):
+        at_master, more = [], hidden.publishers_inside(registry, topic)
+    else:
+        more = hidden.publishers(registry, topic)
+    return [*dict.fromkeys([*at_master, *map(addressing.advertised_uri, more)])]
+
+
+def topic_names(topic: str, caller_id: str) -> tuple[str, ...]:
+    """The names that a node may take a topic for which somebody outside names."""
+    return tuple(dict.fromkeys((topic, resolve_name(topic, ""), resolve_name(topic, caller_id))))
+
+
+def _searched(caller_id: str, name: str) -> tuple[str, ...]:
+    """The names that searchParam looks at: in all namespaces of the caller, from its own up."""
+    if name.startswith(("/", "~")):
+        return (resolve_name(name, caller_id),)
+    parts = [part for part in caller_id.split("/") if part]
+    spaces = ("/".join(["", *parts[:count]]) for count in range(len(parts), -1, -1))
+    return tuple(resolve_name(f"{space}/{name}", "") for space in spaces)
+
+
+def _imported(endpoints: Iterable[Endpoint], asker: Asker, addressing: Addressing) -> list[str]:
+    uris = map(addressing.advertised_uri, endpoints)
+    return [addressing.import_slave(uri, asker) for uri in uris]

@@ -1,0 +1,219 @@
+"""What the policy says to calls at the master port, and to what outside asks of a node inside.
+
+One object that `rosproxy.ros1.api` and the TCPROS server ask, each at one step. What is denied at
+the master port comes back as the reply to give instead; what is denied to outside, as the reason.
+Somebody who has the address of a node inside is no outsider: nodes in several inside networks
+reach each other through the proxy's ports.
+"""
+
+from dataclasses import dataclass, replace
+
+from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
+from rosproxy.access.layers import Verdict, strictest
+from rosproxy.access.rules import RuleKind
+from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
+from rosproxy.ros1.protocol.master_methods import Kind, row
+from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.rewriting import policing
+from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.master_api import (
+    Admission,
+    Answered,
+    LocalReply,
+    MasterReply,
+    Refusal,
+    Request,
+    Unseen,
+    holder,
+    registration,
+    second_name,
+)
+from rosproxy.ros1.rewriting.policing import ParamUse
+from rosproxy.ros1.rewriting.slave_api import MASTER_ONLY
+
+MASTER = "/master"
+"""The caller_id of the master's calls to nodes (rosmaster/registrations.py)."""
+
+
+@dataclass(slots=True, eq=False)
+class PolicyJudge:
+    """Applies the policy to calls and connections."""
+
+    _policy: AccessPolicy
+    _registry: Registry
+    _addressing: Addressing
+    _upstream: MasterClient
+
+    # Calls at the master port
+
+    def judges_parameters(self, source: str | None) -> bool:
+        """Whether calls for parameters from an address have to be read; None: from any."""
+        return self._policy.may_deny(PARAMETERS, (), source)
+
+    def filters_names(self, request: Request) -> bool:
+        """Whether the reply to a request lists parameters that its node may not see."""
+        listing = any(call and call.method == "getParamNames" for call in request.calls)
+        asker = request.asker
+        callers = [asker.caller_id]
+        return listing and self._policy.may_deny({RuleKind.GET_PARAM}, callers, asker.address)
+
+    async def judge_request(self, request: Request) -> list[LocalReply | None]:
+        """The replies to those calls of a request that the master does not get.
+
+        Those that register are judged once they have an endpoint (`judge_registration`).
+        Raises Unreachable.
+        """
+        asker = request.asker
+        return [await self._judge_call(call, asker) if call else None for call in request.calls]
+
+    def judge_long(self, method: str, head: bytes, source: str) -> LocalReply | None:
+        """The reply to a long call of which only the head was read; None if it passes."""
+        caller_id, name = (*passing.first_strings(head, 2), None, None)[:2]
+        use = policing.param_use(method, caller_id or "", name)
+        if use is None:
+            return None
+        verdict = self._judge_use(use, caller_id or "", source)
+        return _refused(self._policy.tell(verdict, use.kind, f"of {caller_id}", source))
+
+    def judge_registration(
+        self, call: Call, admission: Admission, asker: Asker, now: float
+    ) -> Admission:
+        """What becomes of a call that registers or unregisters, once it is admitted."""
+        held, found = registration(call, now), row(call.method)
+        if held is None or isinstance(admission, LocalReply):
+            return admission
+        if found.unregisters:
+            return self._judge_end(held, call, asker) or admission
+        if not isinstance(admission, Endpoint) or held.kind is Kind.PARAM:
+            return admission
+        kind, callers = policing.KINDS[held.kind], [held.caller_id]
+        verdict = self._policy.ask(kind, held.name, callers, admission.address)
+        if verdict.allowed:
+            return admission
+        concealed = replace(held, hidden=True)
+        return policing.hidden_registration(concealed, admission, asker, self._addressing)
+
+    def unseen(self, reply: MasterReply) -> Unseen:
+        """What a reply has to say otherwise than the master does."""
+        publishers, asker = dict[str, list[str]](), reply.exported.request.asker
+        for result in reply.results:
+            if row(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:
+                topic = second_name(result.call)
+                publishers[topic] = policing.publishers_for(
+                    result.endpoint, topic, [], self._addressing
+                )
+        params: frozenset[str] = frozenset()
+        if self.filters_names(reply.exported.request):
+            kind, callers = RuleKind.GET_PARAM, [asker.caller_id]
+            params = frozenset(
+                name
+                for name in reply.param_names()
+                if not self._policy.judge(kind, name, callers, asker.address).allowed
+            )
+        return Unseen(publishers, params)
+
+    # What outside asks of a node inside
+
+    def outside_may_not(
+        self, kind: RuleKind, name: str, endpoint: Endpoint, source: str, caller_id: str = ""
+    ) -> str | None:
+        """Why somebody outside may not have a topic or service of a node; None if he may."""
+        wanted = Kind.SERVICE if kind is RuleKind.SERVE else Kind.PUBLISHER
+        callers = endpoint.callers_of(wanted, name)
+        for one in policing.topic_names(name, caller_id):
+            verdict = self._policy.judge(kind, one, callers, endpoint.address)
+            if verdict.rule is not None and not self._is_inside(source):
+                self._policy.tell(verdict, kind, f"{one} of {endpoint.label}", source)
+                if not verdict.allowed:
+                    return verdict.reason
+        return None
+
+    async def outside_may_not_call(
+        self, method: str, endpoint: Endpoint, source: str, caller_id: str
+    ) -> str | None:
+        """Why somebody outside may not call a method of a node; None if he may.
+
+        What only the master calls, in its name and from its address, is not asked about.
+        """
+        kind = RuleKind.SLAVE
+        verdict = self._policy.judge(kind, method, [caller_id], endpoint.address)
+        if verdict.rule is None or self._is_inside(source):
+            return None
+        masters = method in MASTER_ONLY and caller_id == MASTER
+        if masters and source in await self._upstream.master_addresses():
+            return None
+        what = f"{method} at {endpoint.label}"
+        return None if self._policy.tell(verdict, kind, what, source).allowed else verdict.reason
+
+    def may_bypass(self, endpoint: Endpoint) -> bool:
+        """Whether a node's topics may go where no header is read: forwarded by the kernel."""
+        return not self._policy.may_deny(OUTWARDS, endpoint.caller_ids, endpoint.address)
+
+    def _is_inside(self, source: str) -> bool:
+        return any(endpoint.address == source for endpoint in self._registry)
+
+    async def _judge_call(self, call: Call, asker: Asker) -> LocalReply | None:
+        caller_id = call.string(0) or ""
+        if call.method == "lookupNode":
+            return policing.hidden_node(call, asker, self._addressing)
+        if call.method == "lookupService":
+            return self._judge_lookup(call, asker, caller_id)
+        use = policing.param_use_of(call)
+        if use is None:
+            return None
+        verdict = self._judge_use(use, caller_id, asker.address)
+        if not verdict.allowed and use.below and call.method != "subscribeParam":
+            verdict = await self._judge_names(use, call, caller_id, asker.address)
+        what = f"{use.names[0]} of {caller_id}"
+        return _refused(self._policy.tell(verdict, use.kind, what, asker.address))
+
+    def _judge_lookup(self, call: Call, asker: Asker, caller_id: str) -> LocalReply | None:
+        name = second_name(call)
+        if name in self._registry.services:
+            return policing.hidden_service(call, asker, self._addressing)
+        verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], asker.address)
+        return None if verdict.allowed else policing.no_provider(verdict.reason)
+
+    def _judge_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
+        """What is said to all names that a call may mean, and may have below them."""
+        found = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
+        if use.below:
+            found += [
+                self._policy.judge_below(use.kind, policing.prefix(name), caller_id, source)
+                for name in use.names
+            ]
+        return strictest(found)
+
+    async def _judge_names(self, use: ParamUse, call: Call, caller_id: str, source: str) -> Verdict:
+        """The same where it is denied for what may be below a name: by what there is.
+
+        Whoever sets a whole namespace stays denied. Raises Unreachable.
+        """
+        verdict = self._judge_use(use, caller_id, source)
+        own = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
+        sets_more = call.method == "setParam" and (
+            len(call.params) < 3 or call.params[2].kind == "struct"
+        )
+        if sets_more or not all(one.allowed for one in own):
+            return verdict
+        try:
+            names = await self._upstream.call_master("getParamNames")
+        except MasterError as error:
+            raise Unreachable(str(error)) from None
+        starts = tuple(map(policing.prefix, use.names))
+        below = [name for name in names if isinstance(name, str) and name.startswith(starts)]
+        found = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
+        return strictest([*own, *found])
+
+    def _judge_end(self, held: Registration, call: Call, asker: Asker) -> Answered | None:
+        """The answer to a call that ends what the master does not know of."""
+        endpoint = holder(call, asker, self._addressing)
+        known = endpoint.registrations.get(held.key) if endpoint else None
+        return policing.hidden_end(known) if known and known.hidden else None
+
+
+def _refused(verdict: Verdict) -> LocalReply | None:
+    return None if verdict.allowed else Refusal(f"rosproxy: {verdict.reason}")

@@ -1,0 +1,109 @@
+"""A policy that has changed: registrations are hidden and shown, connections are cut.
+
+What is denied now is taken back at the master and hidden; the nodes inside that use it stay
+connected. What is allowed again is registered. Connections from outside to what outside may not
+have are cut, and a node of which anything may be denied loses its fast port: what the kernel
+forwards nobody looks at. Nothing else is touched, so that it may be done at any time, and is done
+again until it has worked.
+"""
+
+import asyncio
+import logging
+from dataclasses import dataclass, field
+
+import msgspec
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.forwarding.relay import Relay
+from rosproxy.leases.leases import Leases
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.tcpros import UNREGISTERED, TcprosServer
+from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.registrar import Registrar
+
+log = logging.getLogger(__name__)
+
+ENFORCE_TICK = 0.5
+"""Seconds between looks whether the policy has changed."""
+
+
+class Enforced(msgspec.Struct, frozen=True):
+    """What a change has led to: registrations hidden and shown, connections cut."""
+
+    hidden: int = 0
+    shown: int = 0
+    cut: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class PolicyEnforcer:
+    """Makes what there is fit the policy."""
+
+    _context: Context
+    _leases: Leases[Endpoint]
+    _registrar: Registrar
+    _recovery: Recovery
+    _tcpros: TcprosServer
+    _plane: KernelPlane
+    _judge: PolicyJudge
+    _enforced: int = -1
+    _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def look_again(self) -> None:
+        """Note that something may have happened by a policy that is no longer in force."""
+        self._enforced = -1
+
+    async def look(self) -> None:
+        """Enforce the policy if that has not been done since it changed."""
+        if self._enforced != self._context.policy.version:
+            try:
+                await self.enforce()
+            except (Unreachable, MasterError) as error:
+                log.debug("the policy is enforced later: %s", error)
+
+    async def enforce(self) -> Enforced:
+        """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
+        async with self._one_at_a_time:
+            version = self._context.policy.version
+            cut = self._cut_relays() + self._take_fast_ports()
+            await self._recovery.ensure()
+            hidden, shown = await self._registrar.apply_policy()
+            self._enforced = version
+        done = Enforced(hidden, shown, cut)
+        if done != Enforced():
+            text = "policy: %d registrations are hidden now, %d shown, %d connections were cut"
+            log.info(text, hidden, shown, cut)
+        return done
+
+    def _cut_relays(self) -> int:
+        """End the connections that outside may not have; how many.
+
+        Of one for what is not registered the name is not known: it may be denied as well.
+        """
+        count = 0
+        for relay in self._tcpros.relays:
+            endpoint = self._context.registry.by_port.get(relay.port)
+            if endpoint and self._is_denied(relay, endpoint):
+                relay.end()
+                count += 1
+        return count
+
+    def _is_denied(self, relay: Relay, endpoint: Endpoint) -> bool:
+        if relay.name == UNREGISTERED:
+            return not self._judge.may_bypass(endpoint)
+        kind = RuleKind.SERVE if relay.kind == "service" else RuleKind.PUBLISH
+        return bool(self._judge.outside_may_not(kind, relay.name, endpoint, relay.peer))
+
+    def _take_fast_ports(self) -> int:
+        """Take fast ports from nodes of which something may be denied; how many connections."""
+        count = 0
+        for endpoint in self._context.registry:
+            if endpoint.fast_port is not None and not self._judge.may_bypass(endpoint):
+                count += endpoint.fast_connections
+                self._plane.cut(endpoint)
+                self._leases.take_fast_port(endpoint)
+        return count
