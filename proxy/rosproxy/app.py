@@ -109,6 +109,9 @@ class App:
         self._containers = ContainerEvents(
             context, leases, registrar, self._adopter, self._recovery, self.tcpros, plane
         )
+        self._admin = self._make_admin()
+
+    def _make_admin(self) -> AdminServer:
         actions = {
             "/probe": self._probe,
             "/containers": self._handle_news,
@@ -116,8 +119,8 @@ class App:
             "/retire": self._retire,
             "/policy": self._set_policy,
         }
-        metrics, token_hash = context.metrics.registry, settings.token_hash
-        self._admin = AdminServer(metrics, self.status, self._unready, actions, token_hash)
+        metrics, token_hash = self.context.metrics.registry, self.settings.token_hash
+        return AdminServer(metrics, self.status, self._unready, actions, token_hash)
 
     async def start(self) -> None:
         """Bind all ports and begin. Raises SettingError if a port is taken."""

@@ -39,7 +39,7 @@ def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rosproxy.admin.server.is_loopback", lambda _: False)
 
 
-PATHS = ["/probe", "/containers", "/master-address", "/retire"]
+PATHS = ["/probe", "/containers", "/master-address", "/retire", "/policy"]
 
 
 @pytest.mark.usefixtures("from_afar")

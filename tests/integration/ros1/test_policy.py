@@ -103,6 +103,27 @@ async def test_a_hidden_service_is_found_inside_alone(make_proxy, master, make_n
     assert (await client.call(proxy.master, "lookupService", "/add"))[0] == -1
 
 
+async def test_tools_inside_see_the_whole_graph(make_proxy, master, make_node):
+    proxy = await make_proxy(policy="deny publish /chatter; deny serve *")
+    talker, shown = await make_node("/talker"), await make_node("/shown", OTHER_NODE)
+    before = await shown.call(proxy.master, "getSystemState")
+    for node in (talker, shown):
+        await node.publish(proxy.master, "/odom")
+    await talker.publish(proxy.master)
+    await talker.serve(proxy.master)
+    state = (await shown.call(proxy.master, "getSystemState"))[2]
+    assert state == [
+        [["/odom", ["/talker", "/shown"]], ["/chatter", ["/talker"]]],
+        [],
+        [["/add", ["/talker"]]],
+    ]
+    types = (await shown.call(proxy.master, "getTopicTypes"))[2]
+    assert ["/chatter", "std_msgs/String"] in types
+    outside = await rpc(master.uri, "getSystemState", "/x")
+    assert outside[2] == [[["/odom", ["/talker", "/shown"]]], [], []]
+    assert before[2] == [[], [], []]
+
+
 async def test_a_dead_hidden_publisher_is_told_of(make_proxy, make_node):
     proxy = await make_proxy(policy="deny publish /chatter")
     talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)

@@ -97,7 +97,7 @@ class MasterApi:
         if not request.plain:
             await self._recovery.ensure()
         replies = await self._judge.judge_request(request)
-        if request.plain and not any(replies) and not self._judge.filters_names(request):
+        if request.plain and not any(replies) and not self._judge.has_to_read_reply(request):
             return await self._context.upstream.pass_to_master(request.body)
         return await self._rewrite(request, replies, call)
 
@@ -112,7 +112,8 @@ class MasterApi:
             self._note(exported.facts(), request.asker.address)
             if exported.body is None:
                 return exported.local_reply()
-            answer = await self._context.upstream.post_to_master(exported.body)
+            limits = request.reply_limits
+            answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_api.read_reply(exported, answer)
             self._note(reply.facts(self._context.now()), request.asker.address)
             await self._alias.listen_for(reply.uris())

@@ -17,7 +17,7 @@ from rosproxy.ros1.protocol.master_methods import NO_ROW, Kind, Reply, resolve_n
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
+from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL, OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import (
     MULTICALL,
     inner_calls,
@@ -25,6 +25,7 @@ from rosproxy.ros1.protocol.xmlrpc.multicall import (
     insert_items,
 )
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.rewriting import hidden_graph
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.ros1.rewriting.slave_api import replace_held, ros_triple
 
@@ -59,11 +60,13 @@ class Unseen(msgspec.Struct, frozen=True):
     """What a reply has to say otherwise than the master does.
 
     ``publishers`` are those by topic that the master does not know of, as it would have them;
-    ``params`` the names that getParamNames leaves out.
+    ``params`` the names that getParamNames leaves out; ``graph`` says whether replies that tell
+    the graph are completed.
     """
 
     publishers: Mapping[str, Sequence[str]] = {}
     params: Collection[str] = ()
+    graph: bool = False
 
 
 NOTHING_UNSEEN = Unseen()
@@ -93,6 +96,16 @@ class Request(msgspec.Struct, frozen=True):
         if self.multicall:
             return MULTICALL
         return self.calls[0].method if self.calls and self.calls[0] else ""
+
+    @property
+    def tells_graph(self) -> bool:
+        """Whether the reply tells of the graph of all nodes."""
+        return any(call and call.method in hidden_graph.METHODS for call in self.calls)
+
+    @property
+    def reply_limits(self) -> Limits:
+        """How large the reply may be, if it is read."""
+        return OWN_REPLY if self.tells_graph else REPLY
 
     @property
     def plain(self) -> bool:
@@ -228,7 +241,7 @@ def export_request(
 
 def read_reply(exported: Exported, reply: bytes) -> MasterReply:
     """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response."""
-    value = xmlrpc.parse_reply(reply)
+    value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
 
@@ -329,6 +342,11 @@ def _import_result(
     if result.call.method == "getParamNames":
         names = result.triple.items[2].items
         return [xmlrpc.remove(item) for item in names if item.text in unseen.params]
+    if unseen.graph and result.call.method in hidden_graph.METHODS:
+        held = result.triple.items[2]
+        said = xmlrpc.python_value(held)
+        more = hidden_graph.completed(result.call, said, addressing.registry)
+        return [Edit(*held.outer, xmlrpc.dump_value(more))]
     return _import_uri(result, asker, addressing)
 
 

@@ -53,6 +53,11 @@ class PolicyJudge:
         """Whether calls for parameters from an address have to be read; None: from any."""
         return self._policy.may_deny(PARAMETERS, (), source)
 
+    def has_to_read_reply(self, request: Request) -> bool:
+        """Whether the reply to a request has to say otherwise than the master does."""
+        hides = request.tells_graph and bool(self._registry.hidden)
+        return hides or self.filters_names(request)
+
     def filters_names(self, request: Request) -> bool:
         """Whether the reply to a request lists parameters that its node may not see."""
         listing = any(call and call.method == "getParamNames" for call in request.calls)
@@ -113,7 +118,7 @@ class PolicyJudge:
                 for name in reply.param_names()
                 if not self._policy.judge(kind, name, callers, asker.address).allowed
             )
-        return Unseen(publishers, params)
+        return Unseen(publishers, params, bool(self._registry.hidden))
 
     # What outside asks of a node inside
 
