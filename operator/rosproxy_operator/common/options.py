@@ -1,25 +1,13 @@
 """Options of both operators by which an administrator says what all proxies do."""
 
-from collections.abc import Sequence
-
 import click
 
-from rosproxy.access.rules import parse_rules
-from rosproxy.cli.options import Command, Parsed, with_options
-
-
-class RulesType(Parsed):
-    """Rules of a policy. A variable holds all of them: blanks in it separate no values."""
-
-    def split_envvar_value(self, rv: str) -> Sequence[str]:
-        """The one value that a variable holds."""
-        return [rv]
-
+from rosproxy.cli.options import POLICY_RULES, Command, with_options
 
 _POLICY = (
     click.option(
         "--policy",
-        type=RulesType("rules", parse_rules),
+        type=POLICY_RULES,
         multiple=True,
         help='What outside may see and do at all proxies, and inside take, such as "deny publish '
         '/camera/*" (repeatable; several separated by ;). Others can only narrow it.',

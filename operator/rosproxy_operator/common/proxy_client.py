@@ -61,7 +61,8 @@ class ProxyClient:
     async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         """Tell the layers of its policy, instead of those told before. Raises PolicyRefused, too.
 
-        A proxy of a former release has no policy, which is right if there is none.
+        They are in force at once; where its master can't be asked (503) the proxy goes on trying to
+        tell it. A proxy of a former release has no policy, which is right if there is none.
         """
         try:
             body = {"layers": layers_as_json(layers)}
@@ -76,7 +77,7 @@ class ProxyClient:
             if error.status == 400:
                 text = f"does not take its policy, and is told of nobody new till then: {error}"
                 raise PolicyRefused(text, status=400) from None
-            if error.status != 404:
+            if error.status not in (404, 503):
                 raise
 
     async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:

@@ -1,6 +1,5 @@
 """What containers are made of, when they must be made anew, and what their labels tell."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -8,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from rosproxy.access.layers import read_layers
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
@@ -93,8 +91,7 @@ def test_a_policy_is_there_from_the_start_and_makes_no_proxy_anew() -> None:
     rules = parse_rules("deny publish /camera/*")
     other = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
     body = container_config(PROXY, other, SECRET, "")
-    (found,) = [one for one in body["Env"] if one.startswith("ROSPROXY_POLICY_LAYERS=")]
-    assert read_layers(json.loads(found.partition("=")[2])) == other.policy
+    assert settings_of(dict(one.split("=", 1) for one in body["Env"])).policy_layers == other.policy
     made = (proxy_fingerprint(PROXY, each, IMAGE, SECRET) for each in (other, SETTINGS))
     assert len({*made}) == 1
 

@@ -1,12 +1,11 @@
 """What is created: hardened, bound to its node, and recognized when it is seen again."""
 
-import json
 from typing import Any
 
 import pytest
 from msgspec.structs import replace
 
-from rosproxy.access.layers import PolicyLayer, read_layers
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import parse_rules
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
@@ -62,8 +61,7 @@ def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
     settings = replace(SETTINGS, policy=administrators_policy([rules], "audit"))
     own = PolicyLayer("RosProxy ros/robot", parse_rules("deny serve *"))
     made = manifests.proxy_pod(site(rosproxy(policy=(own,)), node()), settings)
-    found = read_layers(json.loads(env_of(made)["ROSPROXY_POLICY_LAYERS"]))
-    assert found == (*settings.policy, own)
+    assert settings_of(env_of(made)).policy_layers == (*settings.policy, own)
     assert manifests.fingerprint_of(made) == manifests.fingerprint_of(body())
     assert "ROSPROXY_POLICY_LAYERS" not in env()
 
