@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 from scripts.custom_resource_docs import custom_resource
 
+from rosproxy.access.rules import LONGEST_GLOB
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.common.policy import MOST_AUTHORS_RULES
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources.model import (
     Name,
@@ -16,7 +18,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     ProxyPod,
     ProxyReport,
 )
-from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, rosproxy
+from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
 from rosproxy_operator.kubernetes.status.status import status_of
 from tests.chart.chart import Json
 
@@ -96,6 +98,10 @@ def with_defaults(value: Any, schema: Json) -> Any:
         {"master": {"service": {"name": "master"}}},
         {"master": {"uri": "http://robot:11311"}, "portWindow": {"first": 20000}},
         {"master": {"uri": "http://robot:11311"}, "policy": {}, "resources": {}},
+        {
+            "master": {"uri": "http://robot:11311"},
+            "policy": {"rules": [{"action": "Deny", "kind": "Call", "names": ["/a"]}]},
+        },
     ],
 )
 def test_defaults_are_the_operators(spec: Json) -> None:
@@ -109,6 +115,15 @@ def test_defaults_are_the_operators(spec: Json) -> None:
 def test_limits_are_the_operators() -> None:
     assert SPEC["spec.ports"]["maximum"] == MOST_PORTS
     assert f"size() <= {MOST_NAME}" in SCHEMA["x-kubernetes-validations"][0]["rule"]
+
+
+def test_bounds_of_a_policy_are_the_operators() -> None:
+    """What the API server takes the operator can read."""
+    (rule,) = SPEC["spec.policy"]["x-kubernetes-validations"]
+    assert f"<= {MOST_AUTHORS_RULES}" in " ".join(rule["rule"].split())
+    assert SPEC["spec.policy.rules[].kind"]["enum"] == [*RULE_KINDS]
+    for path in ("spec.policy.rules[].names[]", "spec.policy.rules[].nodes[]"):
+        assert SPEC[path]["maxLength"] == LONGEST_GLOB
 
 
 def test_rules_have_messages() -> None:

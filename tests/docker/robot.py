@@ -58,6 +58,10 @@ class Robot(Machine):
         """Whether the master knows a node by an address of this host."""
         return self.uri(node, port).startswith(f"http://{self.host_address}:")
 
+    def publishers(self, topic: str) -> set[str]:
+        """The nodes that the master knows to publish a topic."""
+        return publishers_at(f"http://{self.address}:11311", topic)
+
 
 def nodes_at(master_uri: str) -> dict[str, str]:
     """Every node that a master knows, with its URI; none if it does not answer."""
@@ -69,6 +73,13 @@ def nodes_at(master_uri: str) -> dict[str, str]:
             return {name: master.lookupNode("/test", name)[2] for name in names}
     except (OSError, xmlrpc.client.Error):
         return {}
+
+
+def publishers_at(master_uri: str, topic: str) -> set[str]:
+    """The nodes that a master knows to publish a topic."""
+    with xmlrpc.client.ServerProxy(master_uri, _Transport()) as master:
+        answer: Any = master.getSystemState("/test")
+        return {node for name, nodes in answer[2][0] for node in nodes if name == topic}
 
 
 class _Transport(xmlrpc.client.Transport):

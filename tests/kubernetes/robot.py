@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.docker.engine import docker, inspect, wait_until
 from tests.docker.nodes import Log, node_command
-from tests.docker.robot import nodes_at
+from tests.docker.robot import nodes_at, publishers_at
 from tests.kubernetes.cluster.layout import NODES, ROBOT, ROBOT_ADDRESS, node_named
 
 _ports = itertools.count(11311)
@@ -59,6 +59,10 @@ class Robot:
     def uri(self, node: str) -> str:
         """The URI that the master has of a node; empty if none."""
         return self.nodes().get(f"/{node}", "")
+
+    def publishers(self, topic: str) -> set[str]:
+        """The nodes that the master knows to publish a topic."""
+        return publishers_at(self.master_uri, topic)
 
     def knows_proxied(self, node: str, on: str = "") -> bool:
         """Whether the master knows a node by an address of a node of the cluster."""

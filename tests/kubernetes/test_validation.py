@@ -9,6 +9,7 @@ from tests.kubernetes.pods import Namespace
 from tests.kubernetes.rosproxies import rosproxy, rosproxy_body
 
 GOOD = {"uri": "http://robot:11311"}
+RULE = {"action": "Deny", "kind": "Publish", "names": ["/camera/*"]}
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no master": ({}, "master"),
     "empty master": ({"master": {}}, "exactly one of uri"),
@@ -29,6 +30,28 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"master": GOOD, "podSelector": {"matchExpressions": [{"key": "a", "operator": "In"}]}},
         "need values",
     ),
+    "no names": ({"master": GOOD, "policy": {"rules": [{**RULE, "names": []}]}}, "names"),
+    "names of no topic": (
+        {"master": GOOD, "policy": {"rules": [{**RULE, "names": ["camera"]}]}},
+        "begin with / or *",
+    ),
+    "two names in one": (
+        {"master": GOOD, "policy": {"rules": [{**RULE, "names": ["/a;/b"]}]}},
+        "names[0]",
+    ),
+    "nodes of no name": (
+        {"master": GOOD, "policy": {"rules": [{**RULE, "nodes": ["driver"]}]}},
+        "nodes[0]",
+    ),
+    "kind": ({"master": GOOD, "policy": {"rules": [{**RULE, "kind": "Topic"}]}}, "kind"),
+    "many rules": (
+        {
+            "master": GOOD,
+            "policy": {"rules": [{**RULE, "names": ["/a"] * 17, "nodes": ["/b"]}] * 30},
+        },
+        "500 names at most",
+    ),
+    "mode": ({"master": GOOD, "policy": {"mode": "Tell"}}, "mode"),
     "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
 }
 
@@ -47,6 +70,16 @@ def test_bad_name_is_refused(name: str, net: Namespace) -> None:
     with pytest.raises(api.Refused) as refused:
         api.create(rosproxy_body(net.name, name, master=GOOD))
     assert "metadata.name" in refused.value.text
+
+
+def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
+    rules = [
+        {**RULE, "names": ["/a", "*/b", "?c"], "nodes": ["/driver", "*"]},
+        {"action": "Allow", "kind": "Slave", "names": ["getPid"], "nodes": []},
+        {**RULE, "kind": "GetParam", "names": ["/a"] * 31, "nodes": ["/b"] * 15},
+    ]
+    policy = rosproxy(net.name, master=GOOD, policy={"rules": rules}).body["spec"]["policy"]
+    assert policy == {"slaveControl": "Any", "mode": "Enforce", "rules": rules}
 
 
 def test_defaults_are_filled_in(net: Namespace) -> None:

@@ -51,7 +51,7 @@ RESOURCES: Json = {
 _SLAVE_CONTROL = {"Any": "any", "Master": "master"}
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
 _ACTION = {"Allow": Action.ALLOW, "Deny": Action.DENY}
-_RULE_KIND = {
+RULE_KINDS = {
     "Publish": RuleKind.PUBLISH,
     "Serve": RuleKind.SERVE,
     "Subscribe": RuleKind.SUBSCRIBE,
@@ -154,7 +154,7 @@ def _policy(given: Field, of: Name) -> tuple[PolicyLayer, ...]:
 def _rules(given: Field) -> Iterator[Rule]:
     """One for each of the names that are listed, with each of the nodes."""
     action = given["action"].one_of(_ACTION, "")
-    kind = given["kind"].one_of(_RULE_KIND, "")
+    kind = given["kind"].one_of(RULE_KINDS, "")
     names = [_glob(one, kind is not RuleKind.SLAVE) for one in given["names"].each()]
     nodes = [_glob(one, True) for one in given["nodes"].each()]
     if not names:
