@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from rosproxy import __version__
+from rosproxy.access.layers import PolicyMode
 from rosproxy_operator.cli import main
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import (
@@ -117,6 +118,8 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     (args,) = (one["args"] for one in pod["containers"])
     tested = [one.partition("=")[2] for one in args if re.search("--allow-master=.*-test[.]", one)]
     assert len(tested) == bool(allow)
+    policy = [(str(rule), layer.mode) for layer in settings.plan.policy for rule in layer.rules]
+    assert policy == [("deny publish /camera/* by /driver", PolicyMode.AUDIT)] * bool(allow)
     assert settings.plan.bounds == Bounds(
         masters=(*allow.get("masters", ()), *tested),
         max_ports=allow.get("maxPorts", MOST_PORTS),

@@ -1,10 +1,9 @@
 """Policies, as operators hand them to proxies: whose rules they are, and how they get there.
 
-A proxy gets its policy twice. With a variable, when it is created, so that it serves for no moment
-without: there stand the layers for all of its nodes, as no others are known by then. And by
-``POST /policy``, all layers, whenever they have changed or the proxy has been started: another
-policy makes no proxy anew. So one that is started again while its operator is away begins with the
-policy of its creation.
+A proxy gets its policy twice. In a variable, when it is created, so that it serves for no moment
+without. And by ``POST /policy``, whenever it has changed or the proxy has been started: another
+policy makes no proxy anew. So one that is started again begins with the policy of its creation,
+until its operator tells it the present one.
 """
 
 import json
@@ -19,8 +18,10 @@ ADMINISTRATOR = "administrator"
 POLICY_VARIABLE = "ROSPROXY_POLICY_LAYERS"
 MOST_AUTHORS_RULES = MOST_RULES // 2
 """Rules of one author, so that those of the administrator and of another always fit together."""
-LONGEST_POLICY = 32 * 1024
-"""Bytes, as JSON, of one author's layer: Linux starts no program with a variable of 128 KiB."""
+LONGEST_VARIABLE = 96 * 1024
+"""Bytes: Linux starts no program with a variable of 128 KiB (MAX_ARG_STRLEN)."""
+LONGEST_POLICY = LONGEST_VARIABLE // 3
+"""Bytes, as JSON, of one author's layer: the administrator's and another's fit into a variable."""
 
 
 def administrators_policy(rules: Iterable[tuple[Rule, ...]], mode: str) -> tuple[PolicyLayer, ...]:
@@ -41,7 +42,11 @@ def too_much(layers: Sequence[PolicyLayer]) -> str:
     return f"{size} bytes, at most {LONGEST_POLICY} are accepted" if size > LONGEST_POLICY else ""
 
 
-def as_variable(layers: Iterable[PolicyLayer]) -> str:
-    """Those for all nodes, as a proxy takes them at its creation; empty if there are none."""
+def as_variable(layers: Sequence[PolicyLayer]) -> str:
+    """Layers as a proxy takes them at its creation; empty if there are none.
+
+    Where all are too long for a variable, only those that are for all of its nodes.
+    """
     common = [layer for layer in layers if layer.addresses is None]
-    return json.dumps(layers_as_json(common)) if common else ""
+    texts = (json.dumps(layers_as_json(some)) for some in (layers, common) if some)
+    return next((text for text in texts if len(text) <= LONGEST_VARIABLE), "")

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from aiohttp import web
 from aiohttp.test_utils import TestServer
+from msgspec import structs
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode, layers_as_json, read_layers
 from rosproxy.access.rules import parse_rules
@@ -53,10 +54,13 @@ def test_a_policy_is_bounded(count: int, glob: str, told: str) -> None:
     assert error.value.option == "--policy"
 
 
-def test_at_its_creation_a_proxy_gets_what_is_for_all_its_nodes() -> None:
+def test_at_its_creation_a_proxy_gets_what_fits_into_a_variable() -> None:
     common = administrators_policy([RULES], "enforce")
-    assert read_layers(json.loads(as_variable([*common, OWN]))) == common
-    assert as_variable([OWN]) == ""
+    assert read_layers(json.loads(as_variable([*common, OWN]))) == (*common, OWN)
+    assert as_variable([]) == ""
+    long = structs.replace(OWN, rules=parse_rules("deny publish /" + "a" * 255) * 400)
+    assert read_layers(json.loads(as_variable([*common, long]))) == common
+    assert as_variable([long]) == ""
 
 
 class Answers:

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import msgspec
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane, SlaveControl
 from rosproxy.telemetry.text import clean
@@ -66,7 +67,8 @@ class CreateSandbox(_CreateContainer, frozen=True):
 class Create(_CreateContainer, frozen=True):
     """Create the container in which a proxy runs, in the namespace of the one named ``sandbox``.
 
-    ``replaces`` names the one in whose place it comes, if any.
+    ``replaces`` names the one in whose place it comes, if any. ``policy`` are the layers of its
+    containers' labels.
     """
 
     sandbox: str
@@ -74,6 +76,7 @@ class Create(_CreateContainer, frozen=True):
     fingerprint: str = ""
     replaces: str = ""
     slave_control: SlaveControl = "any"
+    policy: tuple[PolicyLayer, ...] = ()
 
     def _more(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""

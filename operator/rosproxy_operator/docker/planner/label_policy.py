@@ -13,7 +13,7 @@ from rosproxy.access.layers import LONGEST_LAYER_NAME, MOST_LAYERS, PolicyLayer
 from rosproxy.access.rules import MOST_RULES, format_rules
 from rosproxy_operator.common.problem import Problem, bounded
 from rosproxy_operator.docker.planner.labels.values import POLICY
-from rosproxy_operator.docker.planner.model import Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.model import Container, Key, Member, PlanSettings
 
 OUTLIVES = 10.0
 """Seconds for which an address keeps its layers after its container has gone.
@@ -49,10 +49,24 @@ def within_bounds(
     )
 
 
-def label_layer(member: Member, addresses: Iterable[str]) -> PolicyLayer:
-    """The layer of a container whose nodes are at these addresses."""
-    name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
-    return PolicyLayer(name, member.policy, addresses=frozenset(addresses))
+def label_layers(
+    members: Iterable[Member], by_id: Mapping[str, Container], networks: Collection[str]
+) -> tuple[PolicyLayer, ...]:
+    """The layers of a proxy's containers, for their addresses on these networks."""
+    found: list[PolicyLayer] = []
+    for member in members:
+        owner = network_owner(member.container, by_id)
+        places = (place for place in owner.attachments if place.network in networks)
+        addresses = frozenset(place.address for place in places if place.address)
+        if member.policy and member.container.alive and addresses:
+            name = bounded(f"label of container {member.container.name}", LONGEST_LAYER_NAME)
+            found.append(PolicyLayer(name, member.policy, addresses=addresses))
+    return tuple(found)
+
+
+def network_owner(container: Container, by_id: Mapping[str, Container]) -> Container:
+    """The container in whose network namespace another one is: itself, if it has its own."""
+    return by_id.get(container.shares or container.id, container)
 
 
 class RecentLayers:

@@ -13,7 +13,11 @@ from typing import Any
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.net.addresses import is_address, is_inside
-from rosproxy_operator.docker.planner.label_policy import RecentLayers, label_layer
+from rosproxy_operator.docker.planner.label_policy import (
+    RecentLayers,
+    label_layers,
+    network_owner,
+)
 from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
@@ -207,13 +211,6 @@ def facts(
     by_id = {container.id: container for container in observed.containers}
     running = [container for container in observed.containers if container.state in STARTED]
     mine = [member for member in members if member.key == proxy.key]
-    alive = [member for member in mine if member.container.alive]
-    at = {
-        member.container.id: [
-            place.address for place in _places(_host(member.container, by_id), joined)
-        ]
-        for member in alive
-    }
     return NetworkFacts(
         master_address="" if is_address(host) else observed.masters.get(host, ""),
         addresses={
@@ -232,15 +229,13 @@ def facts(
             arrival for member in mine for arrival in _arrivals(member.container, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
-        selected=frozenset(address for addresses in at.values() for address in addresses),
-        policy=(
-            *policy,
-            *(
-                label_layer(member, at[member.container.id])
-                for member in alive
-                if member.policy and at[member.container.id]
-            ),
+        selected=frozenset(
+            place.address
+            for member in mine
+            if member.container.alive
+            for place in _places(network_owner(member.container, by_id), joined)
         ),
+        policy=(*policy, *label_layers(mine, by_id, joined)),
     )
 
 
@@ -248,16 +243,11 @@ def _places(container: Container, networks: Collection[str]) -> list[Attachment]
     return [each for each in container.attachments if each.network in networks and each.address]
 
 
-def _host(container: Container, by_id: Mapping[str, Container]) -> Container:
-    """The container in whose network namespace another one is: itself, if it has its own."""
-    return by_id.get(container.shares or container.id, container)
-
-
 def _arrivals(
     container: Container, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
-    host = _host(container, by_id)
+    host = network_owner(container, by_id)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}

@@ -151,7 +151,8 @@ def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secre
     # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
     # is started again while the operator is away begins with the policy of its creation.
     settings = dataclasses.replace(settings, policy=())
-    body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
+    made = replace(made, sandbox="", fingerprint="", policy=())
+    body = container_config(made, settings, secret, "")
     return _digest({**body, "Image": image_id})
 
 
@@ -205,7 +206,7 @@ def container_config(
         "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
-        POLICY_VARIABLE: as_variable(settings.policy),
+        POLICY_VARIABLE: as_variable((*settings.policy, *made.policy)),
     }
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from msgspec.structs import replace
 
+from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.planner.actions import (
     Action,
@@ -27,6 +28,7 @@ from rosproxy_operator.docker.planner.actions import (
     Unpause,
 )
 from rosproxy_operator.docker.planner.desired import holds, needed_by
+from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
     SERVING,
     STARTED,
@@ -68,6 +70,12 @@ class PlanContext:
         """The names of all containers but these."""
         every = [*self.observed.containers, *(one.container for one in self.observed.own)]
         return frozenset(one.name for one in every) - {one.container.name for one in own}
+
+    @property
+    def label_policy(self) -> tuple[PolicyLayer, ...]:
+        """The layers of its containers' labels."""
+        by_id = {container.id: container for container in self.observed.containers}
+        return label_layers(self.desired.members, by_id, self.desired.networks)
 
     def select(
         self, own: Collection[OwnContainer], name: str, made: str, fits: Callable[[Container], bool]
@@ -261,6 +269,7 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         home.name,
         context.desired.data_plane,
         slave_control=context.desired.slave_control,
+        policy=context.label_policy,
     )
     observed = context.observed
     expected = proxy_fingerprint(made, context.settings, observed.image_id, observed.secret)

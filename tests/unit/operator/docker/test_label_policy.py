@@ -3,15 +3,19 @@
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import MOST_RULES, Rule, parse_rules
 from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.docker.planner.actions import Create
 from rosproxy_operator.docker.planner.label_policy import OUTLIVES, RecentLayers, within_bounds
 from rosproxy_operator.docker.planner.labels.values import MOST_LABEL_RULES
 from rosproxy_operator.docker.planner.model import Attachment, Key, Member
 from rosproxy_operator.docker.planner.proxy_news import ProxyNews, facts
+from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
 from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.run_options import settings_of
 from tests.unit.operator.docker.builders import (
     ENABLED,
     KEY,
@@ -90,6 +94,20 @@ def test_a_layer_is_for_the_addresses_of_its_container() -> None:
     other = Member(talker, Key("http://other:11311", "192.0.2.10"), policy=RULES)
     known = facts(seen, seen.proxies[0], [*members, plain, other], COMMON)
     assert known.policy == (*COMMON, layer("talker", A), layer("guest", A))
+
+
+def test_a_proxy_is_made_with_the_layers_of_its_containers() -> None:
+    """Its nodes may register before the operator has told it anything."""
+    labels = {**ENABLED, "rosproxy.policy": "deny publish /camera/*"}
+    seen = observed(container("talker", labels, [Attachment("app", A)]))
+    found = planned(seen, replace(SETTINGS, policy=COMMON), DockerMemory(), 0.0)
+    (made,) = [one for one in found.actions if isinstance(one, Create)]
+    assert made.policy == (layer("talker", A),)
+    body = container_config(made, replace(SETTINGS, policy=COMMON), "t", "")
+    variables = dict(one.split("=", 1) for one in body["Env"])
+    assert settings_of(variables).policy_layers == (*COMMON, layer("talker", A))
+    plain = structs.replace(made, policy=())
+    assert len({proxy_fingerprint(one, SETTINGS, "", "") for one in (made, plain)}) == 1
 
 
 def test_what_a_container_that_has_gone_hid_stays_hidden_until_its_nodes_are_gone() -> None:
