@@ -73,6 +73,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "allow": {
                 "masters": ["http://192.0.2.*:11311", "http://[fd00::*]:*"],
                 "maxPorts": 64,
+                "portWindow": "11400-19999",
                 "dataPlanes": ["Auto", "Kernel"],
                 "images": ["registry.example/*"],
             },

@@ -26,6 +26,7 @@ BAD: list[tuple[Json, str]] = [
     ({"policy": {"mode": "audit"}}, "policy/mode"),
     ({"allow": {"masters": ["robot:11311"]}}, "allow/masters/0"),
     ({"allow": {"maxPorts": 501}}, "allow/maxPorts"),
+    ({"allow": {"portWindow": 11400}}, "allow/portWindow"),
     ({"allow": {"dataPlanes": ["kernel"]}}, "allow/dataPlanes/0"),
     ({"allow": {"dataPlanes": []}}, "allow/dataPlanes"),
     ({"allow": {"images": ["a b"]}}, "allow/images/0"),

@@ -11,6 +11,7 @@ import pytest
 
 from rosproxy import __version__
 from rosproxy.access.layers import PolicyMode
+from rosproxy.leases.ports import PortRange
 from rosproxy_operator.cli import main
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import (
@@ -123,6 +124,7 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     assert settings.plan.bounds == Bounds(
         masters=(*allow.get("masters", ()), *tested),
         max_ports=allow.get("maxPorts", MOST_PORTS),
+        window=PortRange(11400, 19999) if allow else PortRange(1024, 65535),
         data_planes=("auto", "kernel") if allow else ("auto", "splice", "copy"),
         images=tuple(allow.get("images", ())),
         slave_control="master" if allow else "any",

@@ -5,9 +5,9 @@ The rest is in `rosproxy_operator.cli`.
 
 import click
 
-from rosproxy.cli.options import Command, Parsed, with_options
+from rosproxy.cli.options import PORT_RANGE, Command, Parsed, with_options
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
-from rosproxy_operator.kubernetes.settings import read_glob, read_name, read_peers
+from rosproxy_operator.kubernetes.settings import EVERY_PORT, read_glob, read_name, read_peers
 
 GLOB = Parsed("glob", read_glob)
 
@@ -28,6 +28,13 @@ def administrators_options(command: Command) -> Command:
             default=MOST_PORTS,
             metavar="N",
             help="Most ports that a RosProxy may ask for.",
+        ),
+        click.option(
+            "--allow-port-window",
+            type=PORT_RANGE,
+            default=f"{EVERY_PORT}",
+            metavar="A-B",
+            help="Where a RosProxy may have hostPorts: its portWindow and its master's port.",
         ),
         click.option(
             "--allow-data-plane",

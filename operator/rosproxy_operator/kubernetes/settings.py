@@ -24,18 +24,22 @@ NODE_PORTS = PortRange(30000, 32767)
 """The API server's own default of --service-node-port-range."""
 EPHEMERAL = PortRange(32768, 60999)
 """Linux's own default of net.ipv4.ip_local_port_range."""
+EVERY_PORT = PortRange(1024, 65535)
+"""Where the custom resource definition lets hostPorts lie."""
 
 
 class Bounds(msgspec.Struct, frozen=True):
     """What a RosProxy may ask for: the administrator's word, which no RosProxy can widen.
 
-    ``masters`` are globs of the masters' URIs, any if there are none; ``images`` globs of the
+    ``masters`` are globs of the masters' URIs, any if there are none; ``window`` is where hostPorts
+    may lie, all of ``spec.portWindow`` and ``spec.master.publish``; ``images`` are globs of the
     images that ``spec.image`` may name besides the operator's own. ``slave_control`` is what holds
     for all: a RosProxy may only narrow it.
     """
 
     masters: tuple[str, ...] = ()
     max_ports: int = MOST_PORTS
+    window: PortRange = EVERY_PORT
     data_planes: tuple[DataPlane, ...] = ("auto", "splice", "copy")
     images: tuple[str, ...] = ()
     slave_control: str = "any"
@@ -110,6 +114,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
             bounds=Bounds(
                 masters=options["allow_master"],
                 max_ports=options["max_ports"],
+                window=options["allow_port_window"],
                 data_planes=options["allow_data_plane"],
                 images=options["allow_image"],
                 slave_control=options["slave_control"],

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from rosproxy.net.addresses import HostPort, is_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
+from rosproxy_operator.common.allocation import within
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterSnapshot,
     InvalidRosProxy,
@@ -84,9 +85,7 @@ def _beyond(spec: RosProxySpec, bounds: Bounds, own_image: str) -> Iterator[str]
             if not may_name(uri, bounds.masters):
                 field = "spec.master.uri" if spec.master.uri else "spec.master.service"
                 yield _refused(field, uri, "choose an allowed master", "allow.masters")
-    if spec.ports > bounds.max_ports:
-        fewer = f"ask for {bounds.max_ports} at most"
-        yield _refused("spec.ports", spec.ports, fewer, "allow.maxPorts")
+    yield from _beyond_ports(spec, bounds)
     if spec.data_plane not in bounds.data_planes:
         others = " or ".join(one.capitalize() for one in bounds.data_planes)
         value = spec.data_plane.capitalize()
@@ -94,6 +93,19 @@ def _beyond(spec: RosProxySpec, bounds: Bounds, own_image: str) -> Iterator[str]
     known = (own_image, *bounds.images)
     if spec.image and not any(_fits(spec.image, one) for one in known):
         yield _refused("spec.image", spec.image, "leave it out", "allow.images")
+
+
+def _beyond_ports(spec: RosProxySpec, bounds: Bounds) -> Iterator[str]:
+    """The same of its hostPorts."""
+    if spec.ports > bounds.max_ports:
+        fewer = f"ask for {bounds.max_ports} at most"
+        yield _refused("spec.ports", spec.ports, fewer, "allow.maxPorts")
+    if not within(spec.window, bounds.window):
+        inside = f"choose one within {bounds.window}"
+        yield _refused("spec.portWindow", str(spec.window), inside, "allow.portWindow")
+    if spec.master.publish and spec.master.publish not in bounds.window:
+        inside = f"choose one of {bounds.window}"
+        yield _refused("spec.master.publish", spec.master.publish, inside, "allow.portWindow")
 
 
 def _refused(field: str, value: object, fix: str, allowing: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from rosproxy.leases.ports import PortRange
 from rosproxy_operator.kubernetes.planner.bounds import may_name, objection, within_bounds
 from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, MasterSpec, Name
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
@@ -35,6 +36,9 @@ def bounded(**bounds: Any) -> ClusterSettings:
     return replace(OWN, bounds=Bounds(**bounds))
 
 
+NARROW = bounded(window=PortRange(12000, 12999))
+
+
 def asks(settings: ClusterSettings = OWN, **changes: Any) -> str:
     return objection(rosproxy(**changes), {}, settings)
 
@@ -51,6 +55,16 @@ def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, 
         (bounded(max_ports=8), {"ports": 8}, ""),
         (bounded(max_ports=8), {"ports": 9}, "spec.ports: 9 is not what the operator allows: ask "
          "for 8 at most, or have its administrator allow it (chart value allow.maxPorts)"),
+        (OWN, {"window": PortRange(1024, 65535)}, ""),
+        (NARROW, {"window": PortRange(12000, 12999)}, ""),
+        (NARROW, {"window": PortRange(11999, 12100)}, "spec.portWindow: '11999-12100' is not what "
+         "the operator allows: choose one within 12000-12999, or have its administrator allow it "
+         "(chart value allow.portWindow)"),
+        (NARROW, {"window": PortRange(12900, 13000)}, "allow.portWindow"),
+        (NARROW, {"window": PortRange(12000, 12100), "master": MasterSpec("http://robot:11311",
+         publish=13000)}, "spec.master.publish: 13000 is not what the operator allows: choose one"),
+        (NARROW, {"window": PortRange(12000, 12100), "master": MasterSpec("http://robot:11311",
+         publish=12500)}, ""),
         (OWN, {"data_plane": "splice"}, ""),
         (OWN, {"data_plane": "kernel"}, "spec.dataPlane: 'Kernel' is not what the operator allows: "
          "choose Auto or Splice or Copy, or have its administrator allow it (chart value "

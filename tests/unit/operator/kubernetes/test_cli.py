@@ -42,6 +42,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
         "--allow-master=http://192.0.2.*:11311",
         "--allow-master=http://robot:11311",
         "--max-ports=64",
+        "--allow-port-window=11400-19999",
         "--allow-data-plane=auto",
         "--allow-data-plane=kernel",
         "--allow-image=registry.example/*",
@@ -73,6 +74,7 @@ def test_all_options(given: list[KubernetesSettings]) -> None:
     assert settings.plan.bounds == Bounds(
         masters=("http://192.0.2.*:11311", "http://robot:11311"),
         max_ports=64,
+        window=PortRange(11400, 19999),
         data_planes=("auto", "kernel"),
         images=("registry.example/*",),
         slave_control="master",
