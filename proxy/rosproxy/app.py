@@ -51,6 +51,7 @@ from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
+from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 from rosproxy.settings import SettingError, Settings
 
 log = logging.getLogger(__name__)
@@ -139,6 +140,7 @@ class App:
             self._judge,
             self._matchmaker,
             self._enforcer,
+            ServiceFinder(context),
         )
         guard, what = self._callers.refusal, "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, what, guard)

@@ -168,3 +168,28 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     for other in others:
         assert (await other.publish(proxy.master))[0] == 1
     assert (await greet((host, lease + 2), topic_header()))["callerid"] != "/a"
+
+
+async def test_what_a_rule_may_deny_goes_through_the_proxy(make_proxy, make_node, kernel):
+    rules = "deny publish /other by /b*; deny serve /x by /c*"
+    proxy = await make_proxy(data_plane="kernel", policy=rules, linger=60.0)
+    nodes = [await make_node(name) for name in ("/a", "/b", "/c")]
+    for node in nodes:
+        await node.publish(proxy.master)
+    ports = [(await ask(proxy, node))[1] for node in nodes]
+    assert [port == proxy.endpoint(n).port for port, n in zip(ports, nodes, strict=True)] == [
+        False,
+        True,
+        True,
+    ]
+    fast = proxy.endpoint(nodes[0]).fast_port
+    await until(lambda: fast in kernel.forwards, "the kernel forwards it")
+    layer = {"name": "more", "rules": ["deny publish /other"]}
+    assert (await tell(proxy, "/policy", layers=[layer]))["hidden"] == 0
+    assert proxy.endpoint(nodes[0]).fast_port is None
+    await until(lambda: fast not in kernel.forwards, "the kernel forwards it no longer")
+    await until(lambda: kernel.forgotten, "its connections are cut")
+    assert (await ask(proxy, nodes[0]))[1] == proxy.endpoint(nodes[0]).port
+    await proxy.restart()
+    await until(lambda: len(proxy.app.context.registry) == 3, "the nodes are found again")
+    assert proxy.endpoint(nodes[1]).fast_port is None

@@ -1,9 +1,12 @@
 """Policy: what is denied is hidden outside, unchanged inside, and refused where it is asked for."""
 
 import json
+from xmlrpc.client import Binary
 
 import pytest
 
+from examples.demo.fake_node import echo
+from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.admin_calls import post, tell
 from tests.integration.net import (
     NODE,
@@ -256,6 +259,50 @@ async def test_a_denied_topic_is_refused_outside_and_served_to_neighbours(make_p
         assert (await read_header(wire))["callerid"] == "/talker"
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"topic ": "/chatter"},
+        {"topic": "/odom", " topic": "/chatter"},
+        {"topic": "/chatter", " topic": "/odom"},
+        {"topic": "/chatter", "service": "/other"},
+        {"service ": "/secret"},
+    ],
+)
+async def test_no_spelling_of_a_header_gets_around_a_rule(make_proxy, make_node, fields):
+    proxy = await make_proxy(policy="deny publish /chatter; deny serve /secret")
+    talker = await make_node("/talker")
+    await talker.publish(proxy.master)
+    await talker.publish(proxy.master, "/odom")
+    header = encode_header({"callerid": "/outside", "md5sum": "*", "type": "*", **fields})
+    assert (await greet(proxy.lease(talker), header))["error"]
+    assert talker.headers == []
+
+
+async def test_udpros_is_refused_where_topics_may_be_denied(make_proxy, make_node):
+    """Its offer names a topic of its own, which roscpp believes."""
+    proxy = await make_proxy(policy="deny publish /chatter by /talker")
+    talker, other = await make_node("/talker"), await make_node("/other", OTHER_NODE)
+    for node in (talker, other):
+        await node.publish(proxy.master, "/odom")
+    offer = [["UDPROS", Binary(b"topic=/chatter"), "h", 1, 1500]]
+    reply = await rpc(proxy.uri(talker), "requestTopic", "/x", "/odom", offer)
+    assert (reply[0], "only TCPROS" in reply[1]) == (-1, True)
+    assert (await rpc(proxy.uri(other), "requestTopic", "/x", "/odom", offer))[0] == 1
+
+
+async def test_a_uri_of_the_proxys_own_gets_around_no_rule(make_proxy, master, make_node):
+    proxy = await make_proxy(policy="deny publish /chatter")
+    talker = await make_node("/talker")
+    await talker.publish(proxy.master, "/odom")
+    own = proxy.uri(talker)
+    relayed = f"http://{PROXY}:{proxy.endpoint(talker).port}/"
+    for uri in (own, relayed):
+        reply = await talker.call(proxy.master, "registerPublisher", "/chatter", "*", uri)
+        assert (reply[0], "deny publish" in reply[1]) == (-1, True)
+    assert master.holds("publishers", "/chatter") == []
+
+
 async def test_a_denied_service_and_method_are_refused_outside(make_proxy, make_node):
     proxy = await make_proxy(policy="deny serve /add; deny slave getBus* by /spy")
     server = await make_node("/server")
@@ -385,6 +432,29 @@ async def test_a_restarted_proxy_knows_what_is_hidden(make_proxy, master, make_n
     await until(lambda: len(proxy.app.status()["policy"]["hidden"]) == 2, "the subscriber, too")
     assert master.holds("publishers", "/chatter") == []
     assert master.holds("subscribers", "/far") == []
+
+
+async def test_a_restarted_proxy_asks_nodes_for_hidden_services(make_proxy, make_node):
+    proxy = await make_proxy(policy="deny serve *", **PATIENT)
+    server, client = await make_node("/server"), await make_node("/client", OTHER_NODE)
+
+    async def answer(node, reader, writer, header):
+        if header.get("service") == "/add":
+            await echo(node, reader, writer, header)
+        else:
+            writer.write(encode_header({"error": "no such service"}))
+
+    server.stream = answer
+    await server.publish(proxy.master, "/rosout")
+    await server.serve(proxy.master)
+    await proxy.restart()
+
+    async def finds():
+        return (await client.call(proxy.master, "lookupService", "/add"))[2] == server.service_api
+
+    assert (await client.call(proxy.master, "lookupService", "/sub"))[0] == -1
+    await until(finds, "the service is found again")
+    assert (await greet(proxy.lease(server), service_header()))["error"]
 
 
 async def test_a_restart_with_stricter_rules_takes_back(make_proxy, master, make_node):

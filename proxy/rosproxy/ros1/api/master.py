@@ -38,6 +38,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
 from rosproxy.ros1.upkeep.recovery import Recovery
+from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 
 
 @dataclass(slots=True, eq=False)
@@ -52,6 +53,7 @@ class MasterApi:
     _judge: PolicyJudge
     _matchmaker: Matchmaker
     _enforcer: PolicyEnforcer
+    _services: ServiceFinder
 
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
@@ -70,7 +72,7 @@ class MasterApi:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        if method == MULTICALL and self._judge.judges_parameters(None):
+        if method in (MULTICALL, "getParamNames") and self._judge.judges_parameters(None):
             return None
         return _watch(method, size)
 
@@ -96,6 +98,7 @@ class MasterApi:
         """The reply to a request that was read; what needs no change passes untouched."""
         if not request.plain:
             await self._recovery.ensure()
+            await self._services.find_for(request)
         replies = await self._judge.judge_request(request)
         if request.plain and not any(replies) and not self._judge.has_to_read_reply(request):
             return await self._context.upstream.pass_to_master(request.body)

@@ -11,7 +11,6 @@ from collections.abc import Awaitable
 from functools import partial
 from typing import TypeVar
 
-from rosproxy.access.rules import RuleKind
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
@@ -142,8 +141,11 @@ class SlaveApi:
         if too_long := too_long_to_ask(parsed):
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
-        if parsed.method == "requestTopic" and (denied := self._deny_topic(endpoint, parsed, call)):
-            return denied
+        if parsed.method == "requestTopic":
+            denied = self._judge.outside_may_not_ask(parsed, endpoint, call.source)
+            if denied is not None:
+                self._context.metrics.count("slave", parsed.method, "refused")
+                return xmlrpc.dump_reply(denied)
         reply = self._forward(endpoint, parsed, body, call)
         return await counted(self._context.metrics, "slave", parsed.method, reply)
 
@@ -151,17 +153,6 @@ class SlaveApi:
         """The reply to a call that its caller may not make."""
         self._context.metrics.count("slave", method, "refused")
         return xmlrpc.dump_reply([-1, f"rosproxy: {why}", 0])
-
-    def _deny_topic(
-        self, endpoint: Endpoint, parsed: xmlrpc.Call, call: IncomingCall
-    ) -> bytes | None:
-        """The reply to requestTopic for a topic that outside may not have; None if it may."""
-        topic, caller_id = parsed.string(1) or "", parsed.string(0) or ""
-        why = self._judge.outside_may_not(RuleKind.PUBLISH, topic, endpoint, call.source, caller_id)
-        if why is None:
-            return None
-        self._context.metrics.count("slave", parsed.method, "refused")
-        return xmlrpc.dump_reply(policing.no_publisher(topic, why))
 
     async def _forward(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes, call: IncomingCall

@@ -1,10 +1,11 @@
 """Asking a node who it is: does it answer, as which process, with which topics, on which port?
 
-There are three questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over.
+There are four questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over.
 `NodeClient.inspect` has the node describe itself; whoever is about to believe what somebody else
 said of a node (the master after a restart, an operator, the node's former process) inspects it
 first. `NodeClient.name` asks what it is called, before it is registered for somebody who calls from
-another address. All only ask: what follows for the endpoint is decided in `upkeep`.
+another address, and `NodeClient.provider` whether it has a service. All only ask: what follows for
+the endpoint is decided in `upkeep`.
 """
 
 import asyncio
@@ -81,6 +82,10 @@ class NodeClient:
             return None
         except MasterError:
             return await self._name_by_tcpros(where, service)
+
+    async def provider(self, where: HostPort, service: str) -> str | None:
+        """The name of the node with a TCPROS server, if it has a service; None if it has not."""
+        return await self._greet(where, {"service": service})
 
     async def _name_by_tcpros(self, where: HostPort, service: tuple[str, int] | None) -> str | None:
         try:

@@ -30,8 +30,9 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 def decode_header(body: bytes) -> dict[str, str]:
     """The fields of a header, given without its leading total length.
 
-    Raises HeaderError if a field's length leads outside the body, a field has no ``=`` or there are
-    more than MAX_FIELDS.
+    Names come without blanks around them, as rospy reads them (rosgraph/network.py); roscpp keeps
+    the blanks. So that all see the same, none may be there twice. Raises HeaderError if one is, if
+    a field's length leads outside the body, a field has no ``=`` or there are more than MAX_FIELDS.
     """
     fields, position = dict[str, str](), 0
     while position < len(body):
@@ -46,6 +47,9 @@ def decode_header(body: bytes) -> dict[str, str]:
         name, equals, value = body[start:position].decode("utf-8", "replace").partition("=")
         if not equals:
             raise HeaderError("connection header has a field without '='")
+        name = name.strip()
+        if name in fields:
+            raise HeaderError("connection header has a field twice")
         fields[name] = value
     return fields
 

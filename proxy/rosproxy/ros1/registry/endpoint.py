@@ -113,6 +113,8 @@ class Endpoint:
     settles_at: float = 0.0
     fast_port: int | None = None
     fast_peers: Mapping[str, int] = field(default_factory=dict)
+    restored: bool = False
+    """Whether a former process of the proxy knew it, which may have known more of it."""
 
     def mark_alive(self, pid: int | None, tcpros_port: int | None, now: float) -> None:
         """Take in what its node has said of itself: it is served, and what it registered holds."""

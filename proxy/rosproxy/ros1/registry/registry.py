@@ -86,7 +86,7 @@ class Registry:
         if HostPort(place.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
         endpoint = self._add(uri, node, place, port, place.address)
-        endpoint.trusted = False
+        endpoint.trusted, endpoint.restored = False, True
         self._admit(endpoint, uri, place.address)
         return endpoint
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc.document import Call
+from rosproxy.ros1.registry.graph import read_types
 from rosproxy.ros1.registry.registry import Registry
 
 METHODS = frozenset({"getPublishedTopics", "getTopicTypes", "getSystemState"})
@@ -24,15 +25,11 @@ def completed(call: Call, said: Any, registry: Registry) -> Any:
             return said
         pairs = zip(_TABLES, said, strict=True)
         return [_with_nodes(table, kind, registry) for kind, table in pairs]
-    kinds = [Kind.PUBLISHER]
-    below = ""
-    if call.method == "getTopicTypes":
-        kinds.append(Kind.SUBSCRIBER)
-    else:
-        below = call.string(1) or ""
-    known = {row[0] for row in said if isinstance(row, list) and row}
-    types = _types(kinds, registry)
-    prefix = f"{below.rstrip('/')}/" if below else ""
+    kinds, prefix = [Kind.PUBLISHER, Kind.SUBSCRIBER], ""
+    if call.method == "getPublishedTopics":  # of a namespace, if it names one
+        kinds, namespace = kinds[:1], call.string(1) or ""
+        prefix = f"{namespace.rstrip('/')}/" if namespace else ""
+    known, types = read_types(said), _types(kinds, registry)
     return said + [
         [topic, type_]
         for topic, type_ in sorted(types.items())

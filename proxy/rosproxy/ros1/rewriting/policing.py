@@ -117,6 +117,12 @@ def no_publisher(topic: str, reason: str) -> list[object]:
     return [-1, f"Not a publisher of [{topic}] (rosproxy: {reason})", []]
 
 
+def offers_tcpros_alone(call: Call) -> bool:
+    """Whether a requestTopic offers no other protocol than TCPROS."""
+    offers = call.params[2].items if len(call.params) > 2 else []
+    return all(offer.items and offer.items[0].string() == "TCPROS" for offer in offers)
+
+
 def publishers_for(
     endpoint: Endpoint | None, topic: str, at_master: Sequence[str], addressing: Addressing
 ) -> list[str]:

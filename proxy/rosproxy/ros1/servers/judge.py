@@ -92,12 +92,15 @@ class PolicyJudge:
             return admission
         if found.unregisters:
             return self._judge_end(held, call, asker) or admission
-        if not isinstance(admission, Endpoint) or held.kind is Kind.PARAM:
+        if held.kind is Kind.PARAM:  # judged before
             return admission
+        address = admission.address if isinstance(admission, Endpoint) else asker.address
         kind, callers = policing.KINDS[held.kind], [held.caller_id]
-        verdict = self._policy.ask(kind, held.name, callers, admission.address)
+        verdict = self._policy.ask(kind, held.name, callers, address)
         if verdict.allowed:
             return admission
+        if not isinstance(admission, Endpoint):
+            return _refused(verdict)  # a URI of somebody else, whom the proxy could not hide
         concealed = replace(held, hidden=True)
         return policing.hidden_registration(concealed, admission, asker, self._addressing)
 
@@ -136,6 +139,22 @@ class PolicyJudge:
                     return verdict.reason
         return None
 
+    def outside_may_not_ask(
+        self, call: Call, endpoint: Endpoint, source: str
+    ) -> list[object] | None:
+        """The ROS triple of requestTopic for what outside may not have; None if it may.
+
+        An offer of UDPROS holds a header of its own, whose topic roscpp serves (topic_manager.cpp,
+        requestTopic): it is refused where anything of the node may be denied.
+        """
+        topic, caller_id = call.string(1) or "", call.string(0) or ""
+        why = self.outside_may_not(RuleKind.PUBLISH, topic, endpoint, source, caller_id)
+        if why is None and not policing.offers_tcpros_alone(call):
+            if self.may_bypass(endpoint) or self._is_inside(source):
+                return None
+            why = "only TCPROS is passed where a policy may deny a topic of the node"
+        return None if why is None else policing.no_publisher(topic, why)
+
     async def outside_may_not_call(
         self, method: str, endpoint: Endpoint, source: str, caller_id: str
     ) -> str | None:
@@ -158,7 +177,8 @@ class PolicyJudge:
         return not self._policy.may_deny(OUTWARDS, endpoint.caller_ids, endpoint.address)
 
     def _is_inside(self, source: str) -> bool:
-        return any(endpoint.address == source for endpoint in self._registry)
+        """Whether a node lives at an address that has been heard itself."""
+        return any(e.address == source and e.trusted for e in self._registry)
 
     async def _judge_call(self, call: Call, asker: Asker) -> LocalReply | None:
         caller_id = call.string(0) or ""

@@ -70,6 +70,8 @@ class TcprosServer:
             fields = decode_header(header[4:])
             if too_long := too_long_to_connect(fields):
                 raise HeaderError(too_long)
+            if "service" in fields and "topic" in fields:
+                raise HeaderError("connection header for a topic and for a service")
         except HeaderError as error:
             await self._refuse(conn, str(error), "bad header")
             return

@@ -84,7 +84,7 @@ class Matchmaker:
             while topic in self._changed:
                 everybody = self._changed.pop(topic)
                 held = hidden.subscribers_inside(self._context.registry, topic)
-                held = [(e, one) for e, one in held if everybody or one.hidden]
+                held = [(e, one) for e, one in held if e.answers and (everybody or one.hidden)]
                 try:
                     await self._hand_out(held)
                 except Unreachable as error:

@@ -51,15 +51,16 @@ class PolicyEnforcer:
     _plane: KernelPlane
     _judge: PolicyJudge
     _enforced: int = -1
+    _again: bool = False
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def look_again(self) -> None:
         """Note that something may have happened by a policy that is no longer in force."""
-        self._enforced = -1
+        self._again = True
 
     async def look(self) -> None:
         """Enforce the policy if that has not been done since it changed."""
-        if self._enforced != self._context.policy.version:
+        if self._again or self._enforced != self._context.policy.version:
             try:
                 await self.enforce()
             except (Unreachable, MasterError) as error:
@@ -68,10 +69,14 @@ class PolicyEnforcer:
     async def enforce(self) -> Enforced:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._one_at_a_time:
-            version = self._context.policy.version
+            version, self._again = self._context.policy.version, False
             cut = self._cut_relays() + self._take_fast_ports()
             await self._recovery.ensure()
-            hidden, shown = await self._registrar.apply_policy()
+            try:
+                hidden, shown = await self._registrar.apply_policy()
+            except (Unreachable, MasterError):
+                self._again = True
+                raise
             self._enforced = version
         done = Enforced(hidden, shown, cut)
         if done != Enforced():

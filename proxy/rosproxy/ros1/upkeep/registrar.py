@@ -20,7 +20,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.rewriting.policing import KINDS
+from rosproxy.ros1.rewriting.policing import KINDS, prefix
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy import registration as policy
 
@@ -189,8 +189,11 @@ class Registrar:
         return len(to_hide), len(alive)
 
     def _verdict(self, endpoint: Endpoint, held: Registration) -> Verdict:
-        judge = self._context.policy.judge
-        return judge(KINDS[held.kind], held.name, [held.caller_id], endpoint.address)
+        policy, kind, address = self._context.policy, KINDS[held.kind], endpoint.address
+        verdict = policy.judge(kind, held.name, [held.caller_id], address)
+        if held.kind is Kind.PARAM and verdict.allowed:
+            return policy.judge_below(kind, prefix(held.name), held.caller_id, address)
+        return verdict
 
     async def _conceal(self, held: Sequence[Held]) -> None:
         """Hide registrations, and take back what the master has of them. Raises Unreachable.
