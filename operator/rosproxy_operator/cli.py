@@ -25,7 +25,7 @@ from rosproxy.cli.options import (
     setting_errors,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
-from rosproxy_operator.common.options import policy_options
+from rosproxy_operator.common.options import policy_options, proxy_bound_options
 from rosproxy_operator.docker.options import bound_options
 from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
 from rosproxy_operator.docker.settings import (
@@ -145,6 +145,7 @@ def main() -> None:
     help="How proxies forward topics. kernel: they get the capability NET_ADMIN for it.",
 )
 @bound_options
+@proxy_bound_options
 @policy_options
 @click.option(
     "--expose-by-default",
@@ -279,6 +280,7 @@ def plan(settings: PlanSettings) -> None:
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
 @administrators_options
+@proxy_bound_options
 @policy_options
 @own_options
 @_resync_option

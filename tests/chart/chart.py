@@ -68,6 +68,7 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "proxy": {
                 "image": {"repository": "mine/proxy", "tag": "9", "pullPolicy": "Always"},
                 "slaveControl": "Master",
+                "bounds": {"maxBuffered": 16, "maxConnectionsPerLease": 1000000},
                 "networkPolicy": {"metricsFrom": [{"podSelector": {"matchLabels": {"a": "b"}}}]},
             },
             "allow": {

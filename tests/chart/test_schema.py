@@ -18,6 +18,7 @@ BAD: list[tuple[Json, str]] = [
     ({"image": {"pullPolicy": "Sometimes"}}, "image/pullPolicy"),
     ({"proxy": {"image": {"pullPolicy": "never"}}}, "proxy/image/pullPolicy"),
     ({"proxy": {"slaveControl": "master"}}, "proxy/slaveControl"),
+    ({"proxy": {"bounds": {"maxConnectionsPerLease": 8}}}, "proxy/bounds/maxConnectionsPerLease"),
     ({"proxy": {"networkPolicy": {"metricsFrom": [{"pods": {}}]}}}, "metricsFrom/0"),
     ({"proxy": {"networkPolicy": {"metricsFrom": [{}]}}}, "metricsFrom/0"),
     ({"policy": {"rules": "deny publish *"}}, "policy/rules"),

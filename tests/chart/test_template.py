@@ -13,6 +13,7 @@ from rosproxy import __version__
 from rosproxy.access.layers import PolicyMode
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.cli import main
+from rosproxy_operator.common.proxy_bounds import ProxyBounds
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.settings import (
     Bounds,
@@ -119,6 +120,8 @@ def check_bounds(settings: KubernetesSettings, values: Json, pod: Json) -> None:
     (args,) = (one["args"] for one in pod["containers"])
     tested = [one.partition("=")[2] for one in args if re.search("--allow-master=.*-test[.]", one)]
     assert len(tested) == bool(allow)
+    expected = ProxyBounds(max_buffered=16, max_connections_per_lease=1_000_000)
+    assert settings.plan.proxy_bounds == (expected if allow else ProxyBounds())
     policy = [(str(rule), layer.mode) for layer in settings.plan.policy for rule in layer.rules]
     assert policy == [("deny publish /camera/* by /driver", PolicyMode.AUDIT)] * bool(allow)
     assert settings.plan.bounds == Bounds(

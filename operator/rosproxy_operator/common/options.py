@@ -2,7 +2,8 @@
 
 import click
 
-from rosproxy.cli.options import POLICY_RULES, Command, with_options
+from rosproxy.cli.options import CONNECTIONS, MEBIBYTES, POLICY_RULES, Command, with_options
+from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS
 
 _POLICY = (
     click.option(
@@ -19,6 +20,39 @@ _POLICY = (
         help="Whether that is enforced, or the proxies only tell what it would deny.",
     ),
 )
+
+
+_BOUNDS = (
+    click.option(
+        "--proxy-max-buffered",
+        type=MEBIBYTES,
+        default=OWN_BOUNDS.max_buffered,
+        help="Memory of each proxy for calls and replies that are read.",
+    ),
+    click.option(
+        "--proxy-max-body",
+        type=MEBIBYTES,
+        default=OWN_BOUNDS.max_body,
+        help="Longest parameter that passes a proxy.",
+    ),
+    click.option(
+        "--proxy-max-connections-per-source",
+        type=CONNECTIONS,
+        default=OWN_BOUNDS.max_connections_per_source,
+        help="Connections of one address to a proxy.",
+    ),
+    click.option(
+        "--proxy-max-connections-per-lease",
+        type=CONNECTIONS,
+        default=OWN_BOUNDS.max_connections_per_lease,
+        help="Connections to one port of a proxy.",
+    ),
+)
+
+
+def proxy_bound_options(command: Command) -> Command:
+    """What each proxy may take."""
+    return with_options(command, _BOUNDS)
 
 
 def policy_options(command: Command) -> Command:

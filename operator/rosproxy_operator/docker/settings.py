@@ -13,6 +13,7 @@ from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import SettingError, read_master_uri
 from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.common.proxy_bounds import make_proxy_bounds
 from rosproxy_operator.docker.planner.model import PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
@@ -31,9 +32,9 @@ def make_plan_settings(options: Mapping[str, Any]) -> PlanSettings:
 
     Raises SettingError if they don't go together.
     """
-    named = {field.name: options[field.name] for field in fields(PlanSettings)}
     policy = administrators_policy(options["policy"], options["policy_mode"])
-    settings = PlanSettings(**{**named, "policy": policy})
+    every = {**options, "policy": policy, "proxy_bounds": make_proxy_bounds(options)}
+    settings = PlanSettings(**{field.name: every[field.name] for field in fields(PlanSettings)})
     window, ports = settings.port_window, settings.ports
     if len(window) < ports:
         raise SettingError("--port-window", f"{window} has {len(window)} ports, --ports is {ports}")

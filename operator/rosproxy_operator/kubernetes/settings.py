@@ -13,6 +13,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import DataPlane, SettingError
 from rosproxy_operator.common.policy import administrators_policy
+from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds, make_proxy_bounds
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.spec import MOST_PORTS
 from rosproxy_operator.kubernetes.resources.values import is_label, is_subdomain
@@ -53,7 +54,8 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     ``ephemeral`` the range from which the nodes' kernels take ports for connections: no hostPort
     is taken from either. ``network_policy``: whether RosProxies get one; ``admin_from`` are the
     NetworkPolicyPeers that it lets reach the proxies' admin endpoints, everybody if it is None.
-    ``policy`` is the administrator's, for all proxies: one layer or none.
+    ``proxy_bounds`` are what each proxy may take, ``policy`` is the administrator's, for all
+    proxies: one layer or none.
     """
 
     image: str = "rosproxy:latest"
@@ -63,6 +65,7 @@ class ClusterSettings(msgspec.Struct, frozen=True):
     bounds: Bounds = Bounds()
     network_policy: bool = True
     admin_from: tuple[Json, ...] | None = None
+    proxy_bounds: ProxyBounds = OWN_BOUNDS
     policy: tuple[PolicyLayer, ...] = ()
 
 
@@ -121,6 +124,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
             ),
             network_policy=options["network_policy"],
             admin_from=options["admin_from"],
+            proxy_bounds=make_proxy_bounds(options),
             policy=administrators_policy(options["policy"], options["policy_mode"]),
         ),
         namespaces=tuple(dict.fromkeys(options["namespace"])),

@@ -8,6 +8,7 @@ from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import DataPlane, SlaveControl
+from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
 """States of a container, in the engine's words, in which it is or may soon be somebody's node."""
@@ -40,7 +41,8 @@ class PlanSettings:
     (docs/performance.md): 32 MiB and 50 KiB for each in the process, 64 MiB of pipes and, where the
     kernel counts them in, 0.7 MiB of socket buffers for each; two threads for each.
 
-    ``policy`` is the administrator's, for all proxies: one layer or none.
+    ``proxy_bounds`` are what else each may take, ``policy`` is the administrator's, for all
+    proxies: one layer or none.
 
     ``secret`` is what the proxies' tokens are made of; empty: the one that the uplink network has.
     """
@@ -61,6 +63,7 @@ class PlanSettings:
     slave_control: SlaveControl = "any"
     proxy_memory: int = GIBIBYTE
     proxy_pids: int = 8192
+    proxy_bounds: ProxyBounds = OWN_BOUNDS
     policy: tuple[PolicyLayer, ...] = ()
     secret: str = field(default="", repr=False)
 

@@ -16,6 +16,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import SettingError, hash_token, parse_range
 from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
+from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
 
@@ -206,6 +207,7 @@ def container_config(
         "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
+        **bound_variables(settings.proxy_bounds),
         POLICY_VARIABLE: as_variable((*settings.policy, *made.policy)),
     }
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}

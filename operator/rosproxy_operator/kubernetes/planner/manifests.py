@@ -10,6 +10,7 @@ import msgspec
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
+from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.kubernetes.planner.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
@@ -261,6 +262,7 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
+        **bound_variables(settings.proxy_bounds),
         POLICY_VARIABLE: as_variable(policy_of(site.rosproxy, settings)),
     }
     return {name: value for name, value in variables.items() if value}
