@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.access.rules import format_rules
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.settings import SettingError
-from tests.run_options import parse_settings
+from tests.run_options import parse_settings, settings_of
 
 GIVEN: dict[str, Any] = {
     "master_uri": "http://robot:11311",
@@ -175,3 +176,30 @@ def test_any_text_is_accepted_or_refused_in_one_line(name: str, text: str) -> No
     except SettingError as error:
         message = str(error)
     assert len(message.splitlines()) <= 1
+
+
+def test_policy_comes_from_a_variable_as_one_text() -> None:
+    settings = settings_of(
+        {
+            "ROS_MASTER_URI": "http://robot:11311",
+            "ROSPROXY_ADVERTISE_HOST": "host",
+            "ROSPROXY_POLICY": "allow publish /a/* ; deny publish * by /b\n# no more",
+            "ROSPROXY_POLICY_MODE": "audit",
+            "ROSPROXY_POLICY_LAYERS": '[{"name": "web", "rules": ["deny serve *"]}]',
+        }
+    )
+    (own,), (told,) = settings.policy, settings.policy_layers
+    assert (own.name, own.mode.value) == ("--policy", "audit")
+    assert format_rules(own.rules) == "allow publish /a/*; deny publish * by /b"
+    assert (told.name, format_rules(told.rules)) == ("web", "deny serve *")
+
+
+def test_too_many_rules_are_refused() -> None:
+    with pytest.raises(SettingError, match="1001 rules in all layers"):
+        parse_settings(
+            {
+                "master_uri": "http://robot:11311",
+                "advertise_host": "host",
+                "policy": "deny serve *;" * 1001,
+            }
+        )

@@ -15,6 +15,7 @@ from rosproxy.access.layers import (
     decide,
     decide_below,
     may_deny,
+    of_kind,
     strictest,
 )
 from rosproxy.access.rules import RuleKind
@@ -42,6 +43,7 @@ class AccessPolicy:
         self._metrics, self._refusals = metrics, refusals
         self._own, self._told = tuple(own), tuple(told)
         self._file = tuple[PolicyLayer, ...]()
+        self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version = 0
 
     @property
@@ -52,19 +54,21 @@ class AccessPolicy:
     def use_file(self, layer: PolicyLayer) -> None:
         """Take in what the file says now. Raises ValueError if that is too much."""
         bounded((*self._own, layer, *self._told))
-        self._file, self.version = (layer,), self.version + 1
+        self._file = (layer,)
+        self._note_change()
 
     def use_told(self, layers: Sequence[PolicyLayer]) -> None:
         """Take in what an operator says now. Raises ValueError if that is too much."""
         bounded((*self._own, *self._file, *layers))
-        self._told, self.version = tuple(layers), self.version + 1
+        self._told = tuple(layers)
+        self._note_change()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
         """Whether a thing is allowed to all of the callers at a node inside; nobody is told.
 
         What only some of them may not have is denied: nobody can tell them apart at one URI.
         """
-        layers = self.layers
+        layers = self._about(kind)
         return strictest([decide(layers, kind, name, one, address) for one in callers or ("",)])
 
     def ask(
@@ -82,7 +86,7 @@ class AccessPolicy:
 
     def judge_below(self, kind: RuleKind, prefix: str, caller: str, address: str) -> Verdict:
         """Whether all is allowed whose name begins with a prefix; nobody is told."""
-        return decide_below(self.layers, kind, prefix, caller, address)
+        return decide_below(self._about(kind), kind, prefix, caller, address)
 
     def tell(self, verdict: Verdict, kind: RuleKind, what: str, source: str) -> Verdict:
         """Tell of a verdict, if a rule denies or would deny."""
@@ -103,3 +107,13 @@ class AccessPolicy:
         ``address`` is that of the node inside; None: any.
         """
         return may_deny(self.layers, kinds, callers, address)
+
+    def _note_change(self) -> None:
+        self._by_kind.clear()
+        self.version += 1
+
+    def _about(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
+        """The layers with their rules of one kind; those without any are left out."""
+        if kind not in self._by_kind:
+            self._by_kind[kind] = of_kind(self.layers, kind)
+        return self._by_kind[kind]

@@ -101,6 +101,12 @@ def decide_below(
     )
 
 
+def of_kind(layers: Iterable[PolicyLayer], kind: RuleKind) -> tuple[PolicyLayer, ...]:
+    """Layers with their rules of one kind alone, which decide the same for that kind."""
+    rules = [(layer, tuple(rule for rule in layer.rules if rule.kind is kind)) for layer in layers]
+    return tuple(msgspec.structs.replace(layer, rules=mine) for layer, mine in rules if mine)
+
+
 def strictest(verdicts: Iterable[Verdict]) -> Verdict:
     """The one of some verdicts that counts: a denial, else what would be denied."""
     return min(verdicts, key=lambda one: (one.allowed, one.rule is None))

@@ -55,6 +55,9 @@ BAD = {
     "linger": ["-1", "x"],
     "master_interval": ["0", "x"],
     "slave_control": ["none", "MASTER"],
+    "policy": ["deny", "deny publish camera", "allow publish /a; deny it"],
+    "policy_mode": ["off"],
+    "policy_layers": ["{", "{}", '[{"name": "a"}]', "[" * 100_000],
     "log_format": ["xml"],
     "log_level": ["loud"],
 }
@@ -143,6 +146,9 @@ def test_check_accepts_good_values_from_the_command_line_and_the_environment():
         "linger": "0",
         "master_interval": "1",
         "slave_control": "master",
+        "policy": "allow publish /odom; deny publish *",
+        "policy_mode": "audit",
+        "policy_layers": '[{"name": "web", "rules": ["deny serve *"], "mode": "enforce"}]',
         "log_format": "json",
         "log_level": "DEBUG",
     }

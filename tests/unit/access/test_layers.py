@@ -78,6 +78,14 @@ def test_what_is_denied_may_be(found: list[PolicyLayer], kind: RuleKind, name: s
         assert may_deny(found, [kind], ["/b", "/a"], "10.0.0.1")
 
 
+@given(st.lists(LAYERS, max_size=3), st.sampled_from(RuleKind), NAMES)
+def test_rules_of_other_kinds_decide_nothing(
+    found: list[PolicyLayer], kind: RuleKind, name: str
+) -> None:
+    mine = layers.of_kind(found, kind)
+    assert decide(mine, kind, name, "/a", "10.0.0.1") == decide(found, kind, name, "/a", "10.0.0.1")
+
+
 def test_an_allow_list_lets_its_namespaces_be_read() -> None:
     found = [layer("allow get-param /arm/*; allow get-param /arm; deny get-param *")]
     kind = RuleKind.GET_PARAM

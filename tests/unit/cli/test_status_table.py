@@ -202,3 +202,23 @@ def test_why_a_node_is_not_forwarded_is_told_where_others_are() -> None:
     text = planes(node, plane="splice", reason="nft is not installed")
     assert "topics   relayed by the proxy (splice): nft is not installed" in text
     assert "not used" not in text
+
+
+def test_the_policy_and_what_it_hides() -> None:
+    status = make_status()
+    status["policy"] = {
+        "layers": [
+            {"name": "--policy", "mode": "enforce", "rules": ["deny publish /a", "deny serve *"]},
+            {"name": "trial\x1b", "mode": "audit", "rules": ["deny slave *"]},
+        ],
+        "hidden": [
+            {"kind": "publish", "name": f"/t{i}", "node": "/n", "reason": "policy of --policy"}
+            for i in range(21)
+        ],
+    }
+    lines = shown(status, 120).split("\n")
+    head = "policy   --policy: 2 rules, trial\\x1b: 1 rule (audit only); 21 names hidden"
+    assert head in lines
+    start = lines.index("hidden from outside:")
+    assert lines[start + 1] == "  publish /t0 of /n  policy of --policy"
+    assert lines[start + 21] == "    … 1 name more: rosproxy status --json"

@@ -40,13 +40,14 @@ def subscribers_inside(registry: Registry, topic: str) -> list[Held]:
 
 def service(registry: Registry, name: str) -> Endpoint | None:
     """The node that has a hidden service."""
-    return next(iter(registry.hidden.get((Kind.SERVICE, name), {}).values()), None)
+    found = _living(registry.hidden.get((Kind.SERVICE, name), {}).values())
+    return found[0] if found else None
 
 
 def node(registry: Registry, caller_id: str) -> Endpoint | None:
     """The node of a name of which the master knows nothing at all."""
     endpoint = registry.by_caller.get(caller_id)
-    if endpoint is None:
+    if endpoint is None or endpoint.health.cleaned:
         return None
     held = [one for one in endpoint.registrations.values() if one.caller_id == caller_id]
     return endpoint if all(one.hidden for one in held) else None

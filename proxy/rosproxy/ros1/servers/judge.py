@@ -197,7 +197,8 @@ class PolicyJudge:
 
     def _judge_lookup(self, call: Call, asker: Asker, caller_id: str) -> LocalReply | None:
         name = second_name(call)
-        if name in self._registry.services:
+        known = self._registry.services.get(name)
+        if known and not known[0].health.cleaned:
             return policing.hidden_service(call, asker, self._addressing)
         verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], asker.address)
         return None if verdict.allowed else policing.no_provider(verdict.reason)

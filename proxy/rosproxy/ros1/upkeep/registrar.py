@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 Former = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
+JUDGED_AT_ONCE = 100
+"""Registrations that the policy is asked about before others have their turn: rules may be many."""
 SETTLE_TIME = 2.0
 """Seconds in which the master's news of a publisher that is registered anew come in."""
 
@@ -178,11 +180,11 @@ class Registrar:
         Raises Unreachable, MasterError.
         """
         to_hide, to_show = list[Held](), list[Held]()
-        for endpoint in self._context.registry:
-            for held in list(endpoint.registrations.values()):
-                if self._verdict(endpoint, held).allowed == held.hidden:
-                    (to_show if held.hidden else to_hide).append((endpoint, held))
-            await asyncio.sleep(0)  # rules are many, and so are registrations
+        for count, (endpoint, held) in enumerate(self._context.registry.registrations(), 1):
+            if self._verdict(endpoint, held).allowed == held.hidden:
+                (to_show if held.hidden else to_hide).append((endpoint, held))
+            if not count % JUDGED_AT_ONCE:
+                await asyncio.sleep(0)
         await self._conceal(to_hide)
         alive = [(e, held) for e, held in to_show if e.answers and not e.health.cleaned]
         await self.register(alive)
