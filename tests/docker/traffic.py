@@ -70,7 +70,7 @@ class Gaps:
 def traffic(
     net: Inside, robot: Robot, network: str, library: str, labels: tuple[str, ...] = (ENABLE,)
 ) -> Iterator[Traffic]:
-    """Twenty messages and five calls a second; calls cost a processor thirty times as much."""
+    """Twenty messages and five calls a second, which cost a processor more."""
     out, back, service = (f"/{unique(what).replace('-', '_')}" for what in ("out", "in", "serve"))
     mark = out.rsplit("_", 1)[1]
     talker = net.node(network, library, "pub", "--topic", out, "--word", "inside",

@@ -59,7 +59,7 @@ class Flow:
 
 @contextmanager
 def flow(net: Namespace, robot: Robot, library: str, on: str = "node1") -> Iterator[Flow]:
-    """Twenty messages and five calls a second; calls cost a processor thirty times as much."""
+    """Twenty messages and five calls a second, which cost a processor more."""
     wait_for_service(net)
     mark = unique("flow").replace("-", "_")
     out, back, service = f"/out_{mark}", f"/in_{mark}", f"/serve_{mark}"
