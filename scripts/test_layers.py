@@ -134,7 +134,7 @@ def effective_capabilities() -> int:
     return 0
 
 
-UNIT = Layer("unit", smoke=ALL)
+UNIT = Layer("unit", smoke=ALL, workers=2)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
 ABUSE = Layer("abuse", obstacle=cgroup_obstacle)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)

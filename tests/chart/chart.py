@@ -142,14 +142,12 @@ def of_kind(found: list[Json], kind: str) -> list[Json]:
     return [one for one in found if one["kind"] == kind]
 
 
-def every_combination() -> Iterator[tuple[str, Values]]:
-    """All combinations of all choices: their names, and the values."""
-    return map(_combined, itertools.product(*OPTIONS.values()))
+def combinations(most: int) -> Iterator[tuple[str, Values]]:
+    """Combinations of choices, as few as it takes for any ``most`` of them to meet.
 
-
-def combinations() -> Iterator[tuple[str, Values]]:
-    """As few of them as it takes for any two choices to meet."""
-    return map(_combined, pairwise())
+    Their names, and the values.
+    """
+    return map(_combined, _covering(most))
 
 
 def _combined(names: tuple[str, ...]) -> tuple[str, Values]:
@@ -157,19 +155,17 @@ def _combined(names: tuple[str, ...]) -> tuple[str, Values]:
     return " ".join(names), merged(*(choices[name] for choices, name in pairs))
 
 
-def pairwise() -> Iterator[tuple[str, ...]]:
-    """Of all combinations always the one next in which most pairs are new, while there are any."""
-    every = list(itertools.product(*OPTIONS.values()))
-    left = set().union(*map(pairs, every))
+def _covering(most: int) -> Iterator[tuple[str, ...]]:
+    """Always the combination next in which most meetings are new, while there are any."""
+    every = {
+        names: set(itertools.combinations(enumerate(names), most))
+        for names in itertools.product(*OPTIONS.values())
+    }
+    left = set().union(*every.values())
     while left:
-        best = max(every, key=lambda names: len(pairs(names) & left))
-        left -= pairs(best)
+        best = max(every, key=lambda names: len(every[names] & left))
+        left -= every[best]
         yield best
-
-
-def pairs(names: tuple[str, ...]) -> set[tuple[tuple[int, str], ...]]:
-    """Any two choices of a combination, with their places."""
-    return set(itertools.combinations(enumerate(names), 2))
 
 
 def merged(*parts: Values) -> Values:

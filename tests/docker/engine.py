@@ -61,12 +61,16 @@ def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
 
 
 def wait_until(true: Callable[[], bool], seconds: float, what: str | Callable[[], str]) -> float:
-    """Wait for something to come true; return the seconds it took."""
+    """Wait for something to come true; return the seconds it took.
+
+    Who has waited long is asked less often: most questions are a program to start.
+    """
     started = time.monotonic()
     while not true():
-        if time.monotonic() > started + seconds:
+        waited = time.monotonic() - started
+        if waited > seconds:
             raise AssertionError(f"not in {seconds} s: {what if isinstance(what, str) else what()}")
-        time.sleep(0.1)
+        time.sleep(min(max(0.1, waited / 20), 0.5))
     return time.monotonic() - started
 
 

@@ -70,7 +70,7 @@ class Gaps:
 def traffic(
     net: Inside, robot: Robot, network: str, library: str, labels: tuple[str, ...] = (ENABLE,)
 ) -> Iterator[Traffic]:
-    """Twenty messages a second both ways, and as many calls."""
+    """Twenty messages and five calls a second, which cost a processor more."""
     out, back, service = (f"/{unique(what).replace('-', '_')}" for what in ("out", "in", "serve"))
     mark = out.rsplit("_", 1)[1]
     talker = net.node(network, library, "pub", "--topic", out, "--word", "inside",
@@ -80,7 +80,8 @@ def traffic(
     names = [f"{role}_{mark}" for role in ("ear", "mouth", "caller")]
     outward = robot.node(names[0], library, "sub", "--topic", out)
     robot.node(names[1], library, "pub", "--topic", back, "--word", "outside")
-    called = robot.node(names[2], library, "call", "--service", service, "--count", "100000")
+    called = robot.node(names[2], library, "call", "--service", service, "--rate", "5",
+                        "--count", "100000")  # fmt: skip
     found = Traffic(talker, listener, server, outward, listener.log, called, ("inside", "outside"))
     try:
         found.wait()

@@ -38,7 +38,7 @@ def restored(_release: None) -> Iterator[None]:
 def every_object() -> list[Json]:
     """Each object of any combination, once."""
     distinct = {json.dumps(one, sort_keys=True): one
-                for _, values in combinations() for one in objects(values)
+                for _, values in combinations(2) for one in objects(values)
                 if one["apiVersion"] not in FOREIGN}  # fmt: skip
     return list(distinct.values())
 

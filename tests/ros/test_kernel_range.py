@@ -27,8 +27,8 @@ def publisher(lab: Lab, library: str) -> tuple[str, str]:
     return name, topic
 
 
-def listen(lab: Lab, library: str, topic: str) -> Process:
-    receiver = lab.node(library, "out", "sub", topic=topic)
+def listen(lab: Lab, topic: str) -> Process:
+    receiver = lab.node("roscpp", "out", "sub", topic=topic)
     receiver.wait_for_count("^got ", 5, LIMIT)
     return receiver
 
@@ -37,14 +37,14 @@ def listen(lab: Lab, library: str, topic: str) -> Process:
 def test_fast_ports_are_given_back_and_connections_under_way_go_on(lab: Lab, library: str) -> None:
     wait_until("the ports are free", lambda: kernel.status(lab)["ports"]["free"] == 4, LIMIT)
     talkers = [publisher(lab, library) for _ in range(2)]
-    receivers = [listen(lab, library, topic) for _, topic in talkers]
+    receivers = [listen(lab, topic) for _, topic in talkers]
     for name, _ in talkers:
         kernel.wait_forwarded(lab, name)
     assert len(kernel.forwarded_ports(lab)) == 2
     assert kernel.status(lab)["ports"] | {"used": 2, "free": 2} == kernel.status(lab)["ports"]
     talkers += [publisher(lab, library) for _ in range(2)]
     assert kernel.forwarded_ports(lab) == []
-    receivers += [listen(lab, library, topic) for _, topic in talkers[2:]]
+    receivers += [listen(lab, topic) for _, topic in talkers[2:]]
     for receiver in receivers:
         kernel.wait_more(receiver, 30)
         got = kernel.numbers(receiver)
@@ -53,7 +53,7 @@ def test_fast_ports_are_given_back_and_connections_under_way_go_on(lab: Lab, lib
         plane = kernel.plane_of(lab, name)
         assert plane["plane"] == "splice"
         assert "is in use" in plane["reason"]
-        listen(lab, library, topic)
+        listen(lab, topic)
     assert kernel.status(lab)["ports"]["free"] == 0
     before = kernel.plane_of(lab, talkers[0][0])
     assert before["connections"] > 0
@@ -66,10 +66,10 @@ def test_a_range_with_room_again_is_used(lab: Lab) -> None:
     name, topic = publisher(lab, "roscpp")
     crowd = [lab.node("roscpp", "c2", "pub", topic=f"/{lab.unique('t')}") for _ in range(3)]
     wait_until("the range is full", lambda: kernel.status(lab)["ports"]["free"] == 0, LIMIT)
-    listen(lab, "roscpp", topic)
+    listen(lab, topic)
     assert kernel.plane_of(lab, name)["plane"] == "splice"
     for node in crowd:
         node.stop()
     wait_until("there is room", lambda: kernel.status(lab)["ports"]["used"] == 1, LIMIT)
-    listen(lab, "roscpp", topic)
+    listen(lab, topic)
     kernel.wait_forwarded(lab, name)

@@ -121,19 +121,18 @@ def test_uris_are_the_same_inside_and_outside(lab: Lab, library: str) -> None:
 
 
 INSIDE_ABOUT_ROBOT = [
-    test_rosnode.test_info_reaches_the_node,
-    test_rosnode.test_ping_is_answered,
-    test_rosnode.test_kill_ends_the_node,
-    test_rosnode.test_cleanup_removes_a_killed_node,
-    test_rosservice.test_info_type_args_and_uri,
-    test_rosservice.test_call_prints_the_answer,
-    test_rostopic.test_info_names_publishers_with_their_address,
-    test_rostopic.test_echo_prints_messages,
+    (test_rosnode.test_info_reaches_the_node, "rospy"),
+    (test_rosnode.test_ping_is_answered, "roscpp"),
+    (test_rosnode.test_kill_ends_the_node, "rospy"),
+    (test_rosnode.test_cleanup_removes_a_killed_node, "roscpp"),
+    (test_rosservice.test_info_type_args_and_uri, "rospy"),
+    (test_rosservice.test_call_prints_the_answer, "roscpp"),
+    (test_rostopic.test_info_names_publishers_with_their_address, "rospy"),
+    (test_rostopic.test_echo_prints_messages, "roscpp"),
 ]
 
 
-@each_library
-@pytest.mark.parametrize("tool", INSIDE_ABOUT_ROBOT, ids=lambda tool: tool.__name__[5:])
+@pytest.mark.parametrize(("tool", "library"), INSIDE_ABOUT_ROBOT)
 def test_tools_inside(lab: Lab, tool: Callable[..., None], library: str) -> None:
     tool(lab, library, "c1", "out")
 

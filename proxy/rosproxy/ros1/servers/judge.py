@@ -71,8 +71,10 @@ class PolicyJudge:
         Those that register are judged once they have an endpoint (`judge_registration`).
         Raises Unreachable.
         """
-        asker = request.asker
-        return [await self._judge_call(call, asker) if call else None for call in request.calls]
+        asker, params = request.asker, _KnownParams(self._upstream)
+        return [
+            await self._judge_call(call, asker, params) if call else None for call in request.calls
+        ]
 
     def judge_long(self, method: str, head: bytes, source: str) -> LocalReply | None:
         """The reply to a long call of which only the head was read; None if it passes."""
@@ -180,7 +182,9 @@ class PolicyJudge:
         """Whether a node lives at an address that has been heard itself."""
         return any(e.address == source and e.trusted for e in self._registry)
 
-    async def _judge_call(self, call: Call, asker: Asker) -> LocalReply | None:
+    async def _judge_call(
+        self, call: Call, asker: Asker, params: "_KnownParams"
+    ) -> LocalReply | None:
         caller_id = call.string(0) or ""
         if call.method == "lookupNode":
             return policing.hidden_node(call, asker, self._addressing)
@@ -191,7 +195,7 @@ class PolicyJudge:
             return None
         verdict = self._judge_use(use, caller_id, asker.address)
         if not verdict.allowed and use.below and call.method != "subscribeParam":
-            verdict = await self._judge_names(use, call, caller_id, asker.address)
+            verdict = await self._judge_names(use, call, asker.address, params)
         what = f"{use.names[0]} of {caller_id}"
         return _refused(self._policy.tell(verdict, use.kind, what, asker.address))
 
@@ -213,24 +217,22 @@ class PolicyJudge:
             ]
         return strictest(found)
 
-    async def _judge_names(self, use: ParamUse, call: Call, caller_id: str, source: str) -> Verdict:
+    async def _judge_names(
+        self, use: ParamUse, call: Call, source: str, params: "_KnownParams"
+    ) -> Verdict:
         """The same where it is denied for what may be below a name: by what there is.
 
         Whoever sets a whole namespace stays denied. Raises Unreachable.
         """
-        verdict = self._judge_use(use, caller_id, source)
+        caller_id = call.string(0) or ""
         own = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
         sets_more = call.method == "setParam" and (
             len(call.params) < 3 or call.params[2].kind == "struct"
         )
         if sets_more or not all(one.allowed for one in own):
-            return verdict
-        try:
-            names = await self._upstream.call_master("getParamNames")
-        except MasterError as error:
-            raise Unreachable(str(error)) from None
+            return self._judge_use(use, caller_id, source)
         starts = tuple(map(policing.prefix, use.names))
-        below = [name for name in names if isinstance(name, str) and name.startswith(starts)]
+        below = [name for name in await params.names() if name.startswith(starts)]
         found = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
         return strictest([*own, *found])
 
@@ -239,6 +241,25 @@ class PolicyJudge:
         endpoint = holder(call, asker, self._addressing)
         known = endpoint.registrations.get(held.key) if endpoint else None
         return policing.hidden_end(known) if known and known.hidden else None
+
+
+class _KnownParams:
+    """The names of all parameters, for one request: the master is asked once if at all."""
+
+    def __init__(self, upstream: MasterClient) -> None:
+        self._upstream = upstream
+        self._names: list[str] | None = None
+
+    async def names(self) -> list[str]:
+        """The names. Raises Unreachable."""
+        if self._names is None:
+            try:
+                found = await self._upstream.call_master("getParamNames")
+            except MasterError as error:
+                raise Unreachable(str(error)) from None
+            names = found if isinstance(found, list) else []
+            self._names = [name for name in names if isinstance(name, str)]
+        return self._names
 
 
 def _refused(verdict: Verdict) -> LocalReply | None:

@@ -242,8 +242,9 @@ class Registrar:
         if self._context.retired:
             return
         addressing, current = self._context.addressing, policy.to_register(held)
-        wanted = [(e, one) for e, one in current if self._verdict(e, one).allowed]
-        await self._conceal([(e, o) for e, o in current if not self._verdict(e, o).allowed])
+        allowed = {(e, one): self._verdict(e, one).allowed for e, one in current}
+        await self._conceal([held for held, may in allowed.items() if not may])
+        wanted = [held for held, may in allowed.items() if may]
         calls = [
             policy.register_call(
                 one, addressing.advertised_uri(e), addressing.advertised_service(e)
