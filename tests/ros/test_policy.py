@@ -146,3 +146,35 @@ def test_hidden_topics_are_known_to_a_proxy_that_was_killed(lab: Lab, library: s
     wait_until("the early one hears as well", lambda: "got " in early.output(mark), 30)
     assert topic not in lab.run("out", "rostopic", "list", "-p").output
     assert "deny publish" in greet(lab, name, topic=topic, type="*")["error"]
+
+
+@each_library
+def test_hidden_services_are_found_by_a_proxy_that_was_killed(lab: Lab, library: str) -> None:
+    name, service = lab.unique("server"), f"/hidden/{lab.unique('service')}"
+    lab.node(library, "c1", "serve", name=name, service=service).wait_for("^ready")
+    lab.wait_registered(name)
+    assert lab.proxy
+    lab.proxy.kill()
+    lab.start_proxy()
+    caller = lab.node("roscpp", "c2", "call", service=service, count=3, rate=50)
+    caller.wait_for("^done")
+    assert service not in lab.run("out", "rosservice", "list").output
+
+
+@PAIRS
+def test_what_is_denied_of_outside_is_hidden_inside(lab: Lab, first: str, second: str) -> None:
+    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    tell(lab, f"deny subscribe {topic}", f"deny call {service}", "deny get-param /secret/*")
+    lab.node(first, "out", "pub", topic=topic, word="far", rate=20).wait_for("^sent ")
+    lab.node(first, "out", "serve", service=service).wait_for("^ready")
+    receiver = lab.node(second, "c1", "sub", topic=topic)
+    lab.node(first, "c2", "pub", topic=topic, word="near", rate=20)
+    receiver.wait_for_count("^got near ", 5)
+    assert "got far " not in receiver.output()
+    found = lab.run("c1", "rosservice", "call", service, "{}", check=False)
+    assert found.returncode != 0
+    lab.run("out", "rosparam", "set", "/secret/key", "1")
+    refused = lab.run("c1", "rosparam", "get", "/secret/key", check=False)
+    assert (refused.returncode, "deny get-param" in refused.output) == (1, True)
+    assert "/secret/key" not in lab.run("c1", "rosparam", "list").output
+    assert "/rosdistro" in lab.run("c1", "rosparam", "list").output
