@@ -51,7 +51,8 @@ class Settings:
     or would find itself. ``admin_token``: what callers that are not on loopback must know, or
     ``admin_token_hash``: its SHA-256 in hex digits, for a proxy that is not to hold the token.
     ``policy`` are the layers of the options, in ``policy_mode`` as is that of the ``policy_file``;
-    ``policy_layers`` are those that an operator gives for the start.
+    ``policy_layers`` are those that an operator gives for the start, ``await_policy`` is how long
+    nothing is registered then, unless the operator has told the present ones before.
     Raises SettingError if two of them want the same port, or both a token and a hash are given.
     """
 
@@ -81,6 +82,7 @@ class Settings:
     policy_mode: PolicyMode = PolicyMode.ENFORCE
     policy_file: str | None = None
     policy_layers: tuple[PolicyLayer, ...] = ()
+    await_policy: float = 0.0
 
     def __post_init__(self) -> None:
         if self.admin_token and self.admin_token_hash:

@@ -12,20 +12,25 @@ from tests.docker.test_proxy_lost import recovered
 def test_a_label_hides_a_topic_from_outside(
     controller: Controller, net: Inside, named: Robot
 ) -> None:
-    """Inside hears it, also after the proxy was lost; without the label outside hears it, too."""
+    """Inside hears it; no moment shows it, also when the proxy is lost, which was made before."""
     network, topic = net.network(), f"/{unique('hidden').replace('-', '_')}"
+    listener = net.node(network, "roscpp", "sub", "--topic", topic)
+    wait_until(lambda: named.knows_proxied(listener.node), 30, listener.log.read)
     publish = (network, "rospy", "pub", "--topic", topic, "--word", "inside")
     hider = net.node(*publish, labels=(ENABLE, f"rosproxy.policy=deny publish {topic}"))
-    listener = net.node(network, "roscpp", "sub", "--topic", topic)
+
+    def is_hidden() -> bool:
+        assert named.publishers(topic) == set()
+        told = docker("exec", the_proxy().name, "rosproxy", "status", check=False)
+        return named.knows_proxied(hider.node) and f"publish {topic} of /{hider.node}" in told
+
+    wait_until(is_hidden, 30, controller.logs)
     listener.log.wait_for("inside")
-    wait_until(lambda: named.knows_proxied(hider.node), 20, hider.log.read)
-    assert named.publishers(topic) == set()
 
     lost = time.time()
     docker("kill", the_proxy().name)
-    listener.log.wait_for("inside", since=recovered(lost))
-    wait_until(lambda: named.knows_proxied(hider.node), 20, hider.log.read)
-    wait_until(lambda: not named.publishers(topic), 20, controller.logs)
+    recovered(lost)
+    wait_until(is_hidden, 30, controller.logs)
 
     hider.remove()
     net.node(*publish, name=hider.name)

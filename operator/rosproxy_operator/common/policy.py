@@ -2,8 +2,8 @@
 
 A proxy gets its policy twice. In a variable, when it is created, so that it serves for no moment
 without. And by ``POST /policy``, whenever it has changed or the proxy has been started: another
-policy makes no proxy anew. So one that is started again begins with the policy of its creation,
-until its operator tells it the present one.
+policy makes no proxy anew. So one that is started again waits some seconds for its operator's word
+before it registers anything, and if that is away begins with the policy of its creation.
 """
 
 import json
@@ -15,7 +15,10 @@ from rosproxy.settings import SettingError
 
 ADMINISTRATOR = "administrator"
 """Name of the layer that the operator's options make, which is for every proxy."""
-POLICY_VARIABLE = "ROSPROXY_POLICY_LAYERS"
+_LAYERS, _AWAIT = POLICY_VARIABLES = ("ROSPROXY_POLICY_LAYERS", "ROSPROXY_AWAIT_POLICY")
+"""What a proxy gets at its creation, and what is none of what it is made of (its fingerprint)."""
+AWAITED = 3.0
+"""Seconds that a proxy waits for its operator: as long as it waits for news of a new caller."""
 MOST_AUTHORS_RULES = MOST_RULES // 2
 """Rules of one author, so that those of the administrator and of another always fit together."""
 LONGEST_VARIABLE = 96 * 1024
@@ -40,6 +43,11 @@ def too_much(layers: Sequence[PolicyLayer]) -> str:
         return f"{count} rules, at most {MOST_AUTHORS_RULES} are accepted"
     size = len(as_variable(layers).encode())
     return f"{size} bytes, at most {LONGEST_POLICY} are accepted" if size > LONGEST_POLICY else ""
+
+
+def policy_variables(layers: Sequence[PolicyLayer]) -> dict[str, str]:
+    """The variables by which a proxy learns of its policy at its creation, and that more comes."""
+    return {_AWAIT: f"{AWAITED:g}", _LAYERS: as_variable(layers)}
 
 
 def as_variable(layers: Sequence[PolicyLayer]) -> str:

@@ -5,6 +5,8 @@ changes; and an operator, whose word replaces what it said before. Whatever is d
 by a layer in audit mode, is told in the log, the metrics and the status.
 """
 
+import asyncio
+import contextlib
 from collections.abc import Collection, Sequence
 
 from rosproxy.access.layers import (
@@ -43,6 +45,7 @@ class AccessPolicy:
         self._metrics, self._refusals = metrics, refusals
         self._own, self._told = tuple(own), tuple(told)
         self._file = tuple[PolicyLayer, ...]()
+        self._heard = asyncio.Event()
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
         self.version = 0
 
@@ -62,6 +65,14 @@ class AccessPolicy:
         bounded((*self._own, *self._file, *layers))
         self._told = tuple(layers)
         self._note_change()
+        self._heard.set()
+
+    async def wait_for_operator(self, seconds: float) -> None:
+        """Wait until an operator has told its layers, once and for so many seconds at most."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._heard.wait()
+        self._heard.set()
 
     def judge(self, kind: RuleKind, name: str, callers: Sequence[str], address: str) -> Verdict:
         """Whether a thing is allowed to all of the callers at a node inside; nobody is told.

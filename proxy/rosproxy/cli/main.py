@@ -135,6 +135,12 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     show_default=False,
     help="For operators: the layers of rules at the start, as POST /policy takes them.",
 )
+@_time(
+    "--await-policy",
+    0,
+    0.0,
+    "For operators: time at the start in which nothing is registered before POST /policy has come.",
+)
 @click.option(
     "--data-plane",
     type=click.Choice(["auto", "kernel", "splice", "copy"]),

@@ -1,5 +1,6 @@
 """Policy: what is denied is hidden outside, unchanged inside, and refused where it is asked for."""
 
+import asyncio
 import json
 from xmlrpc.client import Binary
 
@@ -440,6 +441,34 @@ async def test_a_restarted_proxy_knows_what_is_hidden(make_proxy, master, make_n
     await until(lambda: len(proxy.app.status()["policy"]["hidden"]) == 2, "the subscriber, too")
     assert master.holds("publishers", "/chatter") == []
     assert master.holds("subscribers", "/far") == []
+
+
+async def test_nothing_is_registered_before_an_operator_has_told_its_policy(
+    make_proxy, master, make_node
+):
+    """Neither by nodes that call nor by the recovery."""
+    proxy = await make_proxy(await_policy=60, **PATIENT)
+    assert await told(proxy) == (0, 0, 0)
+    talker, late = await make_node("/talker"), await make_node("/late", OTHER_NODE)
+    await talker.publish(proxy.master, "/rosout")
+    assert await told(proxy, "deny publish /chatter") == (0, 0, 0)
+    await talker.publish(proxy.master)
+    master.calls.clear()
+    await proxy.restart()
+    registering = asyncio.create_task(late.publish(proxy.master))
+    await until(lambda: "getPid" in dict(master.calls), "it has found its master")
+    assert not {"getSystemState", "registerPublisher"} & {*dict(master.calls)}
+    assert not registering.done()
+    await told(proxy, "deny publish /chatter")
+    assert (await registering)[0] == 1
+    await until(lambda: len(proxy.app.status()["policy"]["hidden"]) == 2, "both are hidden")
+    assert master.holds("publishers", "/chatter") == []
+
+
+async def test_an_operator_is_waited_for_once_and_not_for_ever(make_proxy, make_node):
+    proxy = await make_proxy(await_policy=0.2)
+    talker = await make_node("/talker")
+    assert (await talker.publish(proxy.master))[0] == 1
 
 
 async def test_a_restarted_proxy_asks_nodes_for_hidden_services(make_proxy, make_node):

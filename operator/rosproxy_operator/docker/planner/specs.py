@@ -1,6 +1,5 @@
 """The containers of a proxy: what they are made of, and what is read back from their labels."""
 
-import dataclasses
 import hashlib
 import hmac
 import json
@@ -15,7 +14,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import SettingError, hash_token, parse_range
-from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
+from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
@@ -151,10 +150,9 @@ def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secre
     """
     # Nor is its policy, which a running proxy is told: another one makes no proxy anew. One that
     # is started again while the operator is away begins with the policy of its creation.
-    settings = dataclasses.replace(settings, policy=())
-    made = replace(made, sandbox="", fingerprint="", policy=())
-    body = container_config(made, settings, secret, "")
-    return _digest({**body, "Image": image_id})
+    body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
+    env = [one for one in body["Env"] if one.partition("=")[0] not in POLICY_VARIABLES]
+    return _digest({**body, "Image": image_id, "Env": env})
 
 
 def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
@@ -208,7 +206,7 @@ def container_config(
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,
         **bound_variables(settings.proxy_bounds),
-        POLICY_VARIABLE: as_variable((*settings.policy, *made.policy)),
+        **policy_variables((*settings.policy, *made.policy)),
     }
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {

@@ -9,7 +9,7 @@ import msgspec
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.common.policy import POLICY_VARIABLE, as_variable
+from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
 from rosproxy_operator.kubernetes.planner.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
@@ -100,7 +100,7 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     meta = metadata(of, proxy_id(of.id, site.node.name), notes)
     # A running proxy is told its policy: another one makes no pod anew. A proxy that is started
     # again while the operator is away begins with the policy of its pod's creation.
-    env = [one for one in container["env"] if one["name"] != POLICY_VARIABLE]
+    env = [one for one in container["env"] if one["name"] not in POLICY_VARIABLES]
     spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
     known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
@@ -263,7 +263,7 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
         **bound_variables(settings.proxy_bounds),
-        POLICY_VARIABLE: as_variable(policy_of(site.rosproxy, settings)),
+        **policy_variables(policy_of(site.rosproxy, settings)),
     }
     return {name: value for name, value in variables.items() if value}
 

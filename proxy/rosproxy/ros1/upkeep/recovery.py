@@ -3,7 +3,8 @@
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
 graph once, finds the URIs that this proxy advertised (`policy.claims`), and rebuilds the endpoints
 on the ports that they had. Calls that register wait for it: a node that registered before would
-get another port, and the master would shut it down for having moved.
+get another port, and the master would shut it down for having moved. Before that an operator's
+policy is waited for (``--await-policy``), or what it denies would be registered for a moment.
 
 What the master says is only a claim, since anybody can write to it. Until the node itself has
 borne it out (`_verify`), the endpoint's port is held but refuses. Then subscribers are made to
@@ -86,6 +87,7 @@ class Recovery:
             if self._failures != failures:
                 raise Unreachable("the master has not told its state")
             try:
+                await self._context.policy.wait_for_operator(self._context.settings.await_policy)
                 await self._recover()
             except (Unreachable, MasterError) as error:
                 self._failures += 1

@@ -66,6 +66,7 @@ def test_a_proxy_is_in_its_sandbox_and_has_nothing_of_its_own() -> None:
         "ROSPROXY_ADMIN_BIND=0.0.0.0:11312",
         f"ROSPROXY_ADMIN_TOKEN_HASH={HASH}",
         "ROSPROXY_MASTER_ADDRESS=192.0.2.7",
+        "ROSPROXY_AWAIT_POLICY=3",
     ]
 
 
