@@ -71,8 +71,8 @@ class PolicyEnforcer:
         async with self._one_at_a_time:
             version, self._again = self._context.policy.version, False
             cut = self._cut_relays() + self._take_fast_ports()
-            await self._recovery.ensure()
             try:
+                await self._recovery.ensure()
                 hidden, shown = await self._registrar.apply_policy()
             except (Unreachable, MasterError):
                 self._again = True
