@@ -248,7 +248,7 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
 
 
 def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
-    spec = site.rosproxy.spec
+    spec, policy = site.rosproxy.spec, policy_of(site.rosproxy, settings)
     variables = {
         "ROS_MASTER_URI": site.master.uri,
         "ROSPROXY_MASTER_ADDRESS": site.master.address,
@@ -263,7 +263,8 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
         **bound_variables(settings.proxy_bounds),
-        **policy_variables(policy_of(site.rosproxy, settings)),
+        # Without a policy there is nothing to wait for, which takes a second after each restart.
+        **(policy_variables(policy) if policy else {}),
     }
     return {name: value for name, value in variables.items() if value}
 

@@ -64,7 +64,8 @@ def test_its_policy_is_there_from_the_start_and_makes_no_pod_anew() -> None:
     assert settings_of(env_of(made)).policy_layers == (*settings.policy, own)
     assert manifests.fingerprint_of(made) == manifests.fingerprint_of(body())
     assert "ROSPROXY_POLICY_LAYERS" not in env()
-    assert settings_of(env()).await_policy == AWAITED
+    assert settings_of(env_of(made)).await_policy == AWAITED
+    assert settings_of(env()).await_policy == 0.0
 
 
 def test_what_is_not_known_is_left_to_the_proxy() -> None:
