@@ -36,6 +36,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import hand_on, read_header
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 
@@ -54,8 +55,8 @@ LOOK_TIMEOUT = 1.0
 class Alias:
     """Listens on the ports of nodes on the master's host and passes on what arrives there."""
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(self, context: Context, callers: Callers) -> None:
+        self._context, self._callers = context, callers
         self._name = policy.aliased_host(context.settings.master_uri) or ""
         self._acceptors: dict[int, Acceptor] = {}
         """By port, the one that was of no use for longest first."""
@@ -247,6 +248,7 @@ class Alias:
 
     async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
+        await self._callers.begin()
         self._context.refresh_networks()
         if self._context.standing(peer) is not Standing.ADMITTED:
             log.debug("%s may not use the proxy: refused at port %d", peer, port)
