@@ -2,19 +2,19 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack
 from time import monotonic
 from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, call, value, where
+from examples.demo.fake_http import End, FakeHttpServer, call, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
 from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news, post, tell
+from tests.integration.claims import claim, silent_servers
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     HOST,
@@ -372,25 +372,10 @@ async def test_several_sources_of_dead_uris_give_way_as_well(
     assert (code, "--port-range" in text) == (-1, True)
 
 
-async def claim(master: FakeMaster, name: str, port: int, inside: str, topic: str = "/t") -> None:
-    """Register at the master what a former proxy would have registered."""
-    uri = f"http://{HOST}:{port}/{inside}/"
-    await rpc(master.uri, "registerPublisher", name, topic, "x/Y", uri)
-    await rpc(master.uri, "registerService", name, f"{name}/s", f"rosrpc://{HOST}:{port}", uri)
-
-
 @pytest.fixture
 async def mute() -> AsyncIterator[list[FakeHttpServer]]:
-    """Eight programs that take connections and never say a word, as a lost container seems to."""
-
-    async def hang(_: FakeRequest) -> End:
-        return End.HANG
-
-    async with AsyncExitStack() as stack:
-        made = [FakeHttpServer(hang) for _ in range(8)]
-        for server in made:
-            await server.start(OTHER_NODE)
-            stack.push_async_callback(server.stop)
+    """Eight programs that never say a word."""
+    async with silent_servers(OTHER_NODE, 8) as made:
         yield made
 
 
