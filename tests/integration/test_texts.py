@@ -53,7 +53,8 @@ async def test_a_long_name_is_refused_and_the_master_never_sees_it(
     assert proxy.metric("refused_total", reason="long_name") == 1
     (problem,) = proxy.app.status()["problems"]
     assert problem["subject"] == "refused: long name"
-    assert problem["text"] == f"from {NODE}: {text.removeprefix('rosproxy: ')}"
+    said = text.removeprefix("rosproxy: ")
+    assert problem["text"] == f"from {NODE}: {method} of {node.name}: {said}"
     assert (await node.publish(proxy.master))[0] == 1
 
 

@@ -105,6 +105,7 @@ class Lab:
     def _spawn_proxy(self, argv: list[str]) -> Process:
         env = {"PATH": self.proxy_path, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
         env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+        env["SSL_CERT_FILE"] = "/dev/null"  # as in the image
         return self._spawn("rosproxy", self.place("px"), [*self.proxy_prefix, *argv], env)
 
     def ensure_running(self) -> None:

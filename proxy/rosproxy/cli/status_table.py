@@ -9,17 +9,8 @@ from collections.abc import Iterator, Sequence
 
 from rosproxy.admin import status_document as document
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.telemetry.text import (
-    GAP,
-    besides_first,
-    clean,
-    duration,
-    listed,
-    plural,
-    size,
-    table,
-    wrap,
-)
+from rosproxy.telemetry.tables import GAP, besides_first, table
+from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
 
 HEADING = ("NODE", "INSIDE", "OUTSIDE", "STATE", "PUB", "SUB", "SRV", "CONN", "OUT", "IN")
 LEAST_NAME = 20

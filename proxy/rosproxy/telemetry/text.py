@@ -1,26 +1,18 @@
-"""Text for a terminal: harmless whatever it holds, and as wide as it looks.
+"""Text for logs and a terminal: harmless whatever it holds, and as wide as it looks.
 
-Pure functions from values to text and to lines; `rosproxy.cli.terminal` prints them. Names of nodes
-and topics are whatever a node says they are, so that `clean` comes before everything else. rich
-knows how wide characters are and lays tables out; texts are given to it as ``Text``, in which
-nothing is markup.
+Pure functions from values to text and to lines; `rosproxy.telemetry.tables` makes tables of them
+and `rosproxy.cli.terminal` prints them. Names of nodes and topics are whatever a node says they
+are, so that `clean` comes before everything else.
 """
 
-import io
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from itertools import pairwise
 
 from rich.cells import cell_len
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-GAP = "  "
 _TIMES = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 _UNITS = ("B", "kB", "MB", "GB", "TB")
-_CONSOLE = Console(file=io.StringIO(), color_system=None, width=80, height=25, legacy_windows=False)
-"""Lays out and prints nothing."""
 
 
 def clean(text: object) -> str:
@@ -78,27 +70,6 @@ def wrap(
         max_lines=most,
         placeholder=" …",
     )
-
-
-def table(rows: Sequence[Sequence[str]], left: int, room: int) -> list[str]:
-    """Lines of a table with its heading in the first row.
-
-    The first ``left`` cells stand left, the others right. The first cell gets ``room`` columns at
-    most and is shortened where it has more.
-    """
-    grid = Table.grid(padding=(0, len(GAP), 0, 0))
-    for index in range(len(rows[0])):
-        grid.add_column(justify="left" if index < left else "right", no_wrap=True)
-    for name, *cells in rows:
-        grid.add_row(Text(shorten(name, room)), *map(Text, cells))
-    wide = _CONSOLE.options.update_width(room + besides_first(rows))
-    lines = _CONSOLE.render_lines(grid, wide)
-    return ["".join(segment.text for segment in line).rstrip() for line in lines]
-
-
-def besides_first(rows: Sequence[Sequence[str]]) -> int:
-    """The columns that a table takes besides its first cells."""
-    return sum(len(GAP) + max(map(width, cells)) for cells in [*zip(*rows, strict=True)][1:])
 
 
 def duration(seconds: float) -> str:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.telemetry.tables import besides_first, table
 from rosproxy.telemetry.text import (
-    besides_first,
     brief,
     clean,
     duration,
@@ -15,7 +15,6 @@ from rosproxy.telemetry.text import (
     plural,
     shorten,
     size,
-    table,
     width,
     wrap,
 )

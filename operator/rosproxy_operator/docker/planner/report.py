@@ -6,7 +6,8 @@ Names of containers, networks and nodes are whatever their users say, so all are
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from rosproxy.telemetry.text import besides_first, clean, plural, shorten, table, wrap
+from rosproxy.telemetry.tables import besides_first, table
+from rosproxy.telemetry.text import clean, plural, shorten, wrap
 
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
