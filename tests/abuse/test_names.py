@@ -14,6 +14,7 @@ from tests.integration.net import (
     post,
     rpc,
     topic_header,
+    until,
     xml,
 )
 
@@ -67,6 +68,7 @@ async def test_names_that_hang(start_apart, make_node):
                 for i in range(300)
             ]
             attack = asyncio.gather(*calls)
+            await until(lambda: "too many look-ups" in apart.text, "it has all that it may have")
             assert (await named.publish(apart.master, "/named"))[0] == 1
             assert await seen_by(apart.master, other, "/named") == [named.uri]
             assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
