@@ -12,11 +12,14 @@ from itertools import chain
 
 import msgspec
 
-from rosproxy.admin.status_document import EndpointStatus, ProxyStatus
+from rosproxy.admin.status_document import ConnectionStatus, EndpointStatus, ProxyStatus
 
 MOST = 512 * 1024
 """Characters of JSON for what nodes have registered and who is connected to them. A hundred nodes
 with ten topics and as many connections each have 250,000."""
+CONNECTION = 160
+"""Those of a connection besides its texts."""
+Item = str | ConnectionStatus
 _LISTS = ("nodes", "publishes", "services", "subscribes", "parameters", "connections")
 
 
@@ -42,10 +45,10 @@ def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
 
 def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
     """A node with the first items of its lists, as many as fit."""
-    lists: dict[str, tuple[object, ...]] = {}
+    lists: dict[str, tuple[Item, ...]] = {}
     left_out = 0
     for name in _LISTS:
-        kept: list[object] = []
+        kept: list[Item] = []
         for item in getattr(node, name):
             share -= _size(item)
             if share >= 0:
@@ -56,10 +59,13 @@ def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
     return msgspec.structs.replace(node, **lists, left_out=left_out)
 
 
-def _items(node: EndpointStatus) -> chain[object]:
+def _items(node: EndpointStatus) -> chain[Item]:
     return chain.from_iterable(getattr(node, name) for name in _LISTS)
 
 
-def _size(item: object) -> int:
-    """Characters of an item as JSON, with what separates it from the next."""
-    return len(json.dumps(msgspec.to_builtins(item))) + 2
+def _size(item: Item) -> int:
+    """Characters of an item as JSON, with what separates it from the next; about."""
+    if isinstance(item, str):
+        return len(json.dumps(item)) + 2
+    texts = item.kind, item.name, item.caller_id, item.peer
+    return CONNECTION + sum(len(json.dumps(text)) for text in texts)

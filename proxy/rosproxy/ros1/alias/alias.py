@@ -42,6 +42,8 @@ from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, coun
 
 log = logging.getLogger(__name__)
 
+PORTS_PER_TURN = 50
+"""How many are opened before all connections are looked at again."""
 MOST_PORTS = 1024
 """How many ports stand in for nodes at most."""
 CONNECT_TIMEOUT = 2.0
@@ -82,8 +84,10 @@ class Alias:
         again = self._refused & wanted.keys()
         still = await asyncio.gather(*map(self._refuses, again))
         self._refused -= {port for port, gone in zip(again, still, strict=True) if not gone}
-        for port, uri in wanted.items():
-            if port not in self._refused:
+        for number, (port, uri) in enumerate(wanted.items(), start=1):
+            if number % PORTS_PER_TURN == 0:
+                await asyncio.sleep(0)
+            if port not in self._refused and not self._closed:
                 self._listen(port, uri)
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str]) -> None:
