@@ -28,6 +28,7 @@ No test is tried twice.
 import argparse
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -106,12 +107,14 @@ def debian_root_obstacle() -> str | None:
     return None
 
 
-def cgroup_obstacle() -> str | None:
-    """Say what keeps this machine from bounding a process's memory."""
+def abuse_obstacle() -> str | None:
+    """Say what keeps this machine from bounding a process's memory, and from making namespaces."""
     if platform.system() != "Linux":
         return "it needs Linux"
     if os.geteuid() != 0:
         return "it needs root"
+    if not shutil.which("ip"):
+        return "it needs ip (iproute2)"
     groups = Path("/sys/fs/cgroup")
     if not any(os.access(groups / name, os.W_OK) for name in ("memory", "cgroup.subtree_control")):
         return f"{groups} can't be written here (a container?)"
@@ -136,7 +139,7 @@ def effective_capabilities() -> int:
 
 UNIT = Layer("unit", smoke=ALL, workers=2)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
-ABUSE = Layer("abuse", obstacle=cgroup_obstacle)
+ABUSE = Layer("abuse", obstacle=abuse_obstacle)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
 IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)

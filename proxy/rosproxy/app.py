@@ -64,7 +64,7 @@ class App:
             settings, context.registry, context.tasks, context.problems, context.now
         )
         self._callers, self._probing = Callers(context), asyncio.Lock()
-        self.alias = Alias(context)
+        self.alias = Alias(context, self._callers)
         self.registrar = registrar = Registrar(context, self.alias)
         self._resubscriber = Resubscriber(context, registrar, self.tcpros, plane)
         self.leases = leases = Leases(
@@ -105,6 +105,7 @@ class App:
         self._reserve_range()
         await self.plane.start()
         master = MasterApi(context, self._admission, self.alias, self._recovery, self._adopter)
+        context.tasks.spawn(self._callers.hold(), "waiting for an operator")
         guard, what = self._callers.refusal, "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, what, guard)
         if settings.publish_master is not None:

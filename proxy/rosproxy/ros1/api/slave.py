@@ -156,6 +156,7 @@ class SlaveApi:
             await self._after_registration(endpoint)
             announced = slave_api.announced_publishers(parsed)
             await self._alias.listen_for_announced(parsed.string(1) or "", announced)
+            await self._context.take_turn(len(announced))
         self._context.refresh_networks()
         node, addressing = self._context.node_asker(endpoint), self._context.addressing
         body = self._alias.import_call(body, parsed)
