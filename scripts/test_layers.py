@@ -4,14 +4,13 @@
     python scripts/test_layers.py                  what `make test-all` runs
     python scripts/test_layers.py unit ros         these layers only
 
-How it works. A layer is a directory under tests/. Layers run in lanes: what is in a lane runs one
-after another, the lanes run side by side, and on two processors they end at about the same time.
+How it works. A layer is a directory under tests/. Up to three layers run side by side:
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
      already. After that docker begins, which is the longest and mostly waits, and image.
-  2. After the integration tests the Kubernetes cluster has a lane, and real ROS nodes have one,
-     which ends with the layers of plain computing.
+  2. After the integration tests, whenever one of the three has ended, the next of the others: the
+     long ones first, so that on two processors all end at about the same time.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
 machine that is busy with compiling.
@@ -34,8 +33,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -164,13 +164,13 @@ class Run:
         """Prepare and run; the outcomes in the order of the layers."""
         LOGS.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor() as pool:
-            integration = pool.submit(self._lane, [INTEGRATION])
+            integration = pool.submit(self._some, deque([INTEGRATION]))
             self._prepare()
-            early = [DOCKER_ENGINE], [IMAGE]
-            late = [ROS_NODES, ABUSE, CHART, UNIT], [CLUSTER]
-            lanes = [integration, *(pool.submit(self._lane, lane) for lane in early)]
+            early = [pool.submit(self._some, deque([one])) for one in (DOCKER_ENGINE, IMAGE)]
+            lanes = [integration, *early]
             integration.result()
-            lanes += [pool.submit(self._lane, lane) for lane in late]
+            late = deque([ROS_NODES, CLUSTER, ABUSE, UNIT, CHART])
+            lanes += [pool.submit(self._then, lane, late) for lane in lanes]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
@@ -185,8 +185,21 @@ class Run:
     def _steps(self, layer: Layer) -> tuple[str, ...]:
         return layer.smoke_setup if self.smoke else layer.setup
 
-    def _lane(self, layers: list[Layer]) -> list[Outcome]:
-        return [self._layer(layer) for layer in layers if layer in self.layers]
+    def _then(self, before: Future[list[Outcome]], left: deque[Layer]) -> list[Outcome]:
+        before.result()
+        return self._some(left)
+
+    def _some(self, left: deque[Layer]) -> list[Outcome]:
+        """Run layers one after another, until none is left: others may take from them, too."""
+        outcomes = []
+        while left:
+            try:
+                layer = left.popleft()
+            except IndexError:  # another was faster
+                break
+            if layer in self.layers:
+                outcomes.append(self._layer(layer))
+        return outcomes
 
     def _layer(self, layer: Layer) -> Outcome:
         obstacle = layer.obstacle()
