@@ -4,14 +4,13 @@
     python scripts/test_layers.py                  what `make test-all` runs
     python scripts/test_layers.py unit ros         these layers only
 
-How it works. A layer is a directory under tests/. Layers run in lanes: what is in a lane runs one
-after another, the lanes run side by side, and on two processors they end at about the same time.
+How it works. A layer is a directory under tests/. Up to three layers run side by side:
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
      already. After that docker begins, which is the longest and mostly waits, and image.
-  2. After the integration tests the Kubernetes cluster has a lane, and real ROS nodes have one,
-     which ends with the layers of plain computing.
+  2. After the integration tests, whenever one of the three has ended, the next of the others: the
+     long ones first, so that on two processors all end at about the same time.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
 machine that is busy with compiling.
@@ -28,13 +27,15 @@ No test is tried twice.
 import argparse
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -106,12 +107,14 @@ def debian_root_obstacle() -> str | None:
     return None
 
 
-def cgroup_obstacle() -> str | None:
-    """Say what keeps this machine from bounding a process's memory."""
+def abuse_obstacle() -> str | None:
+    """Say what keeps this machine from bounding a process's memory, and from making namespaces."""
     if platform.system() != "Linux":
         return "it needs Linux"
     if os.geteuid() != 0:
         return "it needs root"
+    if not shutil.which("ip"):
+        return "it needs ip (iproute2)"
     groups = Path("/sys/fs/cgroup")
     if not any(os.access(groups / name, os.W_OK) for name in ("memory", "cgroup.subtree_control")):
         return f"{groups} can't be written here (a container?)"
@@ -136,7 +139,7 @@ def effective_capabilities() -> int:
 
 UNIT = Layer("unit", smoke=ALL, workers=2)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
-ABUSE = Layer("abuse", obstacle=cgroup_obstacle)
+ABUSE = Layer("abuse", obstacle=abuse_obstacle)
 CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
 IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
@@ -161,13 +164,13 @@ class Run:
         """Prepare and run; the outcomes in the order of the layers."""
         LOGS.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor() as pool:
-            integration = pool.submit(self._lane, [INTEGRATION])
+            integration = pool.submit(self._some, deque([INTEGRATION]))
             self._prepare()
-            early = [DOCKER_ENGINE], [IMAGE]
-            late = [ROS_NODES, ABUSE, CHART, UNIT], [CLUSTER]
-            lanes = [integration, *(pool.submit(self._lane, lane) for lane in early)]
+            early = [pool.submit(self._some, deque([one])) for one in (DOCKER_ENGINE, IMAGE)]
+            lanes = [integration, *early]
             integration.result()
-            lanes += [pool.submit(self._lane, lane) for lane in late]
+            late = deque([ROS_NODES, CLUSTER, ABUSE, UNIT, CHART])
+            lanes += [pool.submit(self._then, lane, late) for lane in lanes]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
@@ -182,8 +185,21 @@ class Run:
     def _steps(self, layer: Layer) -> tuple[str, ...]:
         return layer.smoke_setup if self.smoke else layer.setup
 
-    def _lane(self, layers: list[Layer]) -> list[Outcome]:
-        return [self._layer(layer) for layer in layers if layer in self.layers]
+    def _then(self, before: Future[list[Outcome]], left: deque[Layer]) -> list[Outcome]:
+        before.result()
+        return self._some(left)
+
+    def _some(self, left: deque[Layer]) -> list[Outcome]:
+        """Run layers one after another, until none is left: others may take from them, too."""
+        outcomes = []
+        while left:
+            try:
+                layer = left.popleft()
+            except IndexError:  # another was faster
+                break
+            if layer in self.layers:
+                outcomes.append(self._layer(layer))
+        return outcomes
 
     def _layer(self, layer: Layer) -> Outcome:
         obstacle = layer.obstacle()

@@ -80,7 +80,7 @@ class App:
             settings, context.registry, context.tasks, context.problems, context.now
         )
         self._callers, self._probing = Callers(context), asyncio.Lock()
-        self.alias = Alias(context)
+        self.alias = Alias(context, self._callers)
         self._matchmaker = matchmaker = Matchmaker(context, self.alias)
         self.registrar = registrar = Registrar(context, matchmaker)
         self._resubscriber = Resubscriber(context, registrar, matchmaker, self.tcpros, plane)
@@ -112,6 +112,19 @@ class App:
         )
         self._admin = self._make_admin()
 
+    def _make_master_api(self) -> MasterApi:
+        return MasterApi(
+            self.context,
+            self._admission,
+            self.alias,
+            self._recovery,
+            self._adopter,
+            self._judge,
+            self._matchmaker,
+            self._enforcer,
+            ServiceFinder(self.context),
+        )
+
     def _make_admin(self) -> AdminServer:
         actions = {
             "/probe": self._probe,
@@ -131,17 +144,8 @@ class App:
         policy_file = self._read_policy_file()
         self._reserve_range()
         await self.plane.start()
-        master = MasterApi(
-            context,
-            self._admission,
-            self.alias,
-            self._recovery,
-            self._adopter,
-            self._judge,
-            self._matchmaker,
-            self._enforcer,
-            ServiceFinder(context),
-        )
+        master = self._make_master_api()
+        context.tasks.spawn(self._callers.hold(), "waiting for an operator")
         guard, what = self._callers.refusal, "ROS master API, proxied"
         self._listen("--master-port", settings.master_port, master, what, guard)
         if settings.publish_master is not None:

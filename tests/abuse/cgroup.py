@@ -1,32 +1,45 @@
-"""A bound on the memory of processes: a cgroup, of version 1 or 2, whichever the machine has."""
+"""Bounds on the memory and the threads of processes: a cgroup, of version 1 or 2.
+
+Whichever the machine has; in version 1 each is a group of its own.
+"""
 
 from pathlib import Path
 
 ROOT = Path("/sys/fs/cgroup")
-V1 = ROOT / "memory"
+V1_MEMORY, V1_PIDS = ROOT / "memory", ROOT / "pids"
 
 
-class MemoryGroup:
+class Cgroup:
     """A cgroup with so many bytes of memory and no swap; root makes and removes it."""
 
     def __init__(self, name: str, most: int) -> None:
-        if (V1 / "memory.limit_in_bytes").exists():
-            self._dir, files = V1 / name, ("memory.limit_in_bytes", "memory.memsw.limit_in_bytes")
+        if (V1_MEMORY / "memory.limit_in_bytes").exists():
+            self._dirs = [V1_MEMORY / name, V1_PIDS / name]
+            files = "memory.limit_in_bytes", "memory.memsw.limit_in_bytes"
         else:
-            (ROOT / "cgroup.subtree_control").write_text("+memory")
-            self._dir, files = ROOT / name, ("memory.max", "memory.swap.max")
-        self._dir.mkdir()
-        (self._dir / files[0]).write_text(str(most))
-        swap = self._dir / files[1]
+            (ROOT / "cgroup.subtree_control").write_text("+memory +pids")
+            self._dirs = [ROOT / name]
+            files = "memory.max", "memory.swap.max"
+        for folder in self._dirs:
+            folder.mkdir()
+        (self._dirs[0] / files[0]).write_text(str(most))
+        swap = self._dirs[0] / files[1]
         if swap.exists():  # not where the kernel does not count it
             swap.write_text("0" if files[1] == "memory.swap.max" else str(most))
 
     @property
     def prefix(self) -> list[str]:
         """A command that runs another one, which follows it, in this group."""
-        enter = f'echo $$ > {self._dir}/cgroup.procs && exec "$@"'
-        return ["sh", "-c", enter, "sh"]
+        enter = "; ".join(f"echo $$ > {folder}/cgroup.procs" for folder in self._dirs)
+        return ["sh", "-ec", f'{enter}; exec "$@"', "sh"]
+
+    def limit_threads(self, more: int | None) -> None:
+        """Let there be so many more threads than now; None: as many as are wanted."""
+        folder = self._dirs[-1]
+        now = int((folder / "pids.current").read_text())
+        (folder / "pids.max").write_text("max" if more is None else str(now + more))
 
     def remove(self) -> None:
         """Remove it; nothing may be left in it."""
-        self._dir.rmdir()
+        for folder in self._dirs:
+            folder.rmdir()

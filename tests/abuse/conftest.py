@@ -4,31 +4,33 @@ How it works. Each test gets `abused`, a `rosproxy run` as a process of its own 
 256 MB, so that a test which makes it take more kills it. Its master and its nodes are the fakes of
 examples/demo, in the test's own process and outside of the cgroup, on addresses of 127.0.0.0/8 as
 in tests/integration, whose helpers are used: the neighbour's calls and raw connections come from
-`tests.integration.net`. What a test does happens within ``with abused.watched():``, which holds for
-all of them what nobody may lose:
+`tests.integration.net`. Where it matters that these are other machines' addresses, `apart` is the
+same in a network namespace of its own (:mod:`tests.abuse.apart`). What a test does happens within
+``with abused.watched():``, which holds for all of them what nobody may lose:
 
   - /healthz answers within a second throughout, asked by another process;
   - memory stays below what it was before and 100 MB;
   - the log grows by 64 KiB at most, and has no traceback; /status has 1 MiB at most.
 
-Tests say themselves that a good neighbour is served meanwhile. It needs root, for the cgroup and to
-go before whatever else this machine does, which is no neighbour of the proxy's; it needs no other
-program. Tests of one subject are in one file.
+Tests say themselves that a good neighbour is served meanwhile. It needs root, for the cgroup, the
+namespace (`ip`, of iproute2), and to go before whatever else this machine does, which is no
+neighbour of the proxy's. Tests of one subject are in one file.
 """
 
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 from urllib.request import urlopen
 
 import pytest
 
-from examples.demo.fake_http import Where
+from examples.demo.fake_http import Where, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from tests.abuse.cgroup import MemoryGroup
+from tests.abuse.apart import APART, APART_HOST, APART_MASTER, INSIDE, Apart
+from tests.abuse.cgroup import Cgroup
 from tests.abuse.health import Health
 from tests.integration.conftest import (  # noqa: F401 - fixtures
     _ports_of_this_worker,
@@ -36,7 +38,7 @@ from tests.integration.conftest import (  # noqa: F401 - fixtures
     master,
     node,
 )
-from tests.integration.net import HOST, until
+from tests.integration.net import until
 from tests.integration.process import Process
 
 MEBIBYTE = 1024 * 1024
@@ -58,7 +60,11 @@ def _first_in_line() -> Iterator[None]:
 
 
 class Abused(Process):
-    """A proxy under attack."""
+    """A proxy under attack, in ``group``."""
+
+    def __init__(self, group: Cgroup, options: dict[str, Any]) -> None:
+        self.group = group
+        super().__init__(options | {"prefix": [*group.prefix, *options.get("prefix", [])]})
 
     @property
     def admin(self) -> Where:
@@ -85,7 +91,7 @@ class Abused(Process):
     def lease(self, of: FakeNode) -> Where:
         """Where outside reaches a node."""
         found = next(held for held in self.status()["nodes"] if of.name in held["nodes"])
-        return HOST, found["port"]
+        return self.options["advertise_host"], found["port"]
 
     async def publish(self, of: FakeNode) -> Where:
         """Have a node register, and find out where outside reaches it."""
@@ -97,7 +103,7 @@ class Abused(Process):
     def watched(self) -> Iterator[None]:
         """Hold what nobody may lose."""
         before, written = self.most_memory(), len("".join(self.log))
-        with Health(self.admin[1]) as health:
+        with Health(*self.admin) as health:
             yield
         assert health.longest < 1
         assert self.most_memory() - before < GROWTH
@@ -105,15 +111,66 @@ class Abused(Process):
         assert len(self.get("/status")) < STATUS
 
 
+StartAbused = Callable[..., Abused]
+
+
 @pytest.fixture
-def abused(master: FakeMaster, tmp_path: Any) -> Iterator[Abused]:  # noqa: F811 - the fixture
-    """A proxy in a cgroup of 256 MB."""
-    group = MemoryGroup(f"rosproxy-abuse-{os.getpid()}", MEMORY)
-    made: list[Abused] = []
-    try:
-        made.append(Abused({"master_uri": master.uri, "prefix": group.prefix, **PATIENT}))
-        yield made[0]
-    finally:
-        for process in made:
-            process.close()
-        group.remove()
+def start_abused() -> Iterator[StartAbused]:
+    """Starts proxies in a cgroup of 256 MB each, with these options."""
+    with ExitStack() as stack:
+
+        def start(**options: Any) -> Abused:
+            group = Cgroup(f"rosproxy-abuse-{os.getpid()}", MEMORY)
+            stack.callback(group.remove)
+            made = Abused(group, {**PATIENT, **options})
+            stack.callback(made.close)
+            return made
+
+        yield start
+
+
+@pytest.fixture
+def abused(start_abused: StartAbused, master: FakeMaster) -> Abused:  # noqa: F811 - the fixture
+    """A proxy on loopback."""
+    return start_abused(master_uri=master.uri)
+
+
+@pytest.fixture(scope="session")
+def _apart() -> Iterator[Apart]:
+    made = Apart()
+    yield made
+    made.remove()
+
+
+@pytest.fixture
+async def apart_master(_apart: Apart) -> AsyncIterator[FakeMaster]:
+    """A master on another machine than the proxy of `start_apart`."""
+    made = FakeMaster(APART_MASTER)
+    await made.start()
+    yield made
+    await made.stop()
+
+
+@pytest.fixture
+def start_apart(_apart: Apart, start_abused: StartAbused, apart_master: FakeMaster) -> StartAbused:
+    """Starts proxies that are machines of their own; see `tests.abuse.apart`."""
+
+    def start(**options: Any) -> Abused:
+        made = start_abused(
+            master_uri=apart_master.uri,
+            prefix=_apart.prefix,
+            advertise_host=APART_HOST,
+            inside_network=INSIDE,
+            admin_bind=f"{APART}:{free_ports(1)}",
+            **options,
+        )
+        made.master = APART, made.master[1]
+        return made
+
+    return start
+
+
+@pytest.fixture
+def apart(start_apart: StartAbused) -> Abused:
+    """A proxy that is a machine of its own."""
+    return start_apart()

@@ -1,6 +1,6 @@
 """Asks /healthz over and over, in a process of its own, which the tests can't hold up.
 
-    python -m tests.abuse.health PORT
+    python -m tests.abuse.health HOST PORT
 
 When its standard input ends, it prints how long the longest answer took, in seconds.
 """
@@ -16,10 +16,10 @@ INTERVAL = 0.05
 PATIENCE = 30.0
 
 
-def ask(port: int) -> float:
+def ask(host: str, port: int) -> float:
     """How long an answer takes, on a connection of its own."""
     began = time.monotonic()
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+    connection = http.client.HTTPConnection(host, port, timeout=PATIENCE)
     try:
         connection.request("GET", "/healthz")
         status = connection.getresponse().status
@@ -34,7 +34,7 @@ def main() -> None:
     """Ask until standard input ends."""
     longest = 0.0
     while not select.select([sys.stdin], [], [], INTERVAL)[0]:
-        longest = max(longest, ask(int(sys.argv[1])))
+        longest = max(longest, ask(sys.argv[1], int(sys.argv[2])))
     print(longest)
 
 
@@ -43,8 +43,8 @@ class Health:
 
     longest = 0.0
 
-    def __init__(self, port: int) -> None:
-        self._command = [sys.executable, "-m", "tests.abuse.health", str(port)]
+    def __init__(self, host: str, port: int) -> None:
+        self._command = [sys.executable, "-m", "tests.abuse.health", host, str(port)]
 
     def __enter__(self) -> "Health":
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}

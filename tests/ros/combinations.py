@@ -29,6 +29,19 @@ VIEWS = {
 
 each_view = pytest.mark.parametrize(("side", "where"), VIEWS.values(), ids=VIEWS.keys())
 
+_LIBRARIES_SEEN = {
+    "inside-about-itself": ("rospy",),
+    "inside-about-inside": ("roscpp",),
+    "inside-about-outside": ("rospy",),
+    "outside-about-inside": LIBRARIES,
+}
+each_view_of_a_library = pytest.mark.parametrize(
+    ("library", "side", "where"),
+    [(library, *VIEWS[view]) for view, found in _LIBRARIES_SEEN.items() for library in found],
+    ids=[f"{library}-{view}" for view, found in _LIBRARIES_SEEN.items() for library in found],
+)
+"""Each view, and where a tool of outside asks through the proxy each library; else in turn."""
+
 
 def each_pair(first: str, second: str) -> pytest.MarkDecorator:
     """Every pair of libraries, as arguments with the two names."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tests.ros.combinations import each_library, each_side, each_view
+from tests.ros.combinations import each_library, each_side, each_view_of_a_library
 from tests.ros.lab import Lab
 from tests.ros.processes import Process
 
@@ -26,8 +26,7 @@ def test_list_names_the_nodes_of_both_sides(lab: Lab, side: str) -> None:
         assert re.search(rf"^http://\S+:\d+/\S*\s+{name}$", with_uris, re.MULTILINE), with_uris
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_info_reaches_the_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "info", name).output
@@ -48,8 +47,7 @@ def test_info_shows_connections_across_the_boundary(lab: Lab, library: str, side
     assert "transport: TCPROS" in output
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_ping_is_answered(lab: Lab, library: str, side: str, where: str) -> None:
     _, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "ping", "-c", "2", name).output
@@ -66,8 +64,7 @@ def test_ping_all_reaches_every_node(lab: Lab, side: str) -> None:
     assert "connection to" not in output
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_kill_ends_the_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     output = lab.run(side, "rosnode", "kill", name).output
@@ -86,8 +83,7 @@ def test_machine_lists_the_hosts_and_their_nodes(lab: Lab, side: str) -> None:
         assert any(name in nodes for nodes in found.values()), found
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_cleanup_removes_a_killed_node(lab: Lab, library: str, side: str, where: str) -> None:
     node, name = talker(lab, library, where)
     _, living = talker(lab, "roscpp", "c1")

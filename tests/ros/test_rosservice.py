@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from tests.ros.combinations import each_library, each_side, each_view
+from tests.ros.combinations import each_side, each_view, each_view_of_a_library
 from tests.ros.lab import Lab
 
 
@@ -29,8 +29,7 @@ def test_list_find_and_node(lab: Lab, side: str) -> None:
         assert lab.run(side, "rosservice", "node", service).output == f"{name}\n"
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_info_type_args_and_uri(lab: Lab, library: str, side: str, where: str) -> None:
     name, service = server(lab, where, library)
     info = lab.run(side, "rosservice", "info", service).output
@@ -44,8 +43,7 @@ def test_info_type_args_and_uri(lab: Lab, library: str, side: str, where: str) -
     assert f"URI: {uri}" in info
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_call_prints_the_answer(lab: Lab, library: str, side: str, where: str) -> None:
     _, service = server(lab, where, library)
     output = lab.run(side, "rosservice", "call", service, "tool 7 x").output

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from tests.ros.combinations import each_direction, each_library, each_side, each_view
+from tests.ros.combinations import each_direction, each_side, each_view, each_view_of_a_library
 from tests.ros.lab import Lab
 
 STAMPED = ("geometry_msgs/PointStamped", "{header: auto, point: {x: 1.0, y: 2.0, z: 3.0}}")
@@ -36,8 +36,7 @@ def test_list_by_host(lab: Lab, side: str) -> None:
     assert re.search(rf"^Host \[\S+\]:(\n  .*)*\n  {topic}$", output, re.MULTILINE), output
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_info_names_publishers_with_their_address(
     lab: Lab, library: str, side: str, where: str
 ) -> None:
@@ -54,8 +53,7 @@ def test_type_and_find(lab: Lab, side: str) -> None:
     assert topic in lab.run(side, "rostopic", "find", "std_msgs/String").output.split()
 
 
-@each_view
-@each_library
+@each_view_of_a_library
 def test_echo_prints_messages(lab: Lab, library: str, side: str, where: str) -> None:
     _, topic = talker(lab, where, library)
     output = lab.run(side, "rostopic", "echo", "-n", "3", topic).output

@@ -83,6 +83,14 @@ def test_architecture_names_what_exists() -> None:
     assert not {path for path in named if not any((root / path).exists() for root in roots)}
 
 
+def test_every_promise_of_security_names_a_test_that_exists() -> None:
+    named = set(
+        re.findall(r"`((?:[a-z0-9_]+/)+test_[a-z0-9_]+\.py)`", (ROOT / "SECURITY.md").read_text())
+    )
+    assert len(named) > 20
+    assert not {path for path in named if not (ROOT / "tests" / path).exists()}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_block_of_code_says_its_language(page: Path) -> None:
     fences = re.findall(r"^ *```(.*)$", page.read_text(), re.M)

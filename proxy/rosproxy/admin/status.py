@@ -11,6 +11,7 @@ from prometheus_client.registry import Collector
 
 from rosproxy import __version__
 from rosproxy.admin import status_document as document
+from rosproxy.admin.status_bounds import bounded
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
@@ -34,13 +35,13 @@ class ProxyState(Collector):
     _plane: KernelPlane
 
     def status(self) -> document.ProxyStatus:
-        """Everything that ``rosproxy status`` and ``rosproxy doctor`` show."""
+        """Everything that ``rosproxy status`` and ``rosproxy doctor`` show, within bounds."""
         context = self._context
         relays: dict[int, list[Relay]] = {}
         for relay in self._tcpros.relays:
             relays.setdefault(relay.port, []).append(relay)
         endpoints = sorted(context.registry, key=lambda endpoint: endpoint.port)
-        return document.ProxyStatus(
+        whole = document.ProxyStatus(
             version=__version__,
             pid=os.getpid(),
             instance=context.instance,
@@ -58,6 +59,7 @@ class ProxyState(Collector):
                 for p in context.problems.all()
             ),
         )
+        return bounded(whole)
 
     def collect(self) -> Iterable[Metric]:
         """The state as metrics: gauges, and counters of bytes."""

@@ -115,7 +115,8 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     """What is registered with one slave URI: one node as a rule, several for nodelets.
 
     ``nodes`` are their names, ``uri`` is what it calls itself and ``address`` where it was found.
-    ``state`` is one of `rosproxy.telemetry.metrics.STATES`.
+    ``state`` is one of `rosproxy.telemetry.metrics.STATES`. ``left_out``: how many names and
+    connections there are besides those in the lists (`rosproxy.admin.status_bounds`).
     """
 
     nodes: Names = ()
@@ -131,6 +132,7 @@ class EndpointStatus(msgspec.Struct, frozen=True):
     connections: tuple[ConnectionStatus, ...] = ()
     problems: Names = ()
     data_plane: NodePlaneStatus | None = None
+    left_out: Count = 0
 
     @property
     def given_up(self) -> bool:

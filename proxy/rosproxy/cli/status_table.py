@@ -158,6 +158,8 @@ def _details(
         yield from _detail("connected", _connection(connection), columns)
     if len(connections) > MOST_CONNECTIONS:
         yield f"{INDENT}… {plural(len(connections) - MOST_CONNECTIONS, 'connection')} more"
+    if node.left_out:
+        yield from _detail("not shown", f"{node.left_out} more names and connections", columns)
     yield from _detail("kernel", _kernel(node, whole), columns)
 
 

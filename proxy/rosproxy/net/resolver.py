@@ -59,7 +59,7 @@ def _start(host: str, source: str) -> Future[list[str]]:
     try:
         threading.Thread(target=_look_up, args=(host, lookup), daemon=True).start()
     except RuntimeError as error:  # the process or the machine has no thread left
-        log.warning("%s can't be looked up: %s", host, error)
+        log.warning("%s: %s can't be looked up: %s", source or "the proxy", host, error)
         _end(host, lookup, [])
     return lookup
 

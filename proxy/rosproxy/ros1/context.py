@@ -29,6 +29,8 @@ REGISTRATION_GRACE = 0.5
 """Seconds that a publisherUpdate waits at most for a registration of the same node."""
 NETWORKS_TTL = 5.0
 """Seconds for which the list of the machine's own networks is taken as current."""
+MANY_VALUES = 100
+"""Values from which on a document is large; registrations have six."""
 MOST_PASSING = 256
 """Calls and replies that pass unread at once; each takes a thread of the master's."""
 PASSING_SHARE = 64
@@ -41,8 +43,8 @@ class Context:
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
     ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
-    ``passing`` the calls that pass unread; ``turn`` is for who is about to read a large document;
-    ``refusals`` tells what is over these and other bounds. ``policy``: what outside may see and do.
+    ``passing`` the calls that pass unread; ``refusals`` tells what is over these and other bounds.
+    ``policy``: what outside may see and do.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -59,7 +61,7 @@ class Context:
         )
         held = settings.max_buffered * MEBIBYTE
         self.buffered = Budget(held, held // 2, "bytes of requests and replies")
-        self.turn = asyncio.Lock()
+        self._turn = asyncio.Lock()
         self.passing = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
         self.addressing = Addressing(self.registry, settings.advertise_host, settings.ports)
@@ -79,6 +81,16 @@ class Context:
     def now(self) -> float:
         """Seconds of the monotonic clock."""
         return time.monotonic()
+
+    async def take_turn(self, values: int) -> None:
+        """Wait for one's turn to read or rewrite a document of so many values.
+
+        All connections are looked at in between. Else many large documents that come together
+        would hold everybody up.
+        """
+        if values > MANY_VALUES:
+            async with self._turn:
+                await asyncio.sleep(0)
 
     def standing(self, address: str) -> Standing:
         """Whether an address may use the proxy as its master, as far as is known now."""

@@ -34,6 +34,8 @@ BURST_OF_ONE, ONE_EVERY = 5, 10.0
 after which one more is. What is told of a real node changes a few times in a minute at most."""
 BURST_OF_ALL, ALL_EVERY = 2000, 1.0
 """The same for all messages of one kind: a thousand nodes that start at once have a line each."""
+USUAL = 200
+"""Characters of a message that counts as one of its kind; a longer one counts as several."""
 MOST_KNOWN = 1024
 """Kinds and subjects that are remembered; of more the one that came last the longest ago goes."""
 
@@ -54,8 +56,8 @@ class Floods(logging.Filter):
 
     Messages are of one kind if they come from the same call: logger, level and template are the
     same; the subject is the template's first argument. Each kind has a bound, which a single
-    subject can't use up with warnings. Debug messages are for somebody who looks on: they are all
-    written.
+    subject can't use up with warnings, and which long messages use up sooner. Debug messages are
+    for somebody who looks on: they are all written.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -74,7 +76,8 @@ class Floods(logging.Filter):
                 one = self._bucket((*kind, _subject(record)), BURST_OF_ONE, ONE_EVERY)
                 if not _take(one, record):
                     return False
-            return _take(self._bucket(kind, BURST_OF_ALL, ALL_EVERY), record)
+            weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
+            return _take(self._bucket(kind, BURST_OF_ALL, ALL_EVERY), record, weight)
 
     def _bucket(self, key: Hashable, burst: int, every: float) -> _Bucket:
         """What is left of a bound by now."""
@@ -88,12 +91,12 @@ class Floods(logging.Filter):
         return bucket
 
 
-def _take(bucket: _Bucket, record: logging.LogRecord) -> bool:
+def _take(bucket: _Bucket, record: logging.LogRecord, weight: int = 1) -> bool:
     """Whether a bound allows one more record, which then tells what was left out before."""
     if bucket.left < 1:
         bucket.left_out += 1
         return False
-    bucket.left -= 1
+    bucket.left -= weight
     if bucket.left_out:
         record.left_out = getattr(record, "left_out", 0) + bucket.left_out
         bucket.left_out = 0

@@ -12,6 +12,8 @@ from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
+from rosproxy.ros1.servers import callers
+from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news
 from tests.integration.conftest import MakeNode, MakeProxy
@@ -576,3 +578,18 @@ async def test_only_those_who_are_selected_are_let_in(proxy: Proxy, robot: FakeN
     await news(proxy, selected=[OTHER_NODE])
     assert (await rpc(slave(robot), "getPid", "/tool", source=OTHER_NODE))[0] == 1
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) in ("closed", "reset")
+
+
+async def test_an_alias_port_waits_for_an_operator_that_has_told_nothing_yet(
+    make_proxy: MakeProxy, master: FakeMaster, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    operated = behind_its_name(master, admin_token_hash=hash_token("the operator's"))
+    proxy = await make_proxy(**operated)
+    assert await look_up(proxy, robot) == robot.uri  # by a program on its own machine
+    ask = post(xml("getPid", "/tool"))
+    both = [knock(slave(robot), ask, source) for source in (NODE, OTHER_NODE)]
+    assert await asyncio.gather(*both) == ["silent"] * 2
+    await news(proxy, selected=[NODE])
+    assert await knock(slave(robot), ask, NODE) == "answered"
+    assert await knock(slave(robot), ask, OTHER_NODE) in _CLOSED

@@ -2,17 +2,19 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack
+from time import monotonic
 from typing import Any
 
 import pytest
 
-from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, call, value, where
+from examples.demo.fake_http import End, FakeHttpServer, call, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.ros1.servers import callers
+from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
 from tests.integration.admin_calls import news, post, tell
+from tests.integration.claims import claim, silent_servers
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     HOST,
@@ -141,6 +143,52 @@ async def test_a_new_container_waits_for_the_news_and_loses_nothing(
     assert (await call_)[0] == 1
     assert waiting._waiting.total() == 0
     assert proxy.metric("strangers_total", standing="unselected") == 0
+
+
+@pytest.fixture
+def _only_localhost_is_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one address of the tests that is a program on the proxy's own machine."""
+    own = "127.0.0.1"
+    monkeypatch.setattr("rosproxy.ros1.servers.callers.is_own", lambda address: address == own)
+
+
+BY_AN_OPERATOR = {"admin_token_hash": hash_token("the operator's")}
+"""What a proxy is started with that has an operator."""
+
+
+@pytest.mark.usefixtures("_only_localhost_is_own")
+async def test_nobody_slips_in_before_an_operator_has_told_whom_it_selects(
+    make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For some tenths of a second after each start all of the inside networks were let in."""
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
+    proxy = await make_proxy(**BY_AN_OPERATOR)
+    node, stranger = await make_node(), await make_node("/stranger", OTHER_NODE)
+    body = request(xml("registerPublisher", stranger.name, "/t", "x/Y", stranger.uri))
+    good = asyncio.create_task(node.publish(proxy.master))
+    bad = asyncio.create_task(exchange(proxy.master, body, OTHER_NODE))
+    assert (await rpc(proxy.master, "getPid", "/doctor", source="127.0.0.1"))[0] == 1
+    assert (good.done(), bad.done()) == (False, False)
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.05)
+    await news(proxy, selected=[NODE])
+    assert (await good)[0] == 1
+    assert (await bad).status == 403
+    assert {name for row in proxy.app.status()["nodes"] for name in row["nodes"]} == {node.name}
+
+
+@pytest.mark.usefixtures("_only_localhost_is_own")
+async def test_an_operator_that_is_away_stops_nobody(
+    make_proxy: MakeProxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 0.3)
+    began = monotonic()
+    proxy = await make_proxy(**BY_AN_OPERATOR)
+    assert (await node.publish(proxy.master))[0] == 1
+    assert monotonic() - began > 0.3
+    began = monotonic()
+    assert (await node.publish(proxy.master))[0] == 1
+    assert monotonic() - began < 0.3
+    assert (await exchange(proxy.master, request(xml("getPid", "/n")), OUTSIDE)).status == 403
 
 
 @pytest.mark.usefixtures("_no_source_is_own")
@@ -324,25 +372,10 @@ async def test_several_sources_of_dead_uris_give_way_as_well(
     assert (code, "--port-range" in text) == (-1, True)
 
 
-async def claim(master: FakeMaster, name: str, port: int, inside: str, topic: str = "/t") -> None:
-    """Register at the master what a former proxy would have registered."""
-    uri = f"http://{HOST}:{port}/{inside}/"
-    await rpc(master.uri, "registerPublisher", name, topic, "x/Y", uri)
-    await rpc(master.uri, "registerService", name, f"{name}/s", f"rosrpc://{HOST}:{port}", uri)
-
-
 @pytest.fixture
 async def mute() -> AsyncIterator[list[FakeHttpServer]]:
-    """Eight programs that take connections and never say a word, as a lost container seems to."""
-
-    async def hang(_: FakeRequest) -> End:
-        return End.HANG
-
-    async with AsyncExitStack() as stack:
-        made = [FakeHttpServer(hang) for _ in range(8)]
-        for server in made:
-            await server.start(OTHER_NODE)
-            stack.push_async_callback(server.stop)
+    """Eight programs that never say a word."""
+    async with silent_servers(OTHER_NODE, 8) as made:
         yield made
 
 

@@ -106,6 +106,12 @@ def test_long_lists_are_cut() -> None:
     assert lines[-1] == "    … 12 connections more"
 
 
+def test_what_the_proxy_has_left_out_is_told() -> None:
+    lines = lines_of(make_node(left_out=1234))
+    assert [line for line in lines if "1234 more names and connections" in line]
+    assert not [line for line in lines_of(make_node()) if "not shown" in line]
+
+
 def test_a_narrow_terminal_gives_addresses_a_line_of_their_own() -> None:
     node = make_node("/a/very/long/node/name/of/some/driver_1795249066559")
     lines = lines_of(node, columns=60)

@@ -15,6 +15,7 @@ from rosproxy.telemetry.logs import (
     LONGEST,
     MOST_KNOWN,
     ONE_EVERY,
+    USUAL,
     Floods,
     JsonLines,
     TextLines,
@@ -155,6 +156,12 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
     clock.now += ALL_EVERY
     (later,) = written(floods, (record("%s is new", f"/{n}", level=level) for n in range(9)))
     assert later.__dict__["left_out"] == more
+
+
+def test_long_names_fill_no_disk_either(clock: Clock) -> None:
+    floods = Floods(clock)
+    names = (record("%s is new", f"/{n}" + "x" * LONGEST, level=logging.INFO) for n in range(5000))
+    assert len(written(floods, names)) * LONGEST < 2 * BURST_OF_ALL * USUAL
 
 
 def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:

@@ -36,11 +36,14 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.tcpros import hand_on, read_header
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 
 log = logging.getLogger(__name__)
 
+PORTS_PER_TURN = 50
+"""How many are opened before all connections are looked at again."""
 MOST_PORTS = 1024
 """How many ports stand in for nodes at most."""
 CONNECT_TIMEOUT = 2.0
@@ -54,8 +57,8 @@ LOOK_TIMEOUT = 1.0
 class Alias:
     """Listens on the ports of nodes on the master's host and passes on what arrives there."""
 
-    def __init__(self, context: Context) -> None:
-        self._context = context
+    def __init__(self, context: Context, callers: Callers) -> None:
+        self._context, self._callers = context, callers
         self._name = policy.aliased_host(context.settings.master_uri) or ""
         self._acceptors: dict[int, Acceptor] = {}
         """By port, the one that was of no use for longest first."""
@@ -81,8 +84,10 @@ class Alias:
         again = self._refused & wanted.keys()
         still = await asyncio.gather(*map(self._refuses, again))
         self._refused -= {port for port, gone in zip(again, still, strict=True) if not gone}
-        for port, uri in wanted.items():
-            if port not in self._refused:
+        for number, (port, uri) in enumerate(wanted.items(), start=1):
+            if number % PORTS_PER_TURN == 0:
+                await asyncio.sleep(0)
+            if port not in self._refused and not self._closed:
                 self._listen(port, uri)
 
     async def listen_for_announced(self, topic: str, uris: Sequence[str]) -> None:
@@ -247,6 +252,7 @@ class Alias:
 
     async def _serve(self, port: int, conn: socket.socket, peer: str) -> None:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
+        await self._callers.begin()
         self._context.refresh_networks()
         if self._context.standing(peer) is not Standing.ADMITTED:
             log.debug("%s may not use the proxy: refused at port %d", peer, port)

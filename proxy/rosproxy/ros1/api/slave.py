@@ -165,6 +165,7 @@ class SlaveApi:
             await self._context.after_registration(endpoint)
             topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
             await self._alias.listen_for_announced(topic, announced)
+            await self._context.take_turn(len(announced))
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
         node, addressing = self._context.node_asker(endpoint), self._context.addressing

@@ -10,6 +10,9 @@ address that registers them; and where the range is used up, a node that answers
 one that doesn't, whose registrations are taken back (`_make_room`). So neither dead URIs nor stale
 claims of former proxies keep a port from it.
 
+Who makes up names is told of in the log by its address, which comes first in each message: so the
+log's bound for one subject holds (`rosproxy.telemetry.logs`).
+
 A node that is admitted is looked at once, so that one which can't be reached is told of at once; a
 node that is known is taken for alive, whatever was believed of it.
 """
@@ -184,10 +187,11 @@ class NodeAdmission:
         if endpoint is None:
             return False
         label, port, fields = endpoint.label, endpoint.port, endpoint.log_fields
+        text = "%s: %s does not answer: port %d is for another"
         await self._cleanup.give_up(endpoint)
         if registry.by_port.get(port) is endpoint and endpoint.expendable:
             self._leases.end(endpoint)
-            log.warning("%s does not answer: port %d is for another", label, port, extra=fields)
+            log.warning(text, endpoint.source, label, port, extra=fields)
         return True
 
     def _is_crowded(self, source: str) -> bool:
@@ -224,7 +228,7 @@ class NodeAdmission:
     def _refuse(self, uri: str, asker: Asker, text: str) -> Refusal:
         self._context.metrics.exhausted.inc()
         self._context.problems.add(asker.caller_id, text)
-        log.error("%s (%s) gets no port: %s", asker.caller_id, uri, text)
+        log.error("%s: %s (%s) gets no port: %s", asker.address, asker.caller_id, uri, text)
         return Refusal(text)
 
     def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
@@ -266,7 +270,7 @@ class NodeAdmission:
             "Set ROS_IP where it runs"
         )
         self._context.problems.add(caller_id, text)
-        log.warning("%s: %s", caller_id, text)
+        log.warning("%s: %s %s", source, caller_id, text)
         return Place(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
@@ -275,12 +279,12 @@ class NodeAdmission:
         endpoint.health.note(answer.probe, self._context.now())
         endpoint.health.pid = answer.pid
         uri = self._context.addressing.advertised_uri(endpoint)
-        log.info("%s at %s is %s", caller_id, endpoint.uri, uri)
+        log.info("%s at %s is %s", caller_id[:200], endpoint.uri[:200], uri[:200])
         if answer.probe is ProbeResult.ANSWERED and not _on_loopback(endpoint):
             return
         text = _unreachable_text(endpoint, answer.reason)
         self._context.problems.add(caller_id, text, endpoint.port)
-        log.warning("%s: %s", caller_id, text)
+        log.warning("%s: %s %s", endpoint.source, caller_id, text)
 
 
 def _service(call: Call) -> tuple[str, int] | None:

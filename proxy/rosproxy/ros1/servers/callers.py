@@ -5,10 +5,14 @@ anything that it sends is read. Programs on the proxy's own machine are always l
 
 An operator tells of a container some tenths of a second after its start, and the container's first
 call may be faster. So a call from an address that is not selected waits for news, up to
-NEWS_TIMEOUT. What is refused then gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes
-a fault for the master's last word and never asks again (master.cpp, execute), but goes on trying
-after anything that is no XML-RPC reply, as rospy does. So a node whose container is selected later
-still comes to register.
+NEWS_TIMEOUT. Right after a start nobody is known to be selected yet: where an operator runs, all
+calls wait for its first word, up to NEWS_TIMEOUT, and are let in if none comes, so that an operator
+that is away stops nobody (`Callers.hold`).
+
+What is refused gets HTTP 403 with the reason, not an XML-RPC fault: roscpp takes a fault for the
+master's last word and never asks again (master.cpp, execute), but goes on trying after anything
+that is no XML-RPC reply, as rospy does. So a node whose container is selected later still comes to
+register.
 """
 
 import asyncio
@@ -42,18 +46,41 @@ class Callers:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._news = asyncio.Event()
+        self._begun = asyncio.Event()
+        """Set once callers are judged; until then they wait."""
+        if not context.settings.admin_token_hash:
+            self._begun.set()
         self._waiting = Counter[str]()
         self._logged: float | None = None
 
     def select(self, addresses: Iterable[str]) -> None:
         """Take in which addresses an operator has selected, instead of those before."""
         self._context.selected = frozenset(addresses)
+        self._begun.set()
         self._context.problems.solved(SUBJECT)
         news, self._news = self._news, asyncio.Event()
         news.set()
 
+    async def hold(self) -> None:
+        """Have callers wait for an operator's first word, for NEWS_TIMEOUT at most from now on.
+
+        None is waited for without the hash of a token, by which operators start their proxies.
+        """
+        try:
+            async with asyncio.timeout(NEWS_TIMEOUT):
+                await self._begun.wait()
+        except TimeoutError:
+            log.info("no operator has told whom it selects: all of the inside networks are let in")
+            self._begun.set()
+
+    async def begin(self) -> None:
+        """Wait as long as callers are to wait after a start; see `hold`."""
+        await self._begun.wait()
+
     async def refusal(self, source: str) -> str | None:
         """Why a caller is refused, in one line; None if it is let in."""
+        if not self._begun.is_set() and not is_own(source):
+            await self.begin()
         if self._standing(source) is Standing.ADMITTED:
             return None
         await self._wait_for_news(source)

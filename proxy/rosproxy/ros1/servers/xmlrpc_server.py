@@ -50,9 +50,6 @@ MOST_LINE, MOST_FIELDS = 4096, 64
 """Longest line of a request's header in bytes, and how many fields it has: ROS's have five."""
 VALUE = 400
 """Bytes of memory that a value of a document takes while its call is answered."""
-MANY_VALUES = 100
-"""Values from which on documents are read one by one, with a look at all connections in between;
-registrations have six. Else many that come together would hold everybody else up."""
 
 _Answer = TypeVar("_Answer")
 
@@ -324,9 +321,7 @@ class XmlRpcServer(web.Server):
         call.body = call.body + rest if call.body else rest
         values = call.body.count(b"<value")
         call.hold(VALUE * values)
-        if values > MANY_VALUES:
-            async with self._context.turn:
-                await asyncio.sleep(0)
+        await self._context.take_turn(values)
 
     async def _pass_on(
         self, service: LongCalls, call: IncomingCall, long_call: LongCall

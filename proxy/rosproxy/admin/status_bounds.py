@@ -1,0 +1,71 @@
+"""How long the document at ``/status`` gets, whatever nodes and strangers call things.
+
+Names are theirs, and so is how many there are: registrations, and connections from outside. All
+nodes together have MOST characters for these; who has few is shown in whole, and of the others
+each gets as much as the next, so that nobody hides what a neighbour has. Within a node its names
+come first, since connections are what anybody outside can add.
+"""
+
+import json
+from collections.abc import Sequence
+from itertools import chain
+
+import msgspec
+
+from rosproxy.admin.status_document import ConnectionStatus, EndpointStatus, ProxyStatus
+
+MOST = 512 * 1024
+"""Characters of JSON for what nodes have registered and who is connected to them. A hundred nodes
+with ten topics and as many connections each have 250,000."""
+CONNECTION = 160
+"""Those of a connection besides its texts."""
+Item = str | ConnectionStatus
+_LISTS = ("nodes", "publishes", "services", "subscribes", "parameters", "connections")
+
+
+def bounded(status: ProxyStatus, most: int = MOST) -> ProxyStatus:
+    """The status with so much of each node's lists that all fit; ``left_out`` counts the rest."""
+    wanted = [sum(map(_size, _items(node))) for node in status.nodes]
+    if sum(wanted) <= most:
+        return status
+    shares = fair_shares(wanted, most)
+    nodes = (_cut(node, share) for node, share in zip(status.nodes, shares, strict=True))
+    return msgspec.structs.replace(status, nodes=tuple(nodes))
+
+
+def fair_shares(wanted: Sequence[int], most: int) -> list[int]:
+    """How much each gets of ``most``: what it wants, or as much as all others that want more."""
+    shares, left = [0] * len(wanted), most
+    by_size = sorted(range(len(wanted)), key=wanted.__getitem__)
+    for served, index in enumerate(by_size):
+        shares[index] = min(wanted[index], left // (len(wanted) - served))
+        left -= shares[index]
+    return shares
+
+
+def _cut(node: EndpointStatus, share: int) -> EndpointStatus:
+    """A node with the first items of its lists, as many as fit."""
+    lists: dict[str, tuple[Item, ...]] = {}
+    left_out = 0
+    for name in _LISTS:
+        kept: list[Item] = []
+        for item in getattr(node, name):
+            share -= _size(item)
+            if share >= 0:
+                kept.append(item)
+            else:
+                left_out += 1
+        lists[name] = tuple(kept)
+    return msgspec.structs.replace(node, **lists, left_out=left_out)
+
+
+def _items(node: EndpointStatus) -> chain[Item]:
+    return chain.from_iterable(getattr(node, name) for name in _LISTS)
+
+
+def _size(item: Item) -> int:
+    """Characters of an item as JSON, with what separates it from the next; about."""
+    if isinstance(item, str):
+        return len(json.dumps(item)) + 2
+    texts = item.kind, item.name, item.caller_id, item.peer
+    return CONNECTION + sum(len(json.dumps(text)) for text in texts)

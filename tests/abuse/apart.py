@@ -1,0 +1,73 @@
+"""A network namespace for a proxy that is to take the tests' addresses for other machines'.
+
+On loopback every address is the proxy's own machine's, whose programs are always let in, and a
+node's word for where it is counts for less. Here the proxy is a machine of its own with two
+interfaces' worth of addresses on one cable; the other end of it is this machine, where all nodes,
+the master and the neighbours have addresses in either network.
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+# 198.18.0.0/15 is for tests of networks (RFC 2544): nothing else on this machine has it.
+APART, INSIDE = "198.18.2.1", "198.18.2.0/24"
+"""The proxy's address inside, and its inside network."""
+APART_HOST, APART_MASTER = "198.18.1.254", "198.18.1.1"
+"""What outside knows the proxy's machine by, and the master's address."""
+NODES = tuple(f"198.18.2.{number}" for number in range(11, 31))
+STRANGERS = tuple(f"198.18.1.{number}" for number in range(11, 31))
+"""Machines outside."""
+
+
+NAME = f"abuse-{os.getpid()}"
+NAMES = Path("/etc/netns") / NAME
+"""Whose files stand in for those of /etc in the namespace (ip-netns(8))."""
+
+
+@contextmanager
+def a_silent_name_server(hosts: Mapping[str, str]) -> Iterator[None]:
+    """Have a proxy that is started meanwhile know these hosts; it waits in vain for all others."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind((APART_MASTER, 53))
+        NAMES.mkdir(parents=True)
+        try:
+            (NAMES / "resolv.conf").write_text(f"nameserver {APART_MASTER}\n")
+            lines = [f"{address} {name}\n" for name, address in hosts.items()]
+            (NAMES / "hosts").write_text("".join(lines))
+            yield
+        finally:
+            shutil.rmtree(NAMES)
+
+
+class Apart:
+    """The namespace; root makes and removes it."""
+
+    def __init__(self) -> None:
+        near, far = "abuse-near", "abuse-far"
+        _ip("netns", "add", NAME)
+        _ip("link", "add", near, "type", "veth", "peer", "name", far, "netns", NAME)
+        for address in (APART_MASTER, *STRANGERS, *NODES):
+            _ip("address", "add", f"{address}/24", "dev", near)
+        for address in (APART, APART_HOST):
+            _ip("-n", NAME, "address", "add", f"{address}/24", "dev", far)
+        for command in (("link", "set", near), ("-n", NAME, "link", "set", far)):
+            _ip(*command, "up")
+        _ip("-n", NAME, "link", "set", "lo", "up")
+
+    @property
+    def prefix(self) -> list[str]:
+        """A command that runs another one, which follows it, in this namespace."""
+        return ["ip", "netns", "exec", NAME]
+
+    def remove(self) -> None:
+        """Remove it, and the cable with it."""
+        _ip("netns", "delete", NAME)
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True)

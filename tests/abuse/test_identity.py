@@ -1,0 +1,168 @@
+"""Who may not use the proxy, claims to be another, or takes every port: others are served."""
+
+import asyncio
+import json
+from contextlib import AsyncExitStack
+from time import monotonic
+
+import pytest
+
+from examples.demo.fake_http import free_ports
+from rosproxy.settings import hash_token
+from tests.abuse.apart import APART_HOST, NODES, STRANGERS
+from tests.integration.claims import claim, silent_servers
+from tests.integration.net import (
+    HOST,
+    NODE,
+    OTHER_NODE,
+    THIRD_NODE,
+    connect,
+    exchange,
+    greet,
+    knock,
+    post,
+    rpc,
+    service_header,
+    topic_header,
+    until,
+    xml,
+)
+from tests.integration.proxy import PORTS
+
+AT_ONCE = 3.0
+"""Seconds after which a node that registers has been kept waiting, on a busy machine too."""
+TOKEN = "the operator's"
+
+
+def registration(name: str, uri: str) -> bytes:
+    return post(xml("registerPublisher", name, "/t", "x/Y", uri))
+
+
+async def test_strangers_flood_the_master_port(apart, apart_master, make_node):
+    node = await make_node(address=NODES[0])
+    lease = await apart.publish(node)
+    with apart.watched():
+        async with AsyncExitStack() as stack:
+            for number in range(400):
+                where = STRANGERS[number % len(STRANGERS)]
+                wire = await stack.enter_async_context(connect(apart.master, where))
+                await wire.send(post(b" " * 100_000, "Content-Length: 4000000"))
+            calls = [
+                exchange(apart.master, registration(f"/s{i}", f"http://{where}:4000/"), where)
+                for i, where in enumerate(STRANGERS * 10)
+            ]
+            refused = asyncio.gather(*calls)
+            began = monotonic()
+            assert (await node.publish(apart.master, "/more"))[0] == 1
+            assert monotonic() - began < AT_ONCE
+            assert {reply.status for reply in await refused} == {403}
+            assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
+        assert len(apart.status()["nodes"]) == 1
+    assert set(apart_master.nodes) == {node.name}
+
+
+async def test_who_is_not_selected_floods_the_master_port(start_apart, make_node):
+    """Where an operator runs: a new container waits for the news as long as they do.
+
+    Some call before the operator has told for the first time after the start.
+    """
+    apart = start_apart(admin_token_hash=hash_token(TOKEN))
+    node, late = await make_node(address=NODES[0]), await make_node("/late", NODES[1])
+
+    async def select(*addresses: str) -> None:
+        told = json.dumps({"selected": addresses}).encode()
+        request = post(told, f"Authorization: Bearer {TOKEN}", path="/containers")
+        assert (await exchange(apart.admin, request, STRANGERS[0])).status == 200
+
+    early = asyncio.gather(
+        *(
+            exchange(apart.master, registration(f"/e{i}", f"http://{where}:4000/"), where)
+            for i, where in enumerate(NODES[8:12])
+        )
+    )
+    await until(lambda: apart.status()["master"]["up"], "the master is found")
+    await select(NODES[0])
+    lease = await apart.publish(node)
+    with apart.watched():
+        calls = [
+            exchange(apart.master, registration(f"/s{i}", f"http://{where}:4000/"), where)
+            for i, where in enumerate(NODES[2:8] * 80)
+        ]
+        refused = asyncio.gather(*calls)
+        waiting = asyncio.create_task(late.publish(apart.master))
+        assert (await node.publish(apart.master, "/more"))[0] == 1
+        await select(NODES[0], NODES[1])
+        began = monotonic()
+        assert (await waiting)[0] == 1
+        assert monotonic() - began < AT_ONCE
+        assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
+        assert {reply.status for reply in [*await refused, *await early]} == {403}
+    assert {name for held in apart.status()["nodes"] for name in held["nodes"]} == {
+        node.name,
+        late.name,
+    }
+
+
+async def test_dead_uris_of_many_sources(abused, make_node):
+    """Some refuse, behind some are programs that never answer; all ports go to nodes that live."""
+    sources = [f"127.0.2.{number}" for number in range(21, 29)]
+    nodes = [await make_node(f"/n{i}", (NODE, THIRD_NODE)[i % 2]) for i in range(PORTS)]
+    with abused.watched():
+        async with silent_servers(OTHER_NODE, 8) as silent:
+            dead = [(where, f"http://{where}:{i}/") for i in range(1, 41) for where in sources]
+            mute = [(OTHER_NODE, f"http://{one.address[0]}:{one.address[1]}/") for one in silent]
+            calls = [
+                exchange(abused.master, registration(f"/d{i}", uri), where)
+                for i, (where, uri) in enumerate([*dead, *mute * 5])
+            ]
+            attack = asyncio.gather(*calls, return_exceptions=True)
+            await until(lambda: len(abused.status()["nodes"]) == PORTS, "all ports are taken")
+            for node in nodes:
+                began = monotonic()
+                assert (await node.publish(abused.master))[0] == 1
+                assert monotonic() - began < AT_ONCE
+            leases = [abused.lease(node) for node in nodes]
+            assert [(await rpc(lease, "getPid", "/n"))[2] for lease in leases] == [100] * PORTS
+            attack.cancel()
+
+
+async def test_forged_addresses_of_others(apart, apart_master, make_node):
+    """Neither a node that never joined nor one outside is published by somebody else."""
+    evil, node = await make_node("/evil", NODES[0]), await make_node("/good", NODES[1])
+    victims = [await make_node("/victim", NODES[2]), await make_node("/robot", STRANGERS[0])]
+    lease = await apart.publish(node)
+    with apart.watched():
+        for victim in [*victims, node]:
+            calls = [
+                {"methodName": "registerPublisher", "params": [f"/evil{i}", "/rosout", "*", uri]}
+                for i, uri in enumerate([victim.uri] * 100)
+            ]
+            await rpc(apart.master, "system.multicall", calls, source=evil.address)
+        assert (await rpc(lease, "getPid", "/n", source=STRANGERS[1]))[2] == node.pid
+        for held in apart.status()["nodes"]:
+            where = APART_HOST, held["port"]
+            if where != lease:
+                assert await knock(where, topic_header("/rosout"), STRANGERS[1]) != "answered"
+    asked = {header["callerid"] for victim in victims for header in victim.headers}
+    assert asked <= {"/rosproxy"}  # it only asks them who they are
+    assert apart_master.nodes[node.name].startswith(f"http://{APART_HOST}:{lease[1]}/")
+    assert not [uri for uri in apart_master.nodes.values() for one in victims if uri == one.uri]
+
+
+@pytest.mark.parametrize("kind", ["refusing", "silent"])
+async def test_a_range_full_of_stale_claims(start_abused, master, make_node, kind):
+    """Former proxies left eight dead nodes; the next one registers in the first second."""
+    first = free_ports(PORTS)
+    node = await make_node()
+    async with silent_servers(OTHER_NODE, PORTS) as silent:
+        for number, server in enumerate(silent):
+            inside = number + 1 if kind == "refusing" else server.address[1]
+            await claim(master, f"/dead{number}", first + number, f"{OTHER_NODE}:{inside}")
+        ports = f"{first}-{first + PORTS - 1}"
+        abused = start_abused(master_uri=master.uri, port_range=ports)
+        began = monotonic()
+        with abused.watched():
+            assert (await node.serve(abused.master))[0] == 1
+            assert monotonic() - began < AT_ONCE
+            assert master.holds("services", "/add") == [f"rosrpc://{HOST}:{abused.lease(node)[1]}"]
+            assert (await greet(abused.lease(node), service_header()))["callerid"] == node.name

@@ -1,0 +1,55 @@
+"""The document at ``/status`` stays small, and nobody hides what a neighbour has."""
+
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.admin.status_bounds import MOST, bounded, fair_shares
+from rosproxy.admin.status_document import ConnectionStatus, EndpointStatus, ProxyStatus, to_json
+
+NAMES = tuple(f"/topic{number}" for number in range(20))
+
+
+@given(st.lists(st.integers(0, 10**6), max_size=30), st.integers(0, 10**6))
+def test_shares_are_fair(wanted: list[int], most: int) -> None:
+    shares = fair_shares(wanted, most)
+    assert all(0 <= share <= want for share, want in zip(shares, wanted, strict=True))
+    assert sum(shares) <= most
+    cut = [share for share, want in zip(shares, wanted, strict=True) if share < want]
+    if cut:  # nobody has more than one that was cut, but for what does not divide
+        assert max(shares) - min(cut) <= 1
+        assert most - sum(shares) < len(wanted)
+
+
+@given(st.lists(st.lists(st.text(max_size=300), max_size=30), max_size=6), st.integers(0, 5000))
+def test_it_fits_and_counts_what_is_missing(given_names: list[list[str]], most: int) -> None:
+    status = ProxyStatus(nodes=tuple(EndpointStatus(publishes=tuple(n)) for n in given_names))
+    found = bounded(status, most)
+    empty = ProxyStatus(nodes=(EndpointStatus(),) * len(given_names))
+    longest = len(json.dumps(to_json(empty))) + most + 10 * len(given_names)
+    assert len(json.dumps(to_json(found))) <= longest
+    for names, node in zip(given_names, found.nodes, strict=True):
+        assert node.left_out == len(names) - len(node.publishes)
+
+
+def test_who_has_little_is_shown_in_whole() -> None:
+    evil = EndpointStatus(
+        nodes=("/evil",),
+        subscribes=tuple("/" + "x" * 1000 + str(number) for number in range(2000)),
+        connections=(ConnectionStatus(caller_id="y" * 1000),) * 2000,
+    )
+    good = EndpointStatus(
+        nodes=("/good",), publishes=NAMES, connections=(ConnectionStatus(name="/topic1"),)
+    )
+    first, second, third = bounded(ProxyStatus(nodes=(evil, good, evil))).nodes
+    assert second == good
+    assert (first.nodes, first.connections) == (("/evil",), ())
+    assert first == third
+    assert first.left_out == 4000 - len(first.subscribes)
+    assert len(first.subscribes) > 0.9 * MOST / 2 / 1010
+
+
+def test_what_fits_is_left_as_it_is() -> None:
+    status = ProxyStatus(nodes=(EndpointStatus(publishes=NAMES),))
+    assert bounded(status) is status
