@@ -1,8 +1,9 @@
 # The proxy's image:     docker build --target proxy -t rosproxy .
 # The operator's image:  docker build --target operator -t rosproxy-operator .
 # `make image` builds both, with the project's version as tag.
-# Any base with Debian's packages will do; where it has no Python, Debian's is installed.
-ARG BASE_IMAGE=python:3.12-slim-bookworm
+# Any base with Debian's packages will do; where it has no Python, Debian's is installed. The digest is
+# what is built on, for all platforms; `docker buildx imagetools inspect` on the tag tells the newest.
+ARG BASE_IMAGE=python:3.12-slim-bookworm@sha256:782412e85d0f0984994c290652577d4018aff08145c85b262bb63dc0c7522254
 
 FROM ${BASE_IMAGE} AS base
 ENV PYTHONDONTWRITEBYTECODE=1 \

@@ -22,6 +22,13 @@ def test_every_pin_is_a_version_with_hashes() -> None:
         assert all(re.fullmatch(r"    --hash=sha256:[0-9a-f]{64}( \\)?", line) for line in hashes)
 
 
+def test_images_are_built_on_what_a_digest_names() -> None:
+    text = (ROOT / "Dockerfile").read_text()
+    assert re.search(r"^ARG BASE_IMAGE=[\w.:/-]+@sha256:[0-9a-f]{64}$", text, re.M)
+    stages = set(re.findall(r"^FROM \S+ AS (\S+)$", text, re.M))
+    assert set(re.findall(r"^FROM (\S+)", text, re.M)) - stages == {"${BASE_IMAGE}"}
+
+
 def test_every_pin_is_of_use_to_somebody() -> None:
     """Those without are left over: make lock."""
     pinned = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.M)
