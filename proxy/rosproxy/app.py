@@ -36,7 +36,6 @@ from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.judge import PolicyJudge
@@ -278,7 +277,7 @@ class App:
         with _binding(option, f"port {port}"):
             sock = sockets.listen(self.settings.bind, port)
         context, greeting = self.context, f"rosproxy: {what}; nodes use it by ROS_MASTER_URI\n"
-        server = XmlRpcServer(context, service, greeting, MASTER_CALL, service, guard)
+        server = XmlRpcServer(context, service, greeting, context.master_call, service, guard)
         self._servers.append(server)
         self._acceptors.append(Acceptor(context.tasks, sock, server.dispatch, context.gate))
 

@@ -74,6 +74,8 @@ class Settings:
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
     admin_token_hash: str | None = None
+    max_lease_call: int = 1
+    max_master_call: int = 4
     max_body: int = 64
     max_buffered: int = 32
     max_connections_per_source: int = 4096

@@ -11,7 +11,7 @@ from examples.demo.fake_http import value
 from rosproxy.net import gate, sockets
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, INVALID_REQUEST, PARSE_ERROR
-from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL, MASTER_CALL
+from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
 from tests.integration.net import (
     MASTER,
     NODE,
@@ -51,7 +51,7 @@ async def test_long_parameters_pass_unread_both_ways(proxy, master, monkeypatch,
 async def test_a_long_parameter_reaches_its_subscriber(proxy, master, node):
     await node.publish(proxy.master)
     body = xml("paramUpdate", "/master", "/p/", LISTED)
-    assert len(body) > LEASE_CALL.size
+    assert len(body) > lease_call(1).size
     assert (await exchange(proxy.lease(node), post(body), MASTER)).value[0] == 1
     assert ("paramUpdate", ("/master", "/p/", LISTED)) in node.calls
     assert body in [request.body for request in node.requests]
@@ -90,7 +90,7 @@ async def test_a_long_call_with_an_odd_head_is_bounded(proxy):
     odd = body.replace(b"<methodCall>", b"<methodCall><!-- odd -->")
     assert (await exchange(proxy.master, post(odd), NODE)).value[0] == 1  # read as a whole
     longer = odd.replace(b"xxx", b"xxxxx")
-    assert len(longer) > MASTER_CALL.size
+    assert len(longer) > master_call(4).size
     assert (await exchange(proxy.master, post(longer), NODE)).status == 413
 
 
@@ -114,7 +114,7 @@ async def test_a_long_multicall_with_a_registration_is_read_or_refused(proxy, ma
     register = ["/talker", "/chatter", "x/Y", node.uri]
     calls = [*parameters(500, "x" * 500), {"methodName": "registerPublisher", "params": register}]
     body = xml("system.multicall", calls)
-    assert passing.SHORT < len(body) < MASTER_CALL.size
+    assert passing.SHORT < len(body) < master_call(4).size
     assert (await exchange(proxy.master, post(body), NODE)).value[-1][0][0] == 1
     assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
     longer = xml("system.multicall", [*parameters(3000, "x" * 2000), calls[-1]])
@@ -157,11 +157,21 @@ async def test_a_registration_whose_client_has_gone_is_not_half_noted(proxy, mas
 
 async def test_too_many_elements_are_a_fault(proxy, node):
     await node.publish(proxy.master)
-    for where, limits in ((proxy.lease(node), LEASE_CALL), (proxy.master, MASTER_CALL)):
+    for where, limits in ((proxy.lease(node), lease_call(1)), (proxy.master, master_call(4))):
         params = b"<param><value/></param>" * (limits.elements // 2)
         body = xml("registerService").replace(b"<params>", b"<params>" + params)
         assert passing.SHORT < len(body) < limits.size
         assert (await exchange(where, post(body), NODE)).fault == PARSE_ERROR
+
+
+async def test_the_bounds_of_calls_are_options(make_proxy, node):
+    proxy = await make_proxy(max_lease_call=2, max_master_call=1)
+    await node.publish(proxy.master)
+    topics = [f"http://{NODE}:{1024 + i}/" for i in range(6000)]  # 12,000 elements
+    update = post(xml("publisherUpdate", "/master", "/other", topics))
+    assert (await exchange(proxy.lease(node), update, MASTER)).value[0] == 1
+    register = post(xml("registerPublisher", "/n", "/t", "x" * master_call(1).size, node.uri))
+    assert (await exchange(proxy.master, register, NODE)).status == 413
 
 
 async def test_a_call_that_only_the_master_may_make_is_not_parsed(make_proxy, node, monkeypatch):

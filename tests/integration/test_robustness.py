@@ -15,7 +15,7 @@ from examples.demo.fake_http import Where
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS
-from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL, MASTER_CALL
+from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
 from tests.integration.net import HOST, NODE, connect, exchange, post, rpc, xml
 
 BOTH_LOOPS = True
@@ -31,7 +31,7 @@ class Door:
 
     address: Where
     pid: int
-    longest: int = MASTER_CALL.size
+    longest: int = master_call(4).size
 
     async def works(self) -> bool:
         """Whether it still answers as it should."""
@@ -43,7 +43,7 @@ async def door(request: Any, make_proxy: Any, master: Any, node: Any) -> Door:
     proxy = await make_proxy(publish_master=True)
     if request.param == "node port":
         await node.publish(proxy.master)
-        return Door(proxy.lease(node), node.pid, LEASE_CALL.size)
+        return Door(proxy.lease(node), node.pid, lease_call(1).size)
     published = HOST, proxy.settings.publish_master
     return Door(proxy.master if request.param == "master port" else published, master.pid)
 

@@ -148,6 +148,19 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     help="How topics' bytes are forwarded: by the kernel, where the proxy may; spliced; or copied.",
 )
 @click.option(
+    "--max-lease-call",
+    type=options.MEBIBYTES,
+    default=1,
+    help="Longest call of outside to a node, with 10,000 XML elements for each MiB.",
+)
+@click.option(
+    "--max-master-call",
+    type=options.MEBIBYTES,
+    default=4,
+    help="Longest call of a node to the master that holds addresses, with 5,000 elements for each "
+    "MiB.",
+)
+@click.option(
     "--max-body",
     type=options.MEBIBYTES,
     default=64,

@@ -16,6 +16,7 @@ from rosproxy.net.tasks import Tasks
 from rosproxy.ros1.clients.master import MasterClient
 from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
+from rosproxy.ros1.protocol.xmlrpc import limits
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.selection import Standing, standing
@@ -42,6 +43,7 @@ class Context:
 
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
     ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
+    ``lease_call`` and ``master_call`` bound what is read of a call from outside and from inside.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
     ``passing`` the calls that pass unread; ``refusals`` tells what is over these and other bounds.
     ``policy``: what outside may see and do.
@@ -59,6 +61,8 @@ class Context:
             settings.max_connections_per_lease,
             self.refusals.note,
         )
+        self.lease_call = limits.lease_call(settings.max_lease_call)
+        self.master_call = limits.master_call(settings.max_master_call)
         held = settings.max_buffered * MEBIBYTE
         self.buffered = Budget(held, held // 2, "bytes of requests and replies")
         self._turn = asyncio.Lock()

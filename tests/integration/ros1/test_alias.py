@@ -11,7 +11,6 @@ import pytest
 from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.servers import callers
 from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
@@ -201,7 +200,7 @@ async def test_what_is_no_call_is_answered_and_not_forwarded(proxy: Proxy, robot
 
 async def test_a_body_beyond_the_bound_is_refused(proxy: Proxy, robot: FakeNode) -> None:
     await look_up(proxy, robot)
-    size = MASTER_CALL.size + 1
+    size = proxy.app.context.master_call.size + 1
     assert (await exchange(slave(robot), post(b"x" * size), NODE)).status == 413
     robot.answers["getPid"] = ok(b"x" * size)
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"

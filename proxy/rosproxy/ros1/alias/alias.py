@@ -33,7 +33,6 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.servers.callers import Callers
@@ -65,7 +64,7 @@ class Alias:
         self._refused: set[int] = set()
         self._relays = OpenRelays()
         greeting = "rosproxy: a ROS node on the master's host\n"
-        self._server = XmlRpcServer(context, self._forward, greeting, MASTER_CALL)
+        self._server = XmlRpcServer(context, self._forward, greeting, context.master_call)
         self._closed = False
         self._asking = asyncio.Lock()
         self._asked: set[str] = set()
@@ -292,7 +291,7 @@ class Alias:
         """A node's reply to a call. Raises XmlRpcError, Unreachable."""
         if call.comes_from(self._context.instance):
             raise Unreachable(f"the address of {self._name} leads back to the proxy itself")
-        parsed = xmlrpc.parse_call(call.body, MASTER_CALL)
+        parsed = xmlrpc.parse_call(call.body, self._context.master_call)
         port, upstream = call.local.port, self._context.upstream
         answer = upstream.post_to_node(HostPort(self._name, port), call.body, path=call.path)
         try:

@@ -24,7 +24,7 @@ from rosproxy.ros1.protocol.master_methods import NO_ROW, row
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL
+from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import master_api
@@ -64,7 +64,7 @@ class MasterApi:
         if not judged and await _is_long_and_passes(call.body):
             return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
-            request = master_api.read_request(call.body, asker)
+            request = master_api.read_request(call.body, asker, self._context.master_call)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
@@ -74,7 +74,7 @@ class MasterApi:
         """How to watch a long call while it passes; None if it has to be read."""
         if method in (MULTICALL, "getParamNames") and self._judge.judges_parameters(None):
             return None
-        return _watch(method, size)
+        return _watch(method, size, self._context.master_call)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
@@ -223,7 +223,7 @@ class PublishedMaster:
         if await _is_long_and_passes(call.body):
             return await upstream.pass_to_master(call.body)
         asker = Asker(call.source, call.local.host, master=self._address)
-        request = master_api.read_request(call.body, asker)
+        request = master_api.read_request(call.body, asker, self._context.master_call)
         if request.plain:
             return await upstream.pass_to_master(call.body)
         reply = await upstream.post_to_master(call.body)
@@ -231,7 +231,7 @@ class PublishedMaster:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        return _watch(method, size)
+        return _watch(method, size, self._context.master_call)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
@@ -242,9 +242,9 @@ def _passes(method: str) -> bool:
     return row(method) == NO_ROW
 
 
-def _watch(method: str, size: int) -> passing.CallWatch | None:
+def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:
     if method == MULTICALL:
-        return passing.MulticallWatch(_passes) if size > MASTER_CALL.size else None
+        return passing.MulticallWatch(_passes) if size > limits.size else None
     return passing.CallWatch() if _passes(method) else None
 
 

@@ -21,7 +21,6 @@ from rosproxy.ros1.protocol.bounds import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall, passing
-from rosproxy.ros1.protocol.xmlrpc.limits import LEASE_CALL
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.rewriting import policing, slave_api
@@ -53,7 +52,7 @@ class SlaveApi:
         self._context, self._leases, self._alias = context, leases, alias
         self._adopter, self._tcpros, self._judge = adopter, tcpros, judge
         greeting = "rosproxy: slave API of a ROS node behind it\n"
-        self.server = XmlRpcServer(context, self, greeting, LEASE_CALL, self)
+        self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
         """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
@@ -70,7 +69,7 @@ class SlaveApi:
         if method is not None and not await self._is_for(method, call.source):
             return self._refused(method, NOT_THE_MASTER)  # before it is read
         try:
-            parsed = xmlrpc.parse_call(call.body, LEASE_CALL)
+            parsed = xmlrpc.parse_call(call.body, self._context.lease_call)
         except xmlrpc.XmlRpcError:
             self._context.metrics.count("slave", "other", "malformed")
             raise
@@ -123,7 +122,9 @@ class SlaveApi:
         if inner is None:
             return multicall.fault_value(xmlrpc.INVALID_REQUEST, "rosproxy: not a call")
         body = multicall.single_call(inner)
-        reply = await self._one(endpoint, xmlrpc.parse_call(body, LEASE_CALL), body, call)
+        reply = await self._one(
+            endpoint, xmlrpc.parse_call(body, self._context.lease_call), body, call
+        )
         if isinstance(reply, LongReply):
             reply.close()
             text = f"a reply of {reply.size} bytes is too long for a {multicall.MULTICALL}"

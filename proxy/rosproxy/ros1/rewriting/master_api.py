@@ -17,7 +17,7 @@ from rosproxy.ros1.protocol.master_methods import NO_ROW, Kind, Reply, resolve_n
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
-from rosproxy.ros1.protocol.xmlrpc.limits import MASTER_CALL, OWN_REPLY, REPLY, Limits
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import (
     MULTICALL,
     inner_calls,
@@ -199,9 +199,9 @@ class MasterReply(msgspec.Struct, frozen=True):
                 yield from (text for text in texts if text)
 
 
-def read_request(body: bytes, asker: Asker) -> Request:
-    """Parse a request. Raises XmlRpcError if it is none."""
-    call = xmlrpc.parse_call(body, MASTER_CALL)
+def read_request(body: bytes, asker: Asker, limits: Limits = OWN_REPLY) -> Request:
+    """Parse a request within limits. Raises XmlRpcError if it is none, or is beyond them."""
+    call = xmlrpc.parse_call(body, limits)
     if call.method != MULTICALL:
         return Request(body, (call,), False, replace(asker, caller_id=_caller_id(call)))
     calls = tuple(inner_calls(call))

@@ -17,11 +17,20 @@ class Limits(msgspec.Struct, frozen=True):
     depth: int = 64
 
 
-LEASE_CALL = Limits(1024 * 1024, 10_000)
-"""A call from outside to a node. The largest real one, publisherUpdate, has two elements and some
-60 bytes for each publisher of a topic."""
-MASTER_CALL = Limits(4 * 1024 * 1024, 20_000)
-"""A call of a node inside to the master. Registrations have twenty elements."""
+def lease_call(mebibytes: int) -> Limits:
+    """Of a call from outside to a node.
+
+    The largest real one, publisherUpdate, has two elements and some 60 bytes for each publisher of
+    a topic.
+    """
+    return Limits(mebibytes * 1024 * 1024, mebibytes * 10_000)
+
+
+def master_call(mebibytes: int) -> Limits:
+    """Of a call of a node inside to the master. Registrations have twenty elements."""
+    return Limits(mebibytes * 1024 * 1024, mebibytes * 5_000)
+
+
 REPLY = Limits(4 * 1024 * 1024, 20_000)
 """A reply in which addresses are replaced: the publishers of a topic, a node's connections."""
 OWN_REPLY = Limits(64 * 1024 * 1024, 500_000)
