@@ -29,13 +29,14 @@ from rosproxy.telemetry.text import brief, clean
 LONGEST = 2000
 """Characters of a message at most, and of each exception's text: the longest of the proxy's own
 has some 400."""
-BURST_OF_ONE, ONE_EVERY = 5, 10.0
+BURST_OF_ONE, ONE_EVERY = 20, 5.0
 """Warnings and errors of one kind about one subject that are written at once, and the seconds
-after which one more is. What is told of a real node changes a few times in a minute at most."""
+after which one more is. What is told of a real node changes a few times in a minute at most; where
+the subject is an address, there may be some nodes that each say the same of five topics."""
 BURST_OF_ALL, ALL_EVERY = 2000, 1.0
 """The same for all messages of one kind: a thousand nodes that start at once have a line each."""
 USUAL = 200
-"""Characters of a message that counts as one of its kind; a longer one counts as several."""
+"""Characters of a message that counts as one; a longer one counts as several."""
 MOST_KNOWN = 1024
 """Kinds and subjects that are remembered; of more the one that came last the longest ago goes."""
 
@@ -55,9 +56,9 @@ class Floods(logging.Filter):
     """Leaves out messages that come too often, and says in the next of their kind how many.
 
     Messages are of one kind if they come from the same call: logger, level and template are the
-    same; the subject is the template's first argument. Each kind has a bound, which a single
-    subject can't use up with warnings, and which long messages use up sooner. Debug messages are
-    for somebody who looks on: they are all written.
+    same; the subject is the template's first argument. Each kind has a bound, and warnings
+    and errors about one subject have a lower one; long messages use both up sooner. Debug messages
+    are for somebody who looks on: they are all written.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -71,12 +72,12 @@ class Floods(logging.Filter):
         if record.levelno < logging.INFO:
             return True
         kind = record.name, record.levelno, str(record.msg)[:LONGEST]
+        weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
         with self._lock:
             if record.levelno >= logging.WARNING:
                 one = self._bucket((*kind, _subject(record)), BURST_OF_ONE, ONE_EVERY)
-                if not _take(one, record):
+                if not _take(one, record, weight):
                     return False
-            weight = 1 + min(len(record.getMessage()), LONGEST) // USUAL
             return _take(self._bucket(kind, BURST_OF_ALL, ALL_EVERY), record, weight)
 
     def _bucket(self, key: Hashable, burst: int, every: float) -> _Bucket:
@@ -91,7 +92,7 @@ class Floods(logging.Filter):
         return bucket
 
 
-def _take(bucket: _Bucket, record: logging.LogRecord, weight: int = 1) -> bool:
+def _take(bucket: _Bucket, record: logging.LogRecord, weight: int) -> bool:
     """Whether a bound allows one more record, which then tells what was left out before."""
     if bucket.left < 1:
         bucket.left_out += 1

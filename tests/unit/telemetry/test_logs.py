@@ -144,7 +144,14 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
     )
     assert json.loads(JsonLines().format(again))["left_out"] == 1000 - BURST_OF_ONE
     clock.now += 1000 * ONE_EVERY
-    assert len(written(floods, (record("%s: gone", "/a") for _ in range(10)))) == BURST_OF_ONE
+    assert len(written(floods, (record("%s: gone", "/a") for _ in range(99)))) == BURST_OF_ONE
+
+
+def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -> None:
+    """A node registers some five times when it starts, and is refused each time."""
+    floods, why = Floods(clock), "all ports of the range are in use; " * 7
+    told = [record("%s: %s: %s", "10.0.0.5", node, why) for node in ("/a", "/b") for _ in range(5)]
+    assert written(floods, told) == told
 
 
 @pytest.mark.parametrize("level", [logging.INFO, logging.ERROR])
