@@ -1,4 +1,4 @@
-"""Compiles the C++ test nodes, once per version of their sources.
+"""Compiles the C++ test nodes, once per version of their sources and of ROS.
 
     python -m tests.ros.cpp
 
@@ -14,7 +14,8 @@ import subprocess
 from pathlib import Path
 
 NODES = Path(__file__).parent / "nodes"
-CACHE = Path(__file__).parents[2] / "build" / "ros-nodes"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rosproxy/ros-nodes"
+"""Beside what other tests keep between runs, so that a fresh clone need not compile them."""
 PACKAGES = ("roscpp", "std_msgs", "actionlib", "topic_tools")
 FLAGS = ("-std=c++17", "-O1", "-w", "-DBOOST_BIND_GLOBAL_PLACEHOLDERS")
 
@@ -31,7 +32,8 @@ def compiled_node() -> Path:
 
 
 def _digest() -> str:
-    digest = hashlib.sha256(" ".join([*FLAGS, *PACKAGES]).encode())
+    versions = _pkg_config("--modversion")
+    digest = hashlib.sha256(" ".join([*FLAGS, *PACKAGES, *versions]).encode())
     for source in sorted(NODES.glob("*.[ch]pp")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
