@@ -11,6 +11,7 @@ import fcntl
 import hashlib
 import os
 import subprocess
+from functools import cache
 from pathlib import Path
 
 NODES = Path(__file__).parent / "nodes"
@@ -31,6 +32,7 @@ def compiled_node() -> Path:
     return binary
 
 
+@cache
 def _digest() -> str:
     versions = _pkg_config("--modversion")
     digest = hashlib.sha256(" ".join([*FLAGS, *PACKAGES, *versions]).encode())
