@@ -25,7 +25,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 from rosproxy.admin.requests import BodyError
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.http_client import TooLong, read_bounded
-from rosproxy.net.sockets import end_if_stalled
+from rosproxy.net.sockets import BACKLOG, end_if_stalled
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
@@ -68,7 +68,8 @@ class AdminServer:
         """Listen. Raises OSError."""
         self._runner = web.ServerRunner(_BoundedServer(self._answer))
         await self._runner.setup()
-        await web.TCPSite(self._runner, where.host, where.port).start()
+        # Who finds no place in the queue tries again after a second: too late for a health check.
+        await web.TCPSite(self._runner, where.host, where.port, backlog=BACKLOG).start()
 
     async def stop(self) -> None:
         """Stop listening."""
