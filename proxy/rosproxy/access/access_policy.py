@@ -117,7 +117,7 @@ class AccessPolicy:
 
         ``address`` is that of the node inside; None: any.
         """
-        return may_deny(self.layers, kinds, callers, address)
+        return any(may_deny(self._about(kind), (kind,), callers, address) for kind in kinds)
 
     def _note_change(self) -> None:
         self._by_kind.clear()
