@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from rosproxy.access.rules import MOST_RULES, Action, Rule, RuleKind, parse_rules
+from rosproxy.access.rules import MOST_RULES, Rule, RuleAction, RuleKind, parse_rules
 from rosproxy.net.addresses import parse_address
 
 MOST_LAYERS = 1024
@@ -41,15 +41,12 @@ class PolicyLayer(msgspec.Struct, frozen=True):
 
 
 class WrittenLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A layer as JSON has it. What is wrong in it is a ValueError that names layer and rule."""
+    """A layer as JSON has it; `read_layer` says what is wrong in it."""
 
     name: str
     rules: tuple[str, ...]
     mode: PolicyMode = PolicyMode.ENFORCE
     addresses: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        read_layer(self)
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -123,7 +120,7 @@ def may_deny(
     No callers: to anybody. ``address`` is that of the node inside; None: any.
     """
     return any(
-        rule.action is Action.DENY
+        rule.action is RuleAction.DENY
         and (not callers or any(rule.is_about(rule.kind, name) for name in callers))
         for layer in layers
         if layer.mode is PolicyMode.ENFORCE and (address is None or layer.is_for(address))
@@ -182,7 +179,7 @@ def _verdict(found: Iterable[tuple[PolicyLayer, Rule | None]]) -> Verdict:
     """What follows from the rule that decides in each layer: the first that is enforced denies."""
     told = ALLOWED
     for layer, rule in found:
-        if rule is None or rule.action is Action.ALLOW:
+        if rule is None or rule.action is RuleAction.ALLOW:
             continue
         if layer.mode is PolicyMode.ENFORCE:
             return Verdict(False, rule, layer.name)
@@ -196,9 +193,9 @@ def _first_below(layer: PolicyLayer, kind: RuleKind, prefix: str, caller: str) -
     for rule in layer.rules:
         if not rule.is_about(kind, caller):
             continue
-        if rule.action is Action.DENY and rule.may_match_below(prefix):
+        if rule.action is RuleAction.DENY and rule.may_match_below(prefix):
             return rule
-        if rule.action is Action.ALLOW and rule.covers_below(prefix):
+        if rule.action is RuleAction.ALLOW and rule.covers_below(prefix):
             return rule
     return None
 

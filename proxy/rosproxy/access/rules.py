@@ -24,7 +24,7 @@ _LONGEST_SHOWN = 80
 _EXAMPLE = "such as: deny publish /camera/* by /driver"
 
 
-class Action(Enum):
+class RuleAction(Enum):
     """What a rule does with what it matches."""
 
     ALLOW = "allow"
@@ -54,14 +54,14 @@ class RuleKind(Enum):
     """A method of a node inside that somebody outside calls."""
 
 
-_ACTIONS = {action.value: action for action in Action}
+_ACTIONS = {action.value: action for action in RuleAction}
 _KINDS = {kind.value: kind for kind in RuleKind}
 
 
 class Rule(msgspec.Struct, frozen=True):
     """A rule; ``str`` gives it as text, which `parse_rule` reads again."""
 
-    action: Action
+    action: RuleAction
     kind: RuleKind
     glob: str
     by: str = "*"

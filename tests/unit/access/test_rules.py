@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.access import rules
-from rosproxy.access.rules import Action, Rule, RuleKind, parse_rule, parse_rules
+from rosproxy.access.rules import Rule, RuleAction, RuleKind, parse_rule, parse_rules
 
 NAMES = st.text("/ab_.[!", max_size=12)
 GLOBS = st.text("/ab_.[!*?", max_size=10)
 WORDS = st.text("/ab*?[]{}-#", min_size=1, max_size=9).map(lambda text: f"/{text}")
 RULES = st.builds(
-    Rule, st.sampled_from(Action), st.sampled_from(RuleKind), WORDS, st.just("*") | WORDS
+    Rule, st.sampled_from(RuleAction), st.sampled_from(RuleKind), WORDS, st.just("*") | WORDS
 )
 
 
@@ -55,7 +55,7 @@ def test_a_hostile_glob_takes_no_time() -> None:
 
 @given(GLOBS, NAMES, NAMES)
 def test_what_may_match_below_a_prefix_is_never_missed(glob: str, prefix: str, rest: str) -> None:
-    rule = Rule(Action.DENY, RuleKind.GET_PARAM, glob)
+    rule = Rule(RuleAction.DENY, RuleKind.GET_PARAM, glob)
     matched = rules.matches(glob, prefix + rest)
     if matched:
         assert rule.may_match_below(prefix)

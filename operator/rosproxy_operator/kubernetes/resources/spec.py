@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from urllib.parse import urlsplit
 
 from rosproxy.access.layers import PolicyLayer, PolicyMode
-from rosproxy.access.rules import Action, Rule, RuleKind
+from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
@@ -50,7 +50,7 @@ RESOURCES: Json = {
 }
 _SLAVE_CONTROL = {"Any": "any", "Master": "master"}
 _POLICY_MODE = {"Enforce": PolicyMode.ENFORCE, "Audit": PolicyMode.AUDIT}
-_ACTION = {"Allow": Action.ALLOW, "Deny": Action.DENY}
+_ACTION = {"Allow": RuleAction.ALLOW, "Deny": RuleAction.DENY}
 RULE_KINDS = {
     "Publish": RuleKind.PUBLISH,
     "Serve": RuleKind.SERVE,
