@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 
 from rosproxy import __version__
 from rosproxy.admin import status_document as document
-from rosproxy.admin.status_bounds import bounded
+from rosproxy.admin.status_bounds import bounded, first_hidden
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
@@ -168,7 +168,8 @@ class ProxyState(Collector):
                 asked = KINDS[kind]
                 verdict = policy.judge(asked, name, [node], endpoint.address)
                 hidden.append(document.HiddenStatus(asked.value, name, node, verdict.reason))
-        return document.PolicyStatus(tuple(layers), tuple(hidden))
+        shown = first_hidden(hidden)
+        return document.PolicyStatus(tuple(layers), tuple(shown), len(hidden) - len(shown))
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
         problems = self._context.problems.at(endpoint.port)

@@ -8,15 +8,22 @@ come first, since connections are what anybody outside can add.
 
 import json
 from collections.abc import Sequence
-from itertools import chain
+from itertools import accumulate, chain
 
 import msgspec
 
-from rosproxy.admin.status_document import ConnectionStatus, EndpointStatus, ProxyStatus
+from rosproxy.admin.status_document import (
+    ConnectionStatus,
+    EndpointStatus,
+    HiddenStatus,
+    ProxyStatus,
+)
 
 MOST = 512 * 1024
 """Characters of JSON for what nodes have registered and who is connected to them. A hundred nodes
 with ten topics and as many connections each have 250,000."""
+MOST_HIDDEN = 256 * 1024
+"""The same for what the policy hides."""
 CONNECTION = 160
 """Those of a connection besides its texts."""
 Item = str | ConnectionStatus
@@ -31,6 +38,12 @@ def bounded(status: ProxyStatus, most: int = MOST) -> ProxyStatus:
     shares = fair_shares(wanted, most)
     nodes = (_cut(node, share) for node, share in zip(status.nodes, shares, strict=True))
     return msgspec.structs.replace(status, nodes=tuple(nodes))
+
+
+def first_hidden(hidden: Sequence[HiddenStatus], most: int = MOST_HIDDEN) -> list[HiddenStatus]:
+    """The first of the hidden names, as many as fit."""
+    sizes = accumulate(len(msgspec.json.encode(one)) for one in hidden)
+    return [one for one, size in zip(hidden, sizes, strict=True) if size <= most]
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:

@@ -159,10 +159,11 @@ class HiddenStatus(msgspec.Struct, frozen=True):
 
 
 class PolicyStatus(msgspec.Struct, frozen=True):
-    """The layers of rules in force, and what is hidden by them."""
+    """The layers of rules in force, what is hidden by them, and how much of that is left out."""
 
     layers: tuple[LayerStatus, ...] = ()
     hidden: tuple[HiddenStatus, ...] = ()
+    left_out: int = 0
 
 
 class ProblemStatus(msgspec.Struct, frozen=True):

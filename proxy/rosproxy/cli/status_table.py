@@ -82,7 +82,7 @@ def _policy(policy: document.PolicyStatus) -> str:
         + (" (audit only)" if layer.mode == "audit" else "")
         for layer in policy.layers
     )
-    return f"{listed(layers)}; {plural(len(policy.hidden), 'name')} hidden"
+    return f"{listed(layers)}; {plural(len(policy.hidden) + policy.left_out, 'name')} hidden"
 
 
 def _plane(plane: document.DataPlaneStatus) -> str:

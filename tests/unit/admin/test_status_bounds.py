@@ -5,8 +5,14 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.status_bounds import MOST, bounded, fair_shares
-from rosproxy.admin.status_document import ConnectionStatus, EndpointStatus, ProxyStatus, to_json
+from rosproxy.admin.status_bounds import MOST, MOST_HIDDEN, bounded, fair_shares, first_hidden
+from rosproxy.admin.status_document import (
+    ConnectionStatus,
+    EndpointStatus,
+    HiddenStatus,
+    ProxyStatus,
+    to_json,
+)
 
 NAMES = tuple(f"/topic{number}" for number in range(20))
 
@@ -53,3 +59,12 @@ def test_who_has_little_is_shown_in_whole() -> None:
 def test_what_fits_is_left_as_it_is() -> None:
     status = ProxyStatus(nodes=(EndpointStatus(publishes=NAMES),))
     assert bounded(status) is status
+
+
+def test_what_is_hidden_is_bounded_too() -> None:
+    """A node may register any number of long names that a rule hides."""
+    many = [HiddenStatus("publish", f"/{n}" + "x" * 1000, "/node", "a rule") for n in range(5000)]
+    shown = first_hidden(many)
+    assert 0 < sum(len(json.dumps(to_json(one))) for one in shown) < 1.1 * MOST_HIDDEN
+    assert shown == many[: len(shown)]
+    assert first_hidden(many[:3]) == many[:3]
