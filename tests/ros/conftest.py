@@ -23,6 +23,7 @@ if str(ROOT) not in sys.path:
 
 from tests.ros import report, requirements  # noqa: E402
 from tests.ros.cpp import compiled_node  # noqa: E402
+from tests.ros.forks import Forks  # noqa: E402
 from tests.ros.lab import Lab  # noqa: E402
 from tests.ros.topology import SHARED, Plan, Topology, remove_leftovers  # noqa: E402
 
@@ -110,16 +111,25 @@ def topology_of() -> Iterator[Callable[[Plan], Topology]]:
             topology.remove()
 
 
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """What rospy nodes are started with."""
+    forks = Forks()
+    yield forks
+    forks.stop()
+
+
 @pytest.fixture(scope="module")
 def module_lab(
     request: pytest.FixtureRequest,
     topology_of: Callable[[Plan], Topology],
+    forks: Forks,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Lab]:
     """One roscore and one proxy for a module, which may set PLAN and what else is read here."""
     compiled_node()
     plan = getattr(request.module, "PLAN", SHARED)
-    lab = Lab(topology_of(plan), tmp_path_factory.mktemp("lab"))
+    lab = Lab(topology_of(plan), tmp_path_factory.mktemp("lab"), forks)
     lab.proxy_options = getattr(request.module, "PROXY_OPTIONS", ())
     lab.advertise_host = getattr(request.module, "ADVERTISE_HOST", lab.advertise_host)
     lab.master_role = getattr(request.module, "MASTER_ROLE", lab.master_role)

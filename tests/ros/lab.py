@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.ros import wire
-from tests.ros.cpp import NODES, compiled_node
+from tests.ros.cpp import compiled_node
+from tests.ros.forks import Forks
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import (
     ADVERTISED_NAME,
@@ -41,9 +42,10 @@ class Result:
 class Lab:
     """One topology with a real roscore outside and a proxy at the boundary."""
 
-    def __init__(self, topology: Topology, folder: Path) -> None:
+    def __init__(self, topology: Topology, folder: Path, forks: Forks) -> None:
         self.topology = topology
         self.folder = folder
+        self._forks = forks
         self.flat = topology.plan.flat
         self.advertise_host = OUT_HOST
         self.master_role = "out"
@@ -147,19 +149,22 @@ class Lab:
         words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
         for option, value in options.items():
             words += [f"--{option.replace('_', '-')}", str(value)]
-        program = {
-            "rospy": ["/usr/bin/python3", str(NODES / "node.py")],
-            "roscpp": [str(compiled_node())],
-        }[library]
-        return self.start(role, *program, kind, *words, env=env)
+        if library == "rospy":
+            title = " ".join(["node.py", kind, *words])
+            return self._start_node(role, title, [kind, *words], env, self._forks)
+        return self.start(role, str(compiled_node()), kind, *words, env=env)
 
     def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
         """Starts any program on a machine; it is ended with the test."""
         words = [word for word in argv if "/python3" not in word]
         title = " ".join([Path(words[0]).name, *words[1:]])
-        process = self._spawn(
-            f"{title} ({role})", self.place(role), argv, self.environment(role) | dict(env or {})
-        )
+        return self._start_node(role, title, argv, env)
+
+    def _start_node(
+        self, role: str, title: str, argv: Any, env: Any, forks: Forks | None = None
+    ) -> Process:
+        env = self.environment(role) | dict(env or {})
+        process = self._spawn(f"{title} ({role})", self.place(role), argv, env, forks)
         self.nodes.append(process)
         return process
 
@@ -195,9 +200,12 @@ class Lab:
         stop_all(self.nodes, patience)
         self.nodes.clear()
 
-    def _spawn(self, title: str, place: Place, argv: Any, env: Mapping[str, str]) -> Process:
+    def _spawn(
+        self, title: str, place: Place, argv: Any, env: Mapping[str, str],
+        forks: Forks | None = None,
+    ) -> Process:  # fmt: skip
         log = self.folder / f"{next(self._numbers):04d}.log"
-        return Process(title, place, argv, env, log)
+        return Process(title, place, argv, env, log, forks)
 
     # what the real master knows
 

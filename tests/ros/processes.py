@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tests.ros.forks import Forks
 from tests.ros.topology import Place
 
 STOP_PATIENCE = 8.0
@@ -22,21 +23,14 @@ class Process:
     """One running program, in a process group of its own, with its output in a file."""
 
     def __init__(
-        self, title: str, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path
-    ) -> None:
+        self, title: str, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path,
+        forks: Forks | None = None,
+    ) -> None:  # fmt: skip
         self.title = title
-        self.place = place
         self.log = log
         self.started = time.time()
-        with log.open("wb") as output:
-            self._popen = subprocess.Popen(
-                place.command(argv),
-                env=dict(env),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        start = forks.start if forks else _execute
+        self._popen = start(place, argv, env, log)
 
     @property
     def pid(self) -> int:
@@ -128,6 +122,20 @@ class Process:
         except ProcessLookupError:
             return False
         return True
+
+
+def _execute(
+    place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path
+) -> subprocess.Popen[bytes]:
+    with log.open("wb") as output:
+        return subprocess.Popen(
+            place.command(argv),
+            env=dict(env),
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
 
 
 def descendants(pid: int) -> list[int]:

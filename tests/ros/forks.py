@@ -1,0 +1,73 @@
+"""Rospy nodes as forks: one process for each machine has imported rospy, the nodes are its forks.
+
+To import rospy takes a third of a second of a processor, which is more than all else that most
+tests do; and there are some hundred nodes. See nodes/forked.py for the other end.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tests.ros.cpp import NODES
+from tests.ros.topology import Place
+
+_POLL = 0.01
+
+
+class Forks:
+    """Starts rospy nodes on any machine."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, subprocess.Popen[str]] = {}
+
+    def start(self, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path) -> Fork:
+        """Starts node.py with these arguments."""
+        ended = log.with_suffix(".ended")
+        log.touch()
+        parent = self._parents.get(place.namespace) or self._start_parent(place, env)
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        request = {"argv": argv, "env": dict(env), "log": str(log), "ended": str(ended)}
+        print(json.dumps(request), file=parent.stdin, flush=True)
+        return Fork(int(parent.stdout.readline()), ended)
+
+    def _start_parent(self, place: Place, env: Mapping[str, str]) -> subprocess.Popen[str]:
+        parent = self._parents[place.namespace] = subprocess.Popen(
+            place.command(["/usr/bin/python3", str(NODES / "forked.py")]),
+            env=dict(env),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        return parent
+
+    def stop(self) -> None:
+        """Ends the processes that nodes are forks of, not the nodes."""
+        for parent in self._parents.values():
+            parent.kill()
+            parent.communicate()
+
+
+class Fork:
+    """A node's process, used as one of subprocess is."""
+
+    def __init__(self, pid: int, ended: Path) -> None:
+        self.pid = pid
+        self._ended = ended
+
+    def poll(self) -> int | None:
+        return int(self._ended.read_text()) if self._ended.exists() else None
+
+    def wait(self, timeout: float = 60) -> int:
+        """Raises subprocess.TimeoutExpired."""
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("node.py", timeout)
+            time.sleep(_POLL)
+        return code
