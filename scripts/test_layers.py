@@ -8,7 +8,7 @@ How it works. A layer is a directory under tests/. Up to three layers run side b
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
-     already. After that docker begins, which is the longest and mostly waits, and image.
+     already. After that docker begins, which is the longest and mostly waits, and what is light.
   2. After the integration tests, whenever one of the three has ended, the next of the others: the
      long ones first, so that on two processors all end at about the same time.
 
@@ -166,10 +166,11 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._some, deque([INTEGRATION]))
             self._prepare()
-            early = [pool.submit(self._some, deque([one])) for one in (DOCKER_ENGINE, IMAGE)]
+            light = deque([IMAGE, CHART])
+            early = [pool.submit(self._some, lane) for lane in (deque([DOCKER_ENGINE]), light)]
             lanes = [integration, *early]
             integration.result()
-            late = deque([ROS_NODES, CLUSTER, ABUSE, UNIT, CHART])
+            late = deque([ROS_NODES, CLUSTER, ABUSE, UNIT])
             lanes += [pool.submit(self._then, lane, late) for lane in lanes]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
@@ -265,6 +266,8 @@ def main() -> int:
     options = parser.parse_args()
     if unknown := set(options.layers) - set(names):
         parser.error(f"no such layer: {', '.join(sorted(unknown))}")
+    # Hundreds of programs are started: each would compile the project anew.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # In the background a shell has it ignored, and programs under test inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = [layer for layer in LAYERS if not options.layers or layer.name in options.layers]

@@ -32,7 +32,9 @@ class Robot:
         return docker("exec", *variable, *words, check=check, seconds=seconds + 10)
 
     def start_master(self) -> None:
-        self._start("roscore", f"roscore -p {self.port}", self.master_uri)
+        """Start what roscore starts, without roslaunch, which costs four times as much."""
+        core = f"/usr/lib/rosout/rosout & exec rosmaster --core -p {self.port}"
+        self._start("roscore", f"sh -c '{core}'", self.master_uri)
         wait_until(lambda: "/rosout" in self.nodes(), 40, lambda: self._output("roscore"))
 
     def node(self, name: str, library: str, role: str, *options: str, master_uri: str = "") -> Log:
@@ -47,9 +49,8 @@ class Robot:
         docker("exec", ROBOT, "sh", "-c", f"kill -{signal} $(cat {file})", check=False)
 
     def end_all(self) -> None:
-        """End the master, which ends what it has started, and kill the rest."""
-        self.end("roscore", "INT")
-        script = f"rm /tmp/{self.port}/roscore.pid; kill -KILL $(cat /tmp/{self.port}/*.pid)"
+        """Kill all of them with what they have started."""
+        script = f"cat /tmp/{self.port}/*.pid | sed s/^/-/ | xargs kill -KILL --"
         docker("exec", ROBOT, "sh", "-c", script, check=False)
 
     def nodes(self) -> dict[str, str]:

@@ -126,13 +126,14 @@ def module_lab(
     forks: Forks,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Lab]:
-    """One roscore and one proxy for a module, which may set PLAN and what else is read here."""
+    """One master and one proxy for a module, which may set PLAN and what else is read here."""
     compiled_node()
     plan = getattr(request.module, "PLAN", SHARED)
     lab = Lab(topology_of(plan), tmp_path_factory.mktemp("lab"), forks)
     lab.proxy_options = getattr(request.module, "PROXY_OPTIONS", ())
     lab.advertise_host = getattr(request.module, "ADVERTISE_HOST", lab.advertise_host)
     lab.master_role = getattr(request.module, "MASTER_ROLE", lab.master_role)
+    lab.roscore = getattr(request.module, "MASTER", lab.roscore)
     try:
         yield lab
     finally:
@@ -141,7 +142,7 @@ def module_lab(
 
 @pytest.fixture
 def lab(module_lab: Lab) -> Iterator[Lab]:
-    """The module's lab, with roscore and proxy running, and no node of another test."""
+    """The module's lab, with master and proxy running, and no node of another test."""
     module_lab.ensure_running()
     yield module_lab
     module_lab.stop_nodes()

@@ -7,8 +7,9 @@ import re
 import pytest
 
 from tests.ros.combinations import each_library, each_way_and_order, each_way_in_turn
-from tests.ros.lab import Lab
+from tests.ros.lab import ROSCORE, Lab
 
+MASTER = ROSCORE
 BIG = 10 * 1024 * 1024
 
 
