@@ -8,6 +8,7 @@ import pytest
 
 from tests.ros import kernel
 from tests.ros.cpp import compiled_node
+from tests.ros.forks import Forks
 from tests.ros.ipv6 import ADDRESSES, PROXY_ADDRESSES, Lab6, Topology6
 from tests.ros.kernel import LIMIT, talk
 from tests.ros.lab import Lab
@@ -20,10 +21,10 @@ FORWARDING = "net.ipv6.conf.all.forwarding"
 
 
 @pytest.fixture(scope="module")
-def module_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+def module_lab(tmp_path_factory: pytest.TempPathFactory, forks: Forks) -> Iterator[Lab]:
     compiled_node()
     topology = Topology6()
-    lab = Lab6(topology, tmp_path_factory.mktemp("lab6"))
+    lab = Lab6(topology, tmp_path_factory.mktemp("lab6"), forks)
     lab.advertise_host = ADVERTISED_NAME
     lab.proxy_options = ("--bind", "::", "--probe-interval", "0.5", "--linger", "1")
     try:

@@ -14,11 +14,12 @@ import pytest
 from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
 from tests.ros import wire
 from tests.ros.combinations import each_library
-from tests.ros.lab import Lab
+from tests.ros.lab import ROSCORE, Lab
 from tests.ros.processes import wait_until
 
 pytestmark = pytest.mark.boundary
 
+MASTER = ROSCORE
 PROXY_OPTIONS = ("--policy", "deny publish /hidden/*; deny serve /hidden/*")
 PAIRS = pytest.mark.parametrize(
     ("first", "second"), [("rospy", "roscpp"), ("roscpp", "rospy")], ids=["rospy", "roscpp"]

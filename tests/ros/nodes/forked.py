@@ -16,6 +16,7 @@ import sys
 
 import node
 import rospy.names
+from rosgraph.names import get_ros_namespace
 
 
 def main() -> None:
@@ -49,7 +50,9 @@ def become(request: dict[str, object], writer: int) -> None:
     os.environ.clear()
     os.environ.update(request["env"])
     sys.argv = ["node.py", *request["argv"]]
-    rospy.names.reload_mappings(sys.argv)  # they were read when it was imported
+    # Both were read when it was imported.
+    rospy.names.reload_mappings(sys.argv)
+    rospy.names._set_caller_id(f"{get_ros_namespace()}unnamed")
     os.write(writer, str(os.getpid()).encode())
     os.close(writer)
 
