@@ -1,7 +1,7 @@
-"""Rospy nodes as forks: one process for each machine has imported rospy, the nodes are its forks.
+"""ROS's Python programs as forks: one process for each machine has imported rospy for them.
 
 To import rospy takes a third of a second of a processor, which is more than all else that most
-tests do; and there are some hundred nodes. See nodes/forked.py for the other end.
+tests do; and there are some hundred nodes and tools. See nodes/forked.py for the other end.
 """
 
 from __future__ import annotations
@@ -18,14 +18,19 @@ from tests.ros.topology import Place
 _POLL = 0.01
 
 
+_TOOLS = ("rosnode", "rosparam", "rosservice", "rostopic")
+PROGRAMS = {"node.py": str(NODES / "node.py"), **{name: f"/usr/bin/{name}" for name in _TOOLS}}
+"""What is started so, by name."""
+
+
 class Forks:
-    """Starts rospy nodes on any machine."""
+    """Starts Python programs on any machine."""
 
     def __init__(self) -> None:
         self._parents: dict[str, subprocess.Popen[str]] = {}
 
     def start(self, place: Place, argv: Sequence[str], env: Mapping[str, str], log: Path) -> Fork:
-        """Starts node.py with these arguments."""
+        """Starts one of PROGRAMS with its arguments."""
         ended = log.with_suffix(".ended")
         log.touch()
         parent = self._parents.get(place.namespace) or self._start_parent(place, env)
@@ -54,7 +59,7 @@ class Forks:
 
 
 class Fork:
-    """A node's process, used as one of subprocess is."""
+    """A program's process, used as one of subprocess is."""
 
     def __init__(self, pid: int, ended: Path) -> None:
         self.pid = pid
@@ -68,6 +73,6 @@ class Fork:
         deadline = time.monotonic() + timeout
         while (code := self.poll()) is None:
             if time.monotonic() > deadline:
-                raise subprocess.TimeoutExpired("node.py", timeout)
+                raise subprocess.TimeoutExpired("a fork", timeout)
             time.sleep(_POLL)
         return code

@@ -13,7 +13,7 @@ from typing import Any
 
 from tests.ros import wire
 from tests.ros.cpp import compiled_node
-from tests.ros.forks import Forks
+from tests.ros.forks import PROGRAMS, Forks
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import (
     ADVERTISED_NAME,
@@ -154,22 +154,23 @@ class Lab:
         words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
         for option, value in options.items():
             words += [f"--{option.replace('_', '-')}", str(value)]
-        if library == "rospy":
-            title = " ".join(["node.py", kind, *words])
-            return self._start_node(role, title, [kind, *words], env, self._forks)
-        return self.start(role, str(compiled_node()), kind, *words, env=env)
+        program = {"rospy": "node.py", "roscpp": str(compiled_node())}[library]
+        return self.start(role, program, kind, *words, env=env)
 
     def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
         """Starts any program on a machine; it is ended with the test."""
         words = [word for word in argv if "/python3" not in word]
         title = " ".join([Path(words[0]).name, *words[1:]])
-        return self._start_node(role, title, argv, env)
-
-    def _start_node(
-        self, role: str, title: str, argv: Any, env: Any, forks: Forks | None = None
-    ) -> Process:
-        env = self.environment(role) | dict(env or {})
-        process = self._spawn(f"{title} ({role})", self.place(role), argv, env, forks)
+        forks = self._forks if argv[0] in PROGRAMS else None
+        if forks:
+            argv = (PROGRAMS[argv[0]], *argv[1:])
+        process = self._spawn(
+            f"{title} ({role})",
+            self.place(role),
+            argv,
+            self.environment(role) | dict(env or {}),
+            forks,
+        )
         self.nodes.append(process)
         return process
 

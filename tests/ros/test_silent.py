@@ -17,7 +17,7 @@ from tests.ros.combinations import each_library
 from tests.ros.lab import CALLER, Lab
 from tests.ros.processes import wait_until
 from tests.ros.test_recovery import restart_proxy
-from tests.ros.topology import SHARED
+from tests.ros.topology import OUT_HOST, SHARED
 
 pytestmark = pytest.mark.boundary
 
@@ -89,7 +89,8 @@ def silence(lab: Lab, connection: str) -> None:
     """Break a subscriber's connection and have the next one fail before it has begun."""
     (port,) = re.findall(r"on port (\d+) to", connection)
     with no_connections(lab), reset(lab, port):
-        alive = f"sport = :{port}"
+        # The kernel may give the same port to a connection elsewhere.
+        alive = f"sport = :{port} and dst = {OUT_HOST}"
         wait_until(
             "the connection is broken",
             lambda: not lab.run("out", "ss", "-Hnt", "state", "established", alive).output,

@@ -1,21 +1,29 @@
-"""Starts the nodes of node.py as forks of one process: to import rospy costs more than most tests.
+"""Runs ROS's Python programs as forks of one process: to import rospy costs more than most tests.
 
     forked.py <REQUESTS >PIDS
 
-A request is one line of JSON: the node's `argv`, its whole `env`, the file `log` for what it
+A request is one line of JSON: the program's `argv`, its whole `env`, the file `log` for what it
 prints, and the file `ended` for its exit status as subprocess gives it. The answer is a line with
-its process's number. The node leads a session of its own.
+its process's number. The program leads a session of its own.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
+import runpy
 import signal
 import sys
 
-import node
+import actionlib  # noqa: F401 - as the others, for whoever is forked
+import rosnode  # noqa: F401
+import rosparam  # noqa: F401
 import rospy.names
+import rosservice  # noqa: F401
+import rostopic  # noqa: F401
+import topic_tools.srv  # noqa: F401
+from actionlib import msg  # noqa: F401
 from rosgraph.names import get_ros_namespace
 
 
@@ -30,13 +38,13 @@ def main() -> None:
             child = os.fork()
             if child == 0:
                 become(request, writer)
-                return node.main()
+                runpy.run_path(sys.argv[0], run_name="__main__")
+                return
             os.close(writer)
             keep(child, request["ended"])
         os.close(writer)
         with os.fdopen(reader) as pid:
             print(pid.read(), flush=True)
-    return None
 
 
 def become(request: dict[str, object], writer: int) -> None:
@@ -46,10 +54,10 @@ def become(request: dict[str, object], writer: int) -> None:
     for number in (1, 2):
         os.dup2(log, number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    sys.stdout = os.fdopen(1, "w", buffering=1)
+    sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", buffering=0), write_through=True)
     os.environ.clear()
     os.environ.update(request["env"])
-    sys.argv = ["node.py", *request["argv"]]
+    sys.argv[:] = request["argv"]  # in place: some have kept the list
     # Both were read when it was imported.
     rospy.names.reload_mappings(sys.argv)
     rospy.names._set_caller_id(f"{get_ros_namespace()}unnamed")
@@ -58,7 +66,7 @@ def become(request: dict[str, object], writer: int) -> None:
 
 
 def keep(child: int, ended: str) -> None:
-    """Waits for a node's end and tells it."""
+    """Waits for a program's end and tells it."""
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     with open(f"{ended}.new", "w") as file:
         file.write(str(code))
@@ -67,4 +75,4 @@ def keep(child: int, ended: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
