@@ -159,8 +159,7 @@ class Lab:
 
     def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
         """Starts any program on a machine; it is ended with the test."""
-        words = [word for word in argv if "/python3" not in word]
-        title = " ".join([Path(words[0]).name, *words[1:]])
+        title = " ".join([Path(argv[0]).name, *argv[1:]])
         forks = self._forks if argv[0] in PROGRAMS else None
         if forks:
             argv = (PROGRAMS[argv[0]], *argv[1:])
