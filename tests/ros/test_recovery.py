@@ -120,6 +120,8 @@ def test_nodes_keep_their_ports_and_can_be_ended_after_a_restart(lab: Lab, libra
         lab.wait_registered(name)
     before = {name: lab.node_uri(name) for name in names}
     restart_proxy(lab)
+    assert lab.proxy is not None
+    lab.proxy.wait_for(r"recovered 4 nodes")  # a port refuses until its node has borne it out
     assert {name: lab.node_uri(name) for name in names} == before
     for name, node in zip(names, nodes, strict=True):
         assert f"Pid: {node.pid}" in lab.run("out", "rosnode", "info", name).output
