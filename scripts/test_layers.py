@@ -8,7 +8,7 @@ How it works. A layer is a directory under tests/. Up to three layers run side b
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
-     already. After that docker begins, which is the longest and mostly waits, and what is light.
+     already. After that docker and kubernetes begin, which are the longest and mostly wait.
   2. After the integration tests, whenever one of the three has ended, the next of the others: the
      long ones first, so that on two processors all end at about the same time.
 
@@ -166,11 +166,10 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._some, deque([INTEGRATION]))
             self._prepare()
-            light = deque([IMAGE, CHART])
-            early = [pool.submit(self._some, lane) for lane in (deque([DOCKER_ENGINE]), light)]
+            early = [pool.submit(self._some, deque([one])) for one in (DOCKER_ENGINE, CLUSTER)]
             lanes = [integration, *early]
             integration.result()
-            late = deque([ROS_NODES, CLUSTER, ABUSE, UNIT])
+            late = deque([ROS_NODES, IMAGE, CHART, ABUSE, UNIT])
             lanes += [pool.submit(self._then, lane, late) for lane in lanes]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))

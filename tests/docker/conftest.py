@@ -8,7 +8,7 @@ import pytest
 
 from tests.docker import images
 from tests.docker.controller import Controller, proxies, remove_proxies, running_controller
-from tests.docker.engine import docker, running_engine
+from tests.docker.engine import docker, logs, running_engine
 from tests.docker.inside import Inside, inside
 from tests.docker.machines import Machine
 from tests.docker.robot import Robot, laptop, named_robot, robot_outside
@@ -22,7 +22,7 @@ def pytest_runtest_makereport(
     report = yield
     if report.failed and report.when == "call":
         for proxy in proxies(check=False):
-            report.sections.append((proxy.name, docker("logs", proxy.name, check=False)))
+            report.sections.append((proxy.name, logs(proxy.name)))
             status = docker("exec", proxy.name, "rosproxy", "status", check=False)
             report.sections.append((proxy.name, status))
     return report

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.engine import containers, docker, inspect, logs, wait_until
 
 PROGRAM = Path(sys.executable).with_name("rosproxy-operator")
-MANAGED = "label=io.rosproxy.managed=true"
+MANAGED = "io.rosproxy.managed=true"
 UPLINK = "0-rosproxy"
 WINDOW = range(12000, 13000)
 OPTIONS = ("--port-window", f"{WINDOW[0]}-{WINDOW[-1]}", "--ports", "6", "--grace", "3",
@@ -65,9 +65,8 @@ class Proxy:
 
 def managed(role: str, *, check: bool = True) -> list[str]:
     """The names of the containers that a controller has made, in whatever state."""
-    names = docker("ps", "--all", "--filter", MANAGED, "--filter", f"label=io.rosproxy.role={role}",
-                   "--format", "{{.Names}}", check=check).splitlines()  # fmt: skip
-    return sorted(name for name in names if " " not in name)
+    found = containers(MANAGED, f"io.rosproxy.role={role}", check=check)
+    return sorted(one["Names"][0].removeprefix("/") for one in found if one["Names"])
 
 
 def proxies(*, check: bool = True) -> list[Proxy]:
@@ -79,9 +78,9 @@ def proxies(*, check: bool = True) -> list[Proxy]:
 
 def published_ranges() -> list[range]:
     """The ranges of all proxies in one look: one that is being replaced can't be inspected."""
-    found = docker("ps", "--all", "--filter", MANAGED, "--filter", "label=io.rosproxy.role=ports",
-                   "--format", '{{.Label "io.rosproxy.range"}}').splitlines()  # fmt: skip
-    ends = [tuple(map(int, text.split("-"))) for text in found]
+    found = containers(MANAGED, "io.rosproxy.role=ports")
+    ranges = (one["Labels"]["io.rosproxy.range"] for one in found)
+    ends = [tuple(map(int, text.split("-"))) for text in ranges]
     return [range(first, last + 1) for first, last in ends]
 
 
@@ -110,7 +109,7 @@ class Controller:
     options: tuple[str, ...]
 
     def logs(self) -> str:
-        return docker("logs", self.container, check=False)
+        return logs(self.container)
 
     def command(self, *words: str, check: bool = True) -> str:
         """Run another command of the controller's program with the same settings."""
@@ -148,7 +147,7 @@ def running_controller(
     try:
         yield Controller(container, every)
     finally:
-        print(docker("logs", container, check=False))
+        print(logs(container))
         docker("rm", "--force", container, check=False)
 
 

@@ -1,8 +1,7 @@
-"""The Docker engine that the tests use, by its command line."""
+"""The Docker engine that the tests use: by its command line, and what is asked often by its API."""
 
 import contextlib
 import fcntl
-import json
 import os
 import shutil
 import signal
@@ -10,8 +9,14 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+from docker.errors import DockerException, NotFound
+from requests.exceptions import RequestException
+
+from docker import APIClient
 
 ROOT = Path(__file__).resolve().parents[2]
 _USERS = Path("/run/lock/rosproxy-tests-engine")
@@ -51,19 +56,50 @@ def engine_url() -> str:
     return os.environ.get("DOCKER_HOST") or "unix:///var/run/docker.sock"
 
 
+@cache
+def _api(url: str) -> APIClient:
+    """The API of an engine, without a program to start for each question."""
+    return APIClient(base_url=url, timeout=60)
+
+
 def inspect(name: str, *, check: bool = True) -> dict[str, Any]:
     """Everything that the engine knows about a container or an image; empty if it knows none."""
-    found = docker("inspect", name, check=check)
-    if not found.startswith("[\n"):
+    try:
+        api = _api(engine_url())
+        try:
+            found: dict[str, Any] = api.inspect_container(name)
+        except NotFound:
+            found = api.inspect_image(name)
+    except (DockerException, RequestException) as error:
+        if check:
+            raise AssertionError(f"inspect {name}: {error}") from None
         return {}
-    objects: list[dict[str, Any]] = json.loads(found)
-    return objects[0]
+    return found
+
+
+def containers(*labels: str, check: bool = True) -> list[dict[str, Any]]:
+    """All containers with these labels, in whatever state, as the engine lists them."""
+    try:
+        found = _api(engine_url()).containers(all=True, filters={"label": list(labels)})
+    except (DockerException, RequestException) as error:
+        if check:
+            raise AssertionError(f"containers with {' '.join(labels)}: {error}") from None
+        return []
+    return list(found)
+
+
+def logs(name: str) -> str:
+    """What a container has printed; why it can't be said if the engine does not tell."""
+    try:
+        return bytes(_api(engine_url()).logs(name)).decode(errors="replace").strip()
+    except (DockerException, RequestException) as error:
+        return f"logs of {name}: {error}"
 
 
 def wait_until(true: Callable[[], bool], seconds: float, what: str | Callable[[], str]) -> float:
     """Wait for something to come true; return the seconds it took.
 
-    Who has waited long is asked less often: most questions are a program to start.
+    Who has waited long is asked less often: many questions are a program to start.
     """
     started = time.monotonic()
     while not true():

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from tests.docker.engine import docker, inspect
+from tests.docker.engine import containers, docker, inspect, logs
 from tests.docker.nodes import Log, node_command
 
 MARK = f"test.of.rosproxy={os.getpid()}"
@@ -71,7 +71,7 @@ class Container:
 
     @property
     def log(self) -> Log:
-        return Log(lambda: docker("logs", self.name, check=False))
+        return Log(lambda: logs(self.name))
 
     @property
     def state(self) -> str:
@@ -109,9 +109,9 @@ def inside(image: str, master_uri: str) -> Iterator[Inside]:
 
 def remove_marked() -> None:
     """Remove all containers and networks that the tests have made."""
-    containers = docker("ps", "--all", "--quiet", "--filter", f"label={MARK}").split()
-    if containers:
-        docker("rm", "--force", *containers, check=False, seconds=120)
+    found = [one["Id"] for one in containers(MARK)]
+    if found:
+        docker("rm", "--force", *found, check=False, seconds=120)
     for network in docker("network", "ls", "--quiet", "--filter", f"label={MARK}").split():
         for container in attached(network):
             docker("network", "disconnect", "--force", network, container, check=False)

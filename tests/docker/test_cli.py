@@ -6,7 +6,7 @@ from urllib.error import HTTPError
 import pytest
 
 from tests.docker.controller import Controller, the_proxy
-from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.engine import docker, inspect, logs, wait_until
 from tests.docker.inside import ENABLE, Inside
 from tests.docker.robot import Robot
 
@@ -86,7 +86,7 @@ def test_controller_stops_at_once(controller_image: str, container_name: str) ->
            "--volume", "/var/run/docker.sock:/var/run/docker.sock", "--user", "0:0",
            controller_image, "docker", "--admin-bind", "127.0.0.1:21314",
 )  # fmt: skip
-    wait_until(lambda: "21314" in docker("logs", container_name), 60, "it logs where its health is")
+    wait_until(lambda: "21314" in logs(container_name), 60, "it logs where its health is")
 
     docker("stop", "--time", "10", container_name)
 

@@ -121,7 +121,7 @@ def test_range_taken_by_another_while_the_proxy_was_down(
         lambda: [before[1] in one for one in published_ranges()] == [False], 40, controller.logs
     )
     the_proxy(40)
-    assert "HAS LEFT ITS PORTS" in controller.logs()
+    wait_until(lambda: "HAS LEFT ITS PORTS" in controller.logs(), 40, controller.logs)
     docker("restart", "--time", "0", node.name)
     ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
     try:

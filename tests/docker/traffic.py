@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from tests.docker.engine import docker
+from tests.docker.engine import inspect
 from tests.docker.inside import ENABLE, Container, Inside, unique
 from tests.docker.nodes import UNNOTICED, Log
 from tests.docker.robot import Robot
@@ -93,5 +93,4 @@ def traffic(
 
 def crash(container: str) -> None:
     """Kill the program of a container from behind, as the kernel would for want of memory."""
-    pid = docker("inspect", "--format", "{{.State.Pid}}", container)
-    os.kill(int(pid), signal.SIGKILL)
+    os.kill(inspect(container)["State"]["Pid"], signal.SIGKILL)

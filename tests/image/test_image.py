@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.engine import docker, inspect, logs, wait_until
 
 HARDENED = ("--read-only", "--cap-drop", "ALL", "--security-opt", "no-new-privileges")
 # Nothing listens there: a proxy is healthy and waits while its master is away.
@@ -17,7 +17,7 @@ def start(image: str, name: str, *options: str) -> None:
 
 def health(name: str) -> str:
     state = inspect(name)["State"]
-    assert state["Running"], docker("logs", name)
+    assert state["Running"], logs(name)
     return str(state["Health"]["Status"])
 
 
@@ -28,9 +28,7 @@ def test_names_a_user_by_number(proxy_image: str) -> None:
 def test_becomes_healthy_without_any_privilege(proxy_image: str, container_name: str) -> None:
     start(proxy_image, container_name)
 
-    wait_until(
-        lambda: health(container_name) == "healthy", 30, lambda: docker("logs", container_name)
-    )
+    wait_until(lambda: health(container_name) == "healthy", 30, lambda: logs(container_name))
 
     lines = docker("exec", container_name, "cat", "/proc/1/status").splitlines()
     status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
@@ -64,9 +62,7 @@ def test_its_user_makes_rules_where_it_may(proxy_image: str, given: str) -> None
 
 def test_writes_no_file(proxy_image: str, container_name: str) -> None:
     start(proxy_image, container_name)
-    wait_until(
-        lambda: health(container_name) == "healthy", 30, lambda: docker("logs", container_name)
-    )
+    wait_until(lambda: health(container_name) == "healthy", 30, lambda: logs(container_name))
     mounts = docker("exec", container_name, "cat", "/proc/1/mounts").splitlines()
     root = next(line.split() for line in mounts if line.split()[1] == "/")
     assert "ro" in root[3].split(",")
@@ -75,11 +71,11 @@ def test_writes_no_file(proxy_image: str, container_name: str) -> None:
 
 def test_stops_at_once_and_cleanly(proxy_image: str, container_name: str) -> None:
     start(proxy_image, container_name)
-    wait_until(lambda: "ready" in docker("logs", container_name), 60, "it logs that it is ready")
+    wait_until(lambda: "ready" in logs(container_name), 60, "it logs that it is ready")
 
     docker("stop", "--time", "50", container_name)  # afterwards it would be killed: 137
 
-    assert inspect(container_name)["State"]["ExitCode"] == 0, docker("logs", container_name)
+    assert inspect(container_name)["State"]["ExitCode"] == 0, logs(container_name)
 
 
 def test_names_a_bad_setting_and_exits(proxy_image: str, container_name: str) -> None:
@@ -87,7 +83,7 @@ def test_names_a_bad_setting_and_exits(proxy_image: str, container_name: str) ->
 
     assert docker("wait", container_name) == "2"
 
-    logged = docker("logs", container_name)
+    logged = logs(container_name)
     assert "port-range" in logged
     assert len(logged.splitlines()) == 1
 
