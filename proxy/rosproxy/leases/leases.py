@@ -129,7 +129,12 @@ class Leases(Generic[_H]):
             fast_ports.give_back(self._holders.pool, endpoint, blocked=True)
 
     def close(self, endpoint: _H) -> None:
-        """Let an endpoint's ports refuse; the lease and open connections stay."""
+        """Let an endpoint's ports refuse, if it still holds the lease; open connections stay.
+
+        What somebody waited for may tell of a node whose port is another's by now.
+        """
+        if self._holders.by_port.get(endpoint.port) is not endpoint:
+            return
         self._kernel.note_change(endpoint)
         for port in (endpoint.port, endpoint.fast_port):
             self._refuse(port)

@@ -498,3 +498,18 @@ async def test_a_hundred_uris_of_one_node_are_not_all_remembered(
         await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
     assert len(proxy.endpoint(node).admissions) <= 16
     assert not await refuses((PROXY, proxy.endpoint(node).port))
+
+
+async def test_news_of_a_node_that_is_gone_do_not_close_its_port_to_the_next(
+    make_proxy: MakeProxy, make_node: MakeNode
+) -> None:
+    """A probe of a dead node ended after its port had been given to one that lives."""
+    proxy = await make_proxy(ports=1)
+    gone, late = await make_node("/gone"), await make_node("/late")
+    await gone.publish(proxy.master)
+    endpoint = proxy.endpoint(gone)
+    proxy.app.leases.end(endpoint)
+    await late.publish(proxy.master)
+    assert proxy.endpoint(late).port == endpoint.port
+    proxy.app.leases.close(endpoint)
+    assert await proxy.serves(late)
