@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Collection, Sequence
 
 from rosproxy.access.layers import (
+    ALLOWED,
     PolicyLayer,
     PolicyMode,
     Verdict,
@@ -32,7 +33,7 @@ PARAMETERS = frozenset({RuleKind.GET_PARAM, RuleKind.SET_PARAM})
 class AccessPolicy:
     """The layers in force: ``own`` are those of the options, ``told`` those of an operator.
 
-    ``version`` is another number after each change of them.
+    ``version`` is another number after each change of them, ``empty`` whether there is no rule.
     """
 
     def __init__(
@@ -47,7 +48,8 @@ class AccessPolicy:
         self._file = tuple[PolicyLayer, ...]()
         self._heard = asyncio.Event()
         self._by_kind: dict[RuleKind, tuple[PolicyLayer, ...]] = {}
-        self.version = 0
+        self.version, self.empty = 0, False
+        self._note_change()
 
     @property
     def layers(self) -> tuple[PolicyLayer, ...]:
@@ -79,6 +81,8 @@ class AccessPolicy:
 
         What only some of them may not have is denied: nobody can tell them apart at one URI.
         """
+        if self.empty:
+            return ALLOWED
         layers = self._about(kind)
         return strictest([decide(layers, kind, name, one, address) for one in callers or ("",)])
 
@@ -117,11 +121,14 @@ class AccessPolicy:
 
         ``address`` is that of the node inside; None: any.
         """
+        if self.empty:
+            return False
         return any(may_deny(self._about(kind), (kind,), callers, address) for kind in kinds)
 
     def _note_change(self) -> None:
         self._by_kind.clear()
         self.version += 1
+        self.empty = not any(layer.rules for layer in self.layers)
 
     def _about(self, kind: RuleKind) -> tuple[PolicyLayer, ...]:
         """The layers with their rules of one kind; those without any are left out."""

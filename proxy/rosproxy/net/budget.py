@@ -5,7 +5,6 @@ budget first and gives it back in the end; what is over budget is refused at onc
 waits holds something as well. No source gets more than its share, so that none shuts out the rest.
 """
 
-from collections import Counter
 from types import TracebackType
 
 
@@ -18,24 +17,27 @@ class Budget:
 
     def __init__(self, most: int, share: int, what: str) -> None:
         self._most, self._share, self._what = most, share, what
-        self._held: Counter[str] = Counter()
+        self._held: dict[str, int] = {}
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
         """Take so much for a source. Raises OverBudget, and takes nothing."""
         if self.used + size > self._most:
             raise OverBudget(f"more than {self._most} {self._what} at once; try again")
-        if self._held[source] + size > self._share:
+        held = self._held.get(source, 0) + size
+        if held > self._share:
             raise OverBudget(f"more than {self._share} {self._what} at once from {source}")
         self.used += size
-        self._held[source] += size
+        self._held[source] = held
 
     def give(self, source: str, size: int) -> None:
         """Give back what was taken."""
         self.used -= size
-        self._held[source] -= size
-        if not self._held[source]:
-            del self._held[source]
+        left = self._held.get(source, 0) - size
+        if left:
+            self._held[source] = left
+        else:
+            self._held.pop(source, None)
 
 
 class Charge:

@@ -332,7 +332,8 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
 
 def is_plain(headers: Mapping[str, str]) -> bool:
     """Whether the body that goes with an HTTP header is not compressed."""
-    return headers.get("Content-Encoding", "identity").strip().lower() in ("identity", "")
+    encoding = headers.get("Content-Encoding")
+    return encoding is None or encoding.strip().lower() in ("identity", "")
 
 
 def _was_closed(error: BaseException) -> bool:

@@ -19,7 +19,7 @@ from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.bounds import too_long_to_register
+from rosproxy.ros1.protocol.bounds import LONGEST_NAME, too_long_to_register
 from rosproxy.ros1.protocol.master_methods import NO_ROW, row
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -150,7 +150,7 @@ class MasterApi:
                     raise Unreachable("the caller has gone")
                 admission: Admission = reply
                 if call and reply is None:
-                    admission = await self._admit(call, request.asker)
+                    admission = await self._admit(call, request)
                 admissions.append(admission)
                 if isinstance(admission, Endpoint):
                     admission.hold()
@@ -161,9 +161,10 @@ class MasterApi:
                 if isinstance(admission, Endpoint):
                     admission.release()
 
-    async def _admit(self, call: Call, asker: Asker) -> Admission:
+    async def _admit(self, call: Call, request: Request) -> Admission:
         """What becomes of one call; what is too long, or one too many, is refused."""
-        if text := too_long_to_register(call):
+        asker, may_be_long = request.asker, len(request.body) > LONGEST_NAME
+        if may_be_long and (text := too_long_to_register(call)):
             return self._refuse("long_name", call, asker, text)
         admission = await self._admission.admit(call, asker)
         if isinstance(admission, Endpoint) and (text := admission.full):
@@ -203,7 +204,8 @@ class MasterApi:
         shown = known is not None and not known.hidden
         if held.hidden and (shown or endpoint.fast_port is not None):
             self._enforcer.look_again()
-        return replace(held, hidden=held.hidden and not shown)
+        hidden = held.hidden and not shown
+        return held if held.hidden is hidden else replace(held, hidden=hidden)
 
 
 @dataclass(slots=True, eq=False)

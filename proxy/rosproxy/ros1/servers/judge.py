@@ -20,6 +20,7 @@ from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.ros1.rewriting.master_api import (
+    NOTHING_UNSEEN,
     Admission,
     Answered,
     LocalReply,
@@ -47,6 +48,11 @@ class PolicyJudge:
     _addressing: Addressing
     _upstream: MasterClient
 
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to judge: no rule, and nothing that a former one has hidden."""
+        return self._policy.empty and not self._registry.hidden
+
     # Calls at the master port
 
     def judges_parameters(self, source: str | None) -> bool:
@@ -72,6 +78,8 @@ class PolicyJudge:
         Raises Unreachable.
         """
         asker, params = request.asker, _KnownParams(self._upstream)
+        if self.idle:
+            return [None] * len(request.calls)
         return [
             await self._judge_call(call, asker, params) if call else None for call in request.calls
         ]
@@ -89,13 +97,13 @@ class PolicyJudge:
         self, call: Call, admission: Admission, asker: Asker, now: float
     ) -> Admission:
         """What becomes of a call that registers or unregisters, once it is admitted."""
+        if self.idle or isinstance(admission, LocalReply):
+            return admission
         held, found = registration(call, now), row(call.method)
-        if held is None or isinstance(admission, LocalReply):
+        if held is None or held.kind is Kind.PARAM:  # parameters were judged before
             return admission
         if found.unregisters:
             return self._judge_end(held, call, asker) or admission
-        if held.kind is Kind.PARAM:  # judged before
-            return admission
         address = admission.address if isinstance(admission, Endpoint) else asker.address
         kind, callers = policing.KINDS[held.kind], [held.caller_id]
         verdict = self._policy.ask(kind, held.name, callers, address)
@@ -108,6 +116,8 @@ class PolicyJudge:
 
     def unseen(self, reply: MasterReply) -> Unseen:
         """What a reply has to say otherwise than the master does."""
+        if self.idle:
+            return NOTHING_UNSEEN
         publishers, asker = dict[str, list[str]](), reply.exported.request.asker
         for result in reply.results:
             if row(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:

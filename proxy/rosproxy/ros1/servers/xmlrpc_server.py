@@ -10,7 +10,6 @@ A client that takes nothing of its reply is cut by the kernel (`sockets.end_if_s
 """
 
 import asyncio
-import contextlib
 import logging
 import socket
 from collections import defaultdict
@@ -259,10 +258,7 @@ class XmlRpcServer(web.Server):
             return await self._send_long(request, call, reply)
         if len(reply) > passing.SHORT:
             call.hold(len(reply))
-        response = DocumentReply(reply)
-        with contextlib.suppress(ConnectionError):  # the server sees for itself that it is gone
-            await response.prepare(request)
-        return response
+        return await _sent(request, DocumentReply(reply))
 
     async def _read(
         self, request: web.BaseRequest, call: IncomingCall
@@ -316,11 +312,11 @@ class XmlRpcServer(web.Server):
         return LongCall(method, size, call.body, request.content, watch)
 
     async def _read_rest(self, request: web.BaseRequest, call: IncomingCall) -> None:
-        left = self._limits.size - len(call.body)
-        rest = await read_bounded(request.content, left, call.hold)
+        left, whole = self._limits.size - len(call.body), request.content.is_eof()
+        rest = await read_bounded(request.content, left, None if whole else call.hold)
         call.body = call.body + rest if call.body else rest
         values = call.body.count(b"<value")
-        call.hold(VALUE * values)
+        call.hold(VALUE * values + (len(rest) if whole else 0))
         await self._context.take_turn(values)
 
     async def _pass_on(
@@ -366,4 +362,13 @@ def _forbid(text: str) -> web.StreamResponse:
     """The answer to somebody who is not let in; rospy shows the reason phrase, people the text."""
     response = web.Response(status=403, reason=text, text=f"{text}\n")
     response.force_close()
+    return response
+
+
+async def _sent(request: web.BaseRequest, response: DocumentReply) -> DocumentReply:
+    """Send a reply; that nobody is there any more the server sees for itself."""
+    try:
+        await response.prepare(request)
+    except ConnectionError as error:
+        log.debug("%s is gone: %s", request.remote, error)
     return response
