@@ -86,15 +86,14 @@ class Context:
         """Seconds of the monotonic clock."""
         return time.monotonic()
 
-    async def take_turn(self, values: int) -> None:
-        """Wait for one's turn to read or rewrite a document of so many values.
+    async def take_turn(self) -> None:
+        """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.
 
         All connections are looked at in between. Else many large documents that come together
         would hold everybody up.
         """
-        if values > MANY_VALUES:
-            async with self._turn:
-                await asyncio.sleep(0)
+        async with self._turn:
+            await asyncio.sleep(0)
 
     def standing(self, address: str) -> Standing:
         """Whether an address may use the proxy as its master, as far as is known now."""

@@ -16,7 +16,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
-from rosproxy.ros1.context import Context
+from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.protocol.bounds import too_long_to_ask
 from rosproxy.ros1.protocol.uris import parse_inside_path
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
@@ -166,7 +166,8 @@ class SlaveApi:
             await self._context.after_registration(endpoint)
             topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
             await self._alias.listen_for_announced(topic, announced)
-            await self._context.take_turn(len(announced))
+            if len(announced) > MANY_VALUES:
+                await self._context.take_turn()
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
         node, addressing = self._context.node_asker(endpoint), self._context.addressing

@@ -25,7 +25,7 @@ from rosproxy.net.budget import Charge, OverBudget
 from rosproxy.net.http_client import LongReply, TooLong, is_plain, read_bounded
 from rosproxy.net.sockets import end_if_stalled, hang_up, peek
 from rosproxy.ros1.clients.master import LOOP_HEADER, Unreachable
-from rosproxy.ros1.context import Context
+from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.protocol.tcpros import speaks_http
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -273,7 +273,7 @@ class XmlRpcServer(web.Server):
         try:
             size = request.content_length or 0
             if size <= passing.SHORT and request.content.is_eof():  # it came with the header
-                await self._read_rest(request, call)
+                await self._take_in(call, request.content.read_nowait())
                 return None
             async with asyncio.timeout(BODY_TIMEOUT):
                 invite(request)
@@ -312,12 +312,17 @@ class XmlRpcServer(web.Server):
         return LongCall(method, size, call.body, request.content, watch)
 
     async def _read_rest(self, request: web.BaseRequest, call: IncomingCall) -> None:
-        left, whole = self._limits.size - len(call.body), request.content.is_eof()
-        rest = await read_bounded(request.content, left, None if whole else call.hold)
-        call.body = call.body + rest if call.body else rest
-        values = call.body.count(b"<value")
-        call.hold(VALUE * values + (len(rest) if whole else 0))
-        await self._context.take_turn(values)
+        rest = await read_bounded(request.content, self._limits.size - len(call.body), call.hold)
+        await self._take_in(call, call.body + rest, len(call.body) + len(rest))
+
+    async def _take_in(self, call: IncomingCall, body: bytes, held: int = 0) -> None:
+        """Take in a whole body, of which so many bytes are held already. Raises TooLong."""
+        if len(body) > self._limits.size:
+            raise TooLong(self._limits.size)
+        call.body, values = body, body.count(b"<value")
+        call.hold(len(body) - held + VALUE * values)
+        if values > MANY_VALUES:
+            await self._context.take_turn()
 
     async def _pass_on(
         self, service: LongCalls, call: IncomingCall, long_call: LongCall
