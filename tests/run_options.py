@@ -37,6 +37,9 @@ def _run(words: list[str], variables: Mapping[str, str]) -> Settings:
 
 
 def _words(name: str, value: Any) -> Iterator[str]:
+    option = f"--{name.replace('_', '-')}"
     for one in value if isinstance(value, tuple | list) else (value,):
-        if one is not None:
-            yield f"--{name.replace('_', '-')}={one}"
+        if one is True:
+            yield option
+        elif one is not None and one is not False:
+            yield f"{option}={one}"

@@ -32,7 +32,6 @@ from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
-from rosproxy.ros1.alias.alias import TIDY_INTERVAL, Alias
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
@@ -41,6 +40,7 @@ from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
+from rosproxy.ros1.standins.ports import TIDY_INTERVAL, StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
@@ -74,15 +74,18 @@ class App:
         self._judge = judge = PolicyJudge(
             context.policy, context.registry, context.addressing, context.upstream
         )
-        self.tcpros = TcprosServer(context, judge)
+        self.tcpros = TcprosServer(context)
         self.plane = plane = KernelPlane(
             settings, context.registry, context.tasks, context.problems, context.now
         )
         self._callers, self._probing = Callers(context), asyncio.Lock()
-        self.alias = Alias(context, self._callers)
-        self._matchmaker = matchmaker = Matchmaker(context, self.alias)
+        self.stand_ins = StandInPorts(context, self._callers, self.tcpros, judge)
+        self._matchmaker = matchmaker = Matchmaker(context, self.stand_ins)
         self.registrar = registrar = Registrar(context, matchmaker)
-        self._resubscriber = Resubscriber(context, registrar, matchmaker, self.tcpros, plane)
+        udpros = self.stand_ins.udpros
+        self._resubscriber = Resubscriber(
+            context, registrar, matchmaker, self.tcpros, plane, udpros
+        )
         self.leases = leases = Leases(
             context.registry,
             settings.bind,
@@ -94,17 +97,17 @@ class App:
         )
         self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane, judge)
         self._enforcer = PolicyEnforcer(
-            context, leases, registrar, self._recovery, self.tcpros, plane, judge
+            context, leases, registrar, self._recovery, self.tcpros, plane, judge, udpros
         )
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
         self.master_monitor = monitor = MasterMonitor(context, self._recovery, registrar)
-        self._state = ProxyState(context, monitor, self.tcpros, self.alias, plane)
+        self._state = ProxyState(context, monitor, self.tcpros, self.stand_ins, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
-            context, leases, self.alias, self._adopter, self.tcpros, judge
+            context, leases, self.stand_ins, self._adopter, self.tcpros, judge
         )
-        self._servers = [slave.server]
+        self._servers = [slave.server, self.stand_ins.server]
         self._acceptors: list[Acceptor] = []
         self._containers = ContainerEvents(
             context, leases, registrar, self._adopter, self._recovery, self.tcpros, plane
@@ -115,7 +118,7 @@ class App:
         return MasterApi(
             self.context,
             self._admission,
-            self.alias,
+            self.stand_ins,
             self._recovery,
             self._adopter,
             self._judge,
@@ -159,7 +162,7 @@ class App:
         repeat(self.prober.look, PROBE_TICK, "looking after nodes")
         repeat(self.leases.retry_blocked, RETRY_BLOCKED, "retrying blocked ports")
         repeat(self._resubscriber.look, RESUBSCRIBE_TICK, "looking after subscribers")
-        repeat(self.alias.tidy, TIDY_INTERVAL, "looking after the alias's ports")
+        repeat(self.stand_ins.tidy, TIDY_INTERVAL, "looking after nodes outside")
         repeat(self.tcpros.sample_rates, RATE_INTERVAL, "sampling rates")
         repeat(self._enforcer.look, ENFORCE_TICK, "enforcing the policy")
         if policy_file is not None:
@@ -178,13 +181,11 @@ class App:
         for acceptor in self._acceptors:
             acceptor.close()
         self.leases.close_all()
-        self.alias.close()
+        self.stand_ins.close()
         await self.context.tasks.cancel()
         await self.plane.stop()
         servers = (server.close() for server in self._servers)
-        await asyncio.gather(
-            self._admin.stop(), self.tcpros.relays.stop(), self.alias.stop(), *servers
-        )
+        await asyncio.gather(self._admin.stop(), self.tcpros.relays.stop(), *servers)
         await self.context.upstream.close()
 
     def status(self) -> dict[str, Any]:

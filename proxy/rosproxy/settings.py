@@ -22,6 +22,7 @@ from rosproxy.net.addresses import HostPort, Network, parse_host_port
 MEBIBYTE = 1024 * 1024
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
+Direction = Literal["out", "both"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
 SlaveControl = Literal["any", "master"]
 """Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
@@ -46,10 +47,13 @@ class SettingError(ValueError):
 class Settings:
     """Everything that ``rosproxy run`` can be told. Times are in seconds.
 
-    ``inside_networks`` empty means: the networks of the proxy's own interfaces.
+    ``inside_networks`` empty means: the networks of the proxy's own interfaces, with ``direction``
+    ``both`` without that of the default route if there are others.
     ``master_address``: the IP address of the master's host where the proxy can't resolve its name
-    or would find itself. ``admin_token``: what callers that are not on loopback must know, or
-    ``admin_token_hash``: its SHA-256 in hex digits, for a proxy that is not to hold the token.
+    or would find itself. ``direction`` ``both``: nodes inside reach those outside through the
+    proxy, too; ``udp``: the range is published for UDP as well. ``admin_token``: what callers that
+    are not on loopback must know, or ``admin_token_hash``: its SHA-256 in hex digits, for a proxy
+    that is not to hold the token.
     ``policy`` are the layers of the options, in ``policy_mode`` as is that of the ``policy_file``;
     ``policy_layers`` are those that an operator gives for the start, ``await_policy`` is how long
     nothing is registered then, unless the operator has told the present ones before.
@@ -71,6 +75,8 @@ class Settings:
     master_interval: float = 2.0
     slave_control: SlaveControl = "any"
     data_plane: DataPlane = "auto"
+    direction: Direction = "out"
+    udp: bool = False
     master_address: str | None = None
     admin_token: str | None = field(default=None, repr=False)
     admin_token_hash: str | None = None

@@ -55,7 +55,7 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, master,
         calls += [exchange(lease, updates("/map", port, but_not=robot.uri)) for _ in range(5)]
         replies = await asyncio.gather(*calls)
         assert {reply.status for reply in replies} <= {200, 503}
-        assert aliased.status()["alias_ports"] == []
+        assert aliased.status()["stand_ins"] == []
         assert await refuses((PROXY, port), NODE)
         assert len(master.named("getSystemState")) - asked <= 2 * len(calls)
         assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
@@ -65,7 +65,7 @@ async def test_updates_that_name_every_port_of_the_masters_host(aliased, master,
         assert (await rpc(there, "getPid", "/n", source=NODE))[2] == robot.pid
 
 
-async def test_more_nodes_on_the_masters_host_than_there_are_alias_ports(
+async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
     aliased, master, node, make_node
 ):
     """Whoever may register at the master has any ports named: they are bounded in all."""
@@ -77,9 +77,9 @@ async def test_more_nodes_on_the_masters_host_than_there_are_alias_ports(
     lease = await aliased.publish(node)
     with aliased.watched():
         assert len((await node.subscribe(aliased.master, "/many"))[2]) == 3000
-        assert len(aliased.status()["alias_ports"]) <= 1024
+        assert len(aliased.status()["stand_ins"]) <= 1024
         async with AsyncExitStack() as stack:
-            for row in aliased.status()["alias_ports"][:200]:
+            for row in aliased.status()["stand_ins"][:200]:
                 await stack.enter_async_context(connect((PROXY, row["port"]), OTHER_NODE))
             assert (await node.subscribe(aliased.master, "/map"))[2] == [robot.uri]
             there = (PROXY, where(robot.uri)[1])

@@ -2,7 +2,8 @@
 
 With ROS_TESTS_FLAT=1 the same tests run in a network without boundary and without the
 proxy: what fails there is wrong with a test, or with ROS, and not with the proxy. With
-ROS_TESTS_KERNEL=1 the kernel forwards topics in all of them.
+ROS_TESTS_KERNEL=1 the kernel forwards topics in all of them. With ROS_TESTS_ISOLATED=1 inside has
+no way out but a proxy with ``--direction both``, or what ROS_TESTS_DIRECTION says.
 """
 
 from __future__ import annotations

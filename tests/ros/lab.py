@@ -17,6 +17,7 @@ from tests.ros.forks import PROGRAMS, Forks
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import (
     ADVERTISED_NAME,
+    ISOLATED,
     MASTER_PORT,
     OUT_HOST,
     OUT_NODE,
@@ -32,6 +33,8 @@ ROSCORE = f"exec roscore -p {MASTER_PORT}"
 CORE = f"/usr/lib/rosout/rosout & exec rosmaster --core -p {MASTER_PORT}"
 """What roscore starts, without roslaunch, which it is itself: at a fifth of the cost."""
 CALLER = "/rosproxy_tests"
+DIRECTION = os.environ.get("ROS_TESTS_DIRECTION", "both" if ISOLATED else "out")
+"""The proxy's ``--direction``."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class Lab:
         argv += ["--advertise-host", self.advertise_host, "--port-range", ports.bound]
         if ports.published != ports.bound:
             argv += ["--advertise-port-range", ports.published]
+        argv += ["--direction", DIRECTION]
         self.proxy = self._spawn_proxy([*argv, *self.proxy_options])
         self.proxy.wait_for(r"ready: ")
 

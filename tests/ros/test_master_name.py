@@ -100,10 +100,10 @@ def test_subscribers_from_before_hear_publishers_from_after_the_proxy_was_killed
     )
 
 
-def alias_ports(lab: Lab) -> set[int]:
+def stand_ins(lab: Lab) -> set[int]:
     """The ports on which the proxy stands in for nodes of the robot."""
     status = json.loads(lab.rosproxy("status", "--json").output)
-    return {row["port"] for row in status["alias_ports"]}
+    return {row["port"] for row in status["stand_ins"]}
 
 
 @pytest.mark.boundary
@@ -115,7 +115,7 @@ def test_uris_are_the_same_inside_and_outside(lab: Lab, library: str) -> None:
     assert len(uris) == 1
     found = re.match(r"http://robot:(\d+)/ ", uris.pop())
     assert found
-    assert int(found[1]) in alias_ports(lab)
+    assert int(found[1]) in stand_ins(lab)
     assert f" {found[1]}" in lab.rosproxy("status").output
     assert "Nothing wrong was found." in lab.rosproxy("doctor", name).output
 
@@ -176,10 +176,10 @@ def test_a_publisher_that_comes_back_at_the_same_port_is_heard(lab: Lab, library
         node.wait_for("^sent ")
         receiver = lab.node(library, "c1", "sub", topic=topic)
         receiver.wait_for_count(f"^got {word} ", 3)
-        assert 40001 in alias_ports(lab)
+        assert 40001 in stand_ins(lab)
         node.kill()
         lab.run("c1", "rosnode", "ping", "-c", "1", name, check=False)
-        assert 40001 not in alias_ports(lab)
+        assert 40001 not in stand_ins(lab)
 
 
 @pytest.mark.boundary

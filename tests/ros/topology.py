@@ -7,6 +7,9 @@ so that a host name which is known in one place and nowhere else is the real thi
 
 The host drops what outside sends to inside, apart from the ports it publishes to `px`;
 inside gets out through masquerade only: just what Docker's bridge network does.
+
+With ROS_TESTS_ISOLATED=1 inside does not get out at all, but for the proxy: the other machines
+have no route there, and the host passes nothing of theirs on.
 """
 
 from __future__ import annotations
@@ -30,6 +33,9 @@ ADVERTISED_NAME = "dockerhost"
 """A name for the host that outside machines know; `OUT_HOST` is its address."""
 MASTER_PORT = 11311
 PUBLISHED_MASTER_PORT = 11411
+
+ISOLATED = os.environ.get("ROS_TESTS_ISOLATED") == "1"
+"""Whether inside has no way out but the proxy."""
 
 _PREFIX = "rost"
 _NETNS_ETC = Path("/etc/netns")
@@ -169,7 +175,7 @@ class Topology:
             device = f"eth{len(self.places[role].addresses)}"
             self._link(role, device, port, f"{subnet}.{last}/24")
             self._on_host("link", "set", port, "master", bridge)
-            if device == "eth0":
+            if device == "eth0" and (role == "px" or not ISOLATED):
                 gateway = ("default", "via", f"{subnet}.1")
                 ip("-n", self.places[role].namespace, "route", "add", *gateway)
 
@@ -227,6 +233,7 @@ def _rules(plan: Plan, proxy: str) -> str:
     pairs = [*plan.ports.pairs(), (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)]
     published = ", ".join(f"{host} : {bound}" for host, bound in pairs)
     come = "" if plan.hairpin else 'iifname "out0"'
+    leaves = proxy if ISOLATED else "172.30.0.0/16"
     return f"""
     table ip boundary {{
       chain published {{
@@ -236,14 +243,14 @@ def _rules(plan: Plan, proxy: str) -> str:
       }}
       chain leaving {{
         type nat hook postrouting priority srcnat;
-        ip saddr 172.30.0.0/16 oifname "out0" masquerade
+        ip saddr {leaves} oifname "out0" masquerade
         ip saddr 172.30.0.0/16 ct status dnat masquerade
       }}
       chain forward {{
         type filter hook forward priority filter; policy drop;
         ct state established,related accept
         ct status dnat accept
-        iifname "br*" oifname "out0" accept
+        iifname "br*" ip saddr {leaves} oifname "out0" accept
         iifname "br1" oifname "br1" accept
         iifname "br2" oifname "br2" accept
       }}

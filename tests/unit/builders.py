@@ -14,9 +14,11 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
 from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting import master_api
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.ros1.rewriting.master_api import Admission, Noted, Refusal
+from rosproxy.settings import Settings
 
 HOST = "robot-host"
 PROXY = "10.0.0.1"
@@ -113,7 +115,15 @@ def make_addressing(
 ) -> Addressing:
     """The addressing of a proxy that knows no node yet."""
     ports = PortMap(PortRange(*listen), PortRange(*(advertise or listen)))
-    return Addressing(Registry(ports.listen), host, ports, tuple(map(ip_network, networks)))
+    known = tuple(map(ip_network, networks))
+    return Addressing(Registry(ports.listen), host, ports, make_stand_ins(ports), known)
+
+
+def make_stand_ins(ports: PortMap | None = None, **options: Any) -> StandIns:
+    """The stand-ins of a proxy whose master is ``robot``; none yet."""
+    listen = PortRange(45000, 45009)
+    settings = Settings("http://robot:11311", HOST, ports or PortMap(listen, listen), **options)
+    return StandIns(settings)
 
 
 def make_asker(address: str, proxy: str = PROXY, **more: Any) -> Asker:

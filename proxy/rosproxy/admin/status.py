@@ -15,12 +15,12 @@ from rosproxy.admin.status_bounds import bounded, first_hidden
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
 from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 
 
@@ -31,7 +31,7 @@ class ProxyState(Collector):
     _context: Context
     _monitor: MasterMonitor
     _tcpros: TcprosServer
-    _alias: Alias
+    _stand_ins: StandInPorts
     _plane: KernelPlane
 
     def status(self) -> document.ProxyStatus:
@@ -51,7 +51,19 @@ class ProxyState(Collector):
             master=self._master(),
             ports=self._ports(),
             data_plane=msgspec.convert(self._plane.status(), document.DataPlaneStatus),
-            alias_ports=msgspec.convert(self._alias.status(), tuple[document.AliasPortStatus, ...]),
+            udpros=tuple(
+                document.UdprosStatus(
+                    one.topic,
+                    one.caller_id,
+                    one.peer,
+                    relay.port,
+                    one.inside_asks,
+                    relay.sent,
+                    relay.dropped,
+                )
+                for one, relay in self._stand_ins.udpros
+            ),
+            stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
             policy=self._policy(),
             nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
             problems=tuple(
@@ -76,9 +88,14 @@ class ProxyState(Collector):
             ("leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)),
             ("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)),
             (
-                "alias_ports",
-                "Ports that stand in for nodes on the master's host.",
-                len(self._alias.status()),
+                "stand_ins",
+                "Ports that stand in for nodes outside.",
+                len(self._stand_ins.status()),
+            ),
+            (
+                "udpros_relays",
+                "Subscriptions by UDPROS that the proxy passes on.",
+                len(self._stand_ins.udpros),
             ),
             ("master_up", "Whether the master answers.", bool(self._monitor.up)),
             ("kernel_plane", "Whether the kernel forwards topics.", self._plane.syncer.usable),
@@ -123,6 +140,7 @@ class ProxyState(Collector):
             advertise_host=settings.advertise_host,
             bind=settings.bind,
             inside_networks=tuple(map(str, self._context.addressing.networks)),
+            direction=settings.direction,
             cleanup_after=settings.cleanup_after,
             linger=settings.linger,
             selected=None if selected is None else len(selected),

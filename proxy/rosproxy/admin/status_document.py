@@ -31,6 +31,7 @@ class NotAStatus(ValueError):
 class StatusSettings(msgspec.Struct, frozen=True):
     """The settings that others have to know. ``inside_networks``: those in force, as CIDRs.
 
+    ``direction``: ``out``, or ``both`` where inside reaches outside through the proxy, too.
     ``selected``: how many addresses an operator has selected; None: it has told of none yet.
     """
 
@@ -39,6 +40,7 @@ class StatusSettings(msgspec.Struct, frozen=True):
     advertise_host: str = ""
     bind: str = "0.0.0.0"
     inside_networks: Names = ()
+    direction: str = "out"
     cleanup_after: Seconds = 0.0
     linger: Seconds = 0.0
     selected: Count | None = None
@@ -91,11 +93,28 @@ class NodePlaneStatus(msgspec.Struct, frozen=True):
     received_rate: Rate = 0.0
 
 
-class AliasPortStatus(msgspec.Struct, frozen=True):
-    """A port that stands in for a node on the master's host."""
+class StandInStatus(msgspec.Struct, frozen=True):
+    """A port that stands in for a node or service outside, which ``uri`` names."""
 
     port: Count = 0
+    uri: str = ""
     connections: Count = 0
+
+
+class UdprosStatus(msgspec.Struct, frozen=True):
+    """A subscription by UDPROS that the proxy passes on: who, where from and to, and the bytes.
+
+    ``port`` is the proxy's UDP port, ``inward`` whether the subscriber is inside, ``dropped`` how
+    many datagrams came from others than the publisher.
+    """
+
+    topic: str = ""
+    caller_id: str = ""
+    peer: str = ""
+    port: Count = 0
+    inward: bool = False
+    bytes: Count = 0
+    dropped: Count = 0
 
 
 class ConnectionStatus(msgspec.Struct, frozen=True):
@@ -178,7 +197,8 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` is another one after each start; ``retired``: it registers nothing any more;
-    ``alias_ports`` are the ports that stand in for nodes on the master's host.
+    ``stand_ins`` are the ports that stand in for nodes outside, for inside nodes; ``udpros`` the
+    subscriptions by UDPROS that it passes on.
     """
 
     version: str = ""
@@ -190,7 +210,8 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     master: MasterStatus = MasterStatus()
     ports: PortsStatus = PortsStatus()
     data_plane: DataPlaneStatus | None = None
-    alias_ports: tuple[AliasPortStatus, ...] = ()
+    stand_ins: tuple[StandInStatus, ...] = ()
+    udpros: tuple[UdprosStatus, ...] = ()
     policy: PolicyStatus | None = None
     nodes: tuple[EndpointStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()

@@ -148,6 +148,18 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     help="How topics' bytes are forwarded: by the kernel, where the proxy may; spliced; or copied.",
 )
 @click.option(
+    "--direction",
+    type=click.Choice(["out", "both"]),
+    default="out",
+    help="Who needs no route to the other side: outside alone, or (both) the nodes inside as well.",
+)
+@click.option(
+    "--udp",
+    is_flag=True,
+    help="With --direction both: the range is published for UDP, too, so that UDPROS from outside "
+    "comes in.",
+)
+@click.option(
     "--max-lease-call",
     type=options.MEBIBYTES,
     default=1,

@@ -50,8 +50,8 @@ def _head(status: document.ProxyStatus) -> Iterator[str]:
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
     selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
     yield f"inside   {inside}, networks {networks}{selected}"
-    if ports := status.alias_ports:
-        yield f"alias    {_alias_ports(ports)}"
+    if ports := status.stand_ins:
+        yield f"outside  {_stand_ins(ports)}"
     if settings.publish_master:
         host = clean(settings.advertise_host)
         yield f"outside  ROS_MASTER_URI=http://{host}:{settings.publish_master}"
@@ -91,10 +91,10 @@ def _plane(plane: document.DataPlaneStatus) -> str:
     return f"relayed by the proxy ({clean(plane.plane)}): {clean(plane.reason)}"
 
 
-def _alias_ports(ports: Sequence[document.AliasPortStatus]) -> str:
+def _stand_ins(ports: Sequence[document.StandInStatus]) -> str:
     open_ones = plural(sum(port.connections for port in ports), "connection")
-    numbers = listed(str(port.port) for port in ports)
-    return f"{plural(len(ports), 'port')} of nodes on the master's host ({open_ones}): {numbers}"
+    named = listed(f"{port.port} for {clean(port.uri)}" for port in ports)
+    return f"reached from inside at {plural(len(ports), 'port')} ({open_ones}): {named}"
 
 
 def _nodes(status: document.ProxyStatus, columns: int, details: bool) -> Iterator[str]:

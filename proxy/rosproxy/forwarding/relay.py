@@ -57,9 +57,9 @@ class Relay:
     """One relayed connection.
 
     ``kind`` is topic or service and ``name`` which; ``caller_id`` and ``peer`` tell who connected
-    from outside. ``sent`` are bytes towards outside, ``received`` bytes towards the inside node;
-    ``sent_rate`` and ``received_rate`` are in bytes per second, as of the last `sample`. Without
-    ``splice`` all bytes are copied.
+    at ``port``: somebody outside, or a node inside if ``inside_asks``. ``sent`` are bytes towards
+    outside, ``received`` bytes towards the inside node; ``sent_rate`` and ``received_rate`` are in
+    bytes per second, as of the last `sample`. Without ``splice`` all bytes are copied.
     """
 
     port: int
@@ -70,6 +70,7 @@ class Relay:
     outside: socket.socket
     inside: socket.socket
     splice: bool = True
+    inside_asks: bool = False
     sent: int = 0
     received: int = 0
     failed: bool = False
@@ -88,11 +89,13 @@ class Relay:
         """
         for sock in (self.outside, self.inside):
             _prepare(sock)
-        if self._start_direction(0, finished):
+        client = self.inside if self.inside_asks else self.outside
+        asked, answer = (0, 1) if self.inside_asks else (1, 0)
+        if self._start_direction(answer, finished):
             if self.kind == "topic":
-                when_readable(self.outside, lambda: self._start_direction(1, finished))
+                when_readable(client, lambda: self._start_direction(asked, finished, second=True))
             else:
-                self._start_direction(1, finished)
+                self._start_direction(asked, finished, second=True)
 
     def end(self) -> None:
         """End both directions; ``finished`` is called when that is done."""
@@ -109,8 +112,11 @@ class Relay:
             self.sent_rate = round((self.sent - sent) / passed, 1)
             self.received_rate = round((self.received - received) / passed, 1)
 
-    def _start_direction(self, index: int, finished: Finished) -> bool:
-        """Whether the direction could be started; if not, both sides are reset."""
+    def _start_direction(self, index: int, finished: Finished, second: bool = False) -> bool:
+        """Whether the direction could be started; if not, both sides are reset.
+
+        ``second``: the other one runs already.
+        """
         thread = threading.Thread(
             target=self._direction, args=(index, finished), name=f"relay {self.name}", daemon=True
         )
@@ -119,9 +125,9 @@ class Relay:
         except RuntimeError as error:
             log.error("relay of %s: %s; raise the limit of processes and threads", self.name, error)
             self.failed = True
-            if index:  # the one before runs
+            if second:
                 self._pass_reset_on(index)
-            for left in range(index, 2):
+            for left in (index,) if second else (0, 1):
                 self._finish(left, finished)
             return False
         return True

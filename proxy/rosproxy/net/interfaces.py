@@ -29,19 +29,29 @@ def is_own(address: str) -> bool:
     return is_loopback(address) or address_towards(address) == address
 
 
-def interface_networks() -> tuple[Network, ...]:
-    """The networks that this machine's own interfaces are in, without loopback."""
-    networks: list[Network] = []
+def interface_networks(without_uplink: bool = False) -> tuple[Network, ...]:
+    """The networks that this machine's own interfaces are in, without loopback.
+
+    ``without_uplink``: nor those of the interface with the default route, if there are others.
+    """
+    found: dict[str, list[Network]] = {}
+    uplink = ""
     for line in _lines("/proc/net/route")[1:]:
         interface, target, gateway, *_, mask = line.split()[:8]
-        if interface != "lo" and gateway == "00000000" and target != "00000000":
-            networks.append(ip_network(f"{_quad(target)}/{_quad(mask)}", strict=False))
+        if target == "00000000":
+            uplink = interface
+        elif interface != "lo" and gateway == "00000000":
+            network = ip_network(f"{_quad(target)}/{_quad(mask)}", strict=False)
+            found.setdefault(interface, []).append(network)
     for line in _lines("/proc/net/if_inet6"):
         digits, _, prefix, _, _, interface = line.split()
         address = ip_address(bytes.fromhex(digits))
         if interface != "lo" and not address.is_link_local:
-            networks.append(ip_network(f"{address}/{int(prefix, 16)}", strict=False))
-    return tuple(networks)
+            network = ip_network(f"{address}/{int(prefix, 16)}", strict=False)
+            found.setdefault(interface, []).append(network)
+    if without_uplink and found.keys() - {uplink}:
+        found.pop(uplink, None)
+    return tuple(network for networks in found.values() for network in networks)
 
 
 def _quad(digits: str) -> str:

@@ -20,6 +20,7 @@ from rosproxy.ros1.protocol.xmlrpc import limits
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.selection import Standing, standing
+from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from rosproxy.settings import MEBIBYTE, Settings
 from rosproxy.telemetry.metrics import Metrics
@@ -68,7 +69,10 @@ class Context:
         self._turn = asyncio.Lock()
         self.passing = Budget(MOST_PASSING, PASSING_SHARE, "long requests and replies")
         self.registry = Registry(settings.ports.listen)
-        self.addressing = Addressing(self.registry, settings.advertise_host, settings.ports)
+        self.stand_ins = StandIns(settings)
+        self.addressing = Addressing(
+            self.registry, settings.advertise_host, settings.ports, self.stand_ins
+        )
         self.upstream = MasterClient(
             settings.master_uri,
             self.instance,
@@ -123,7 +127,8 @@ class Context:
         """The same at once."""
         self._towards.clear()
         self._networks_read = self.now()
-        self.addressing.networks = self.settings.inside_networks or interface_networks()
+        given, both = self.settings.inside_networks, self.stand_ins.both
+        self.addressing.networks = given or interface_networks(without_uplink=both)
 
     def node_asker(self, endpoint: Endpoint) -> Asker:
         """The node of an endpoint as somebody who is given addresses.

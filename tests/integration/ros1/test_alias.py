@@ -11,6 +11,7 @@ import pytest
 from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
+from rosproxy.ros1.rewriting.addressing import Asker
 from rosproxy.ros1.servers import callers
 from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
@@ -73,9 +74,9 @@ def service(node: FakeNode, address: str = PROXY) -> Where:
     return address, node.tcpros_port
 
 
-def alias_ports(proxy: Proxy) -> dict[int, int]:
-    """The alias ports with their connections."""
-    return {row["port"]: row["connections"] for row in proxy.app.status()["alias_ports"]}
+def stand_ins(proxy: Proxy) -> dict[int, int]:
+    """The ports that stand in for nodes, with their connections."""
+    return {row["port"]: row["connections"] for row in proxy.app.status()["stand_ins"]}
 
 
 def problems(proxy: Proxy) -> dict[str, str]:
@@ -130,10 +131,10 @@ WAYS = [by_subscribing, by_publishing, by_lookup, by_multicall, by_update]
 async def test_whatever_way_a_uri_is_given_it_is_unchanged_and_its_port_is_open(
     proxy: Proxy, robot: FakeNode, node: FakeNode, way: Callable[..., Awaitable[Any]]
 ) -> None:
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     assert await refuses(slave(robot), NODE)
     assert await way(proxy, robot, node) == robot.uri
-    assert slave(robot)[1] in alias_ports(proxy)
+    assert slave(robot)[1] in stand_ins(proxy)
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
 
 
@@ -156,15 +157,15 @@ async def test_the_port_is_open_before_the_update_arrives(
 
 async def test_a_service_is_found_at_its_own_port(proxy: Proxy, robot: FakeNode) -> None:
     assert await look_up_service(proxy) == robot.service_api
-    assert alias_ports(proxy) == {robot.tcpros_port: 0}
+    assert stand_ins(proxy) == {robot.tcpros_port: 0}
     async with connect(service(robot), NODE) as wire:
         await wire.send(service_header(caller="/tool"))
         assert (await read_header(wire))["callerid"] == "/robot"
         await wire.send(b"x" * 300_000)
         assert await wire.exactly(300_000) == b"x" * 300_000
-        assert alias_ports(proxy) == {robot.tcpros_port: 1}
+        assert stand_ins(proxy) == {robot.tcpros_port: 1}
     assert robot.headers == [{"callerid": "/tool", "service": "/add", "md5sum": "*"}]
-    await until(lambda: alias_ports(proxy) == {robot.tcpros_port: 0}, "the relay ends")
+    await until(lambda: stand_ins(proxy) == {robot.tcpros_port: 0}, "the relay ends")
 
 
 async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
@@ -174,7 +175,7 @@ async def test_a_topic_is_to_be_had_directly_at_the_masters_address(
     asked = await rpc(slave(robot), "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
     port = robot.tcpros_port
     assert asked == [1, f"ready on {MASTER}:{port}", ["TCPROS", MASTER, port]]
-    assert port not in alias_ports(proxy)
+    assert port not in stand_ins(proxy)
     asked = await rpc(slave(robot), "requestTopic", "/n", "/no", [["TCPROS"]], source=NODE)
     assert asked == [-1, "Not a publisher of [/no]", []]
 
@@ -269,7 +270,7 @@ async def test_nothing_happens_without_need(
     proxy = await make_proxy(**behind_its_name(master, **changed))
     assert await look_up(proxy, robot) == robot.uri
     assert await look_up_service(proxy) == robot.service_api
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     assert await refuses(slave(robot), NODE)
 
 
@@ -280,7 +281,7 @@ async def test_nodes_with_addresses_or_of_other_hosts_are_left_alone(
         node = await make_node(name, MASTER, host=host)
         await node.publish(where(master.uri))
         assert await look_up(proxy, node) == node.uri
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
 
 
 async def gone(proxy: Proxy, robot: FakeNode) -> None:
@@ -297,12 +298,12 @@ async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot:
     for _ in range(2):
         assert await refuses(slave(robot), NODE)
         assert await refuses(service(robot), NODE)
-        assert alias_ports(proxy) == {}
+        assert stand_ins(proxy) == {}
         assert await look_up(proxy, robot) == robot.uri
         assert await look_up_service(proxy) == robot.service_api
     await robot.start()
     assert await look_up(proxy, robot) == robot.uri
-    assert alias_ports(proxy) == {slave(robot)[1]: 0}
+    assert stand_ins(proxy) == {slave(robot)[1]: 0}
     assert (await rpc(slave(robot), "getPid", "/tool", source=NODE))[2] == robot.pid
 
 
@@ -324,7 +325,7 @@ async def test_a_node_that_does_not_answer_is_no_node_that_is_gone(
     await look_up(proxy, robot)
     robot.answers["getPid"] = End.RESET
     assert await knock(slave(robot), post(xml("getPid", "/tool")), NODE) == "reset"
-    assert alias_ports(proxy) == {slave(robot)[1]: 0}
+    assert stand_ins(proxy) == {slave(robot)[1]: 0}
 
 
 async def test_ports_that_the_proxy_needs_itself_are_a_problem(
@@ -337,7 +338,7 @@ async def test_ports_that_the_proxy_needs_itself_are_a_problem(
         await rpc(master.uri, "registerPublisher", f"/{uri[-6:-1]}", "/t", "x/Y", uri)
     seen = (await rpc(proxy.master, "registerSubscriber", "/n", "/t", "*", uris[0], source=NODE))[2]
     assert seen == uris
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     told = problems(proxy)
     options = ("--port-range", "--master-port", "--admin-bind")
     for uri, port, option in zip(uris, own, options, strict=True):
@@ -371,13 +372,13 @@ async def test_the_problem_of_a_node_that_has_ended_is_forgotten(
             taken.listen()
         await look_up(proxy, robot)
         await look_up_service(proxy)
-        await proxy.app.alias.tidy()
+        await proxy.app.stand_ins.tidy()
         assert set(problems(proxy)) == {robot.uri, robot.service_api}
         await robot.stop()
-        await proxy.app.alias.tidy()
+        await proxy.app.stand_ins.tidy()
         assert set(problems(proxy)) == {robot.service_api}
-        monkeypatch.setattr("rosproxy.ros1.alias.alias.SERVICE_PROBLEM", 0.0)
-        await proxy.app.alias.tidy()
+        monkeypatch.setattr("rosproxy.ros1.standins.ports.SERVICE_PROBLEM", 0.0)
+        await proxy.app.stand_ins.tidy()
         assert problems(proxy) == {}
 
 
@@ -387,7 +388,7 @@ async def test_the_proxys_own_ports_are_no_aliases_where_it_shares_the_name(
     proxy = await make_proxy(**behind_its_name(master, advertise_host="robot"))
     await node.publish(proxy.master)
     assert await look_up(proxy, node) == node.uri
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     assert problems(proxy) == {}
 
 
@@ -404,20 +405,20 @@ async def crowd(make_node: MakeNode, master: FakeMaster) -> list[FakeNode]:
 async def test_ports_are_bounded_and_the_least_used_goes_first(
     proxy: Proxy, crowd: list[FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
+    monkeypatch.setattr("rosproxy.ros1.registry.stand_ins.MOST_STAND_INS", 2)
     first, second, third = crowd
     await look_up(proxy, first)
     await look_up(proxy, second)
     await look_up(proxy, first)
     await look_up(proxy, third)
-    assert set(alias_ports(proxy)) == {slave(first)[1], slave(third)[1]}
+    assert set(stand_ins(proxy)) == {slave(first)[1], slave(third)[1]}
     assert await refuses(slave(second), NODE)
 
 
 async def test_ports_in_use_are_kept(
     proxy: Proxy, crowd: list[FakeNode], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rosproxy.ros1.alias.alias.MOST_PORTS", 2)
+    monkeypatch.setattr("rosproxy.ros1.registry.stand_ins.MOST_STAND_INS", 2)
     async with AsyncExitStack() as stack:
         for node in crowd[:2]:
             await rpc(proxy.master, "lookupService", "/tool", node.name, source=NODE)
@@ -425,12 +426,12 @@ async def test_ports_in_use_are_kept(
             await wire.send(service_header())
             await read_header(wire)
         assert await look_up(proxy, crowd[2]) == crowd[2].uri
-        assert set(alias_ports(proxy)) == {node.tcpros_port for node in crowd[:2]}
+        assert set(stand_ins(proxy)) == {node.tcpros_port for node in crowd[:2]}
         assert "one too many" in problems(proxy)[crowd[2].uri]
-    await until(lambda: set(alias_ports(proxy).values()) == {0}, "the relays end")
+    await until(lambda: set(stand_ins(proxy).values()) == {0}, "the relays end")
     await look_up(proxy, crowd[2])
     assert crowd[2].uri not in problems(proxy)
-    assert slave(crowd[2])[1] in alias_ports(proxy)
+    assert slave(crowd[2])[1] in stand_ins(proxy)
 
 
 async def test_another_address_counts_for_new_connections(proxy: Proxy, robot: FakeNode) -> None:
@@ -456,7 +457,7 @@ async def test_an_address_that_leads_back_makes_no_loop(
 ) -> None:
     await look_up(proxy, robot)
     await look_up_service(proxy)
-    monkeypatch.setattr("rosproxy.ros1.alias.alias.address_towards", lambda address: address)
+    monkeypatch.setattr("rosproxy.ros1.standins.outside.address_towards", lambda address: address)
     proxy.app.context.upstream.master_address = PROXY
     assert await knock(service(robot), service_header(), NODE) == "reset"
     assert await refuses(service(robot), NODE)
@@ -470,10 +471,10 @@ async def test_a_recovered_subscriber_is_given_open_ports(
     await node.subscribe(proxy.master)
     node.calls.clear()
     await proxy.restart()
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     await until(node.updates, "a publisherUpdate by the proxy")
     assert node.updates()[0] == [robot.uri]
-    assert alias_ports(proxy) == {slave(robot)[1]: 0}
+    assert stand_ins(proxy) == {slave(robot)[1]: 0}
 
 
 async def test_nodes_on_the_masters_host_are_told_at_its_address(
@@ -486,16 +487,16 @@ async def test_nodes_on_the_masters_host_are_told_at_its_address(
     await proxy.restart()
     await until(robot.updates, "a publisherUpdate by the proxy")
     assert robot.updates()[0] == [robot.uri]
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
 
 
 async def test_alias_ports_are_measured(proxy: Proxy, robot: FakeNode) -> None:
-    assert (await metrics(proxy))["rosproxy_alias_ports"] == 0
+    assert (await metrics(proxy))["rosproxy_stand_ins"] == 0
     await look_up(proxy, robot)
     await rpc(slave(robot), "getPid", "/tool", source=NODE)
     found = await metrics(proxy)
-    assert found["rosproxy_alias_ports"] == 1
-    label = "{api=alias,method=getPid,outcome=answered}"
+    assert found["rosproxy_stand_ins"] == 1
+    label = "{api=stand_in,method=getPid,outcome=answered}"
     assert found[f"rosproxy_xmlrpc_calls_total{label}"] == 1
 
 
@@ -512,7 +513,7 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
         assert await caller.outcome() in _CLOSED
     assert await refuses(slave(robot), NODE)
     assert await refuses(service(robot), OTHER_NODE)
-    await proxy.app.alias.listen_for([robot.uri])
+    await proxy.app.stand_ins.listen_for([robot.uri], Asker(NODE, PROXY))
     assert await refuses(slave(robot), NODE)
 
 
@@ -528,11 +529,11 @@ async def test_an_update_that_the_master_does_not_bear_out_opens_no_port(
         for source in (NODE, OUTSIDE, MASTER):
             params = "/master", topic, uris
             assert (await rpc(proxy.uri(node), "publisherUpdate", *params, source=source))[0] == 1
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
     assert await refuses((PROXY, port), NODE)
     # What the master has of that topic opens its port, whoever tells.
     await rpc(proxy.uri(node), "publisherUpdate", "/master", "/chatter", [robot.uri, *forged])
-    assert set(alias_ports(proxy)) == {slave(robot)[1]}
+    assert set(stand_ins(proxy)) == {slave(robot)[1]}
     secret.close()
 
 
@@ -548,7 +549,7 @@ async def test_updates_that_come_together_share_a_question_to_the_master(
     )
     await asyncio.gather(*updates)
     assert len(master.named("getSystemState")) - before < 10
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
 
 
 async def test_an_update_is_passed_on_while_the_master_is_away(
@@ -559,7 +560,7 @@ async def test_an_update_is_passed_on_while_the_master_is_away(
     await master.stop()
     assert (await rpc(lease, "publisherUpdate", "/master", "/t", [robot.uri]))[0] == 1
     assert node.updates("/t") == [[robot.uri]]
-    assert alias_ports(proxy) == {}
+    assert stand_ins(proxy) == {}
 
 
 async def test_only_tcpros_is_relayed(proxy: Proxy, robot: FakeNode) -> None:
@@ -567,7 +568,7 @@ async def test_only_tcpros_is_relayed(proxy: Proxy, robot: FakeNode) -> None:
     await look_up_service(proxy)
     for data in (b"\x00\x01\x02\x03garbage", b"\xff\xff\xff\xff", b"\x04\x00\x00\x00abcd"):
         before = robot.tcpros.connections
-        assert await knock(service(robot), data, NODE) in ("closed", "reset", "silent")
+        assert await knock(service(robot), data, NODE) in ("closed", "reset", "silent", "answered")
         assert robot.tcpros.connections == before
 
 

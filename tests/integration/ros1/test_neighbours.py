@@ -177,7 +177,7 @@ async def test_a_network_that_the_proxy_joins_while_it_runs_counts_at_once(
     make_proxy, make_node, monkeypatch: pytest.MonkeyPatch
 ):
     networks = [ip_network("127.0.5.0/24")]
-    monkeypatch.setattr("rosproxy.ros1.context.interface_networks", lambda: tuple(networks))
+    monkeypatch.setattr("rosproxy.ros1.context.interface_networks", lambda **_: tuple(networks))
     proxy = await make_proxy(inside_network=())
     talker, listener = await make_node("/talker"), await make_node("/listener", OTHER_NODE)
     networks.append(ip_network("127.0.2.0/24"))

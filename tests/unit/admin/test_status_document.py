@@ -54,14 +54,14 @@ def test_what_is_missing_has_a_default_and_what_is_unknown_is_ignored() -> None:
 
 def test_what_does_not_fit_leaves_the_rest_alone() -> None:
     status = a_status()
-    status |= {"uptime": float("nan"), "pid": 2**64, "alias_ports": 3, "data_plane": []}
+    status |= {"uptime": float("nan"), "pid": 2**64, "stand_ins": 3, "data_plane": []}
     status["master"] |= {"error": None, "round_trip": "fast", "since": float("inf")}
     status["ports"]["used"] = -1
     status["nodes"][0] |= {"state": 7, "publishes": ["/a", 1, None], "data_plane": {"port": []}}
     status["nodes"][0]["connections"] += ["x", {"name": "/b", "sent": True}]
     status["nodes"] += ["x", None]
     found = parse_status(json.dumps(status))
-    assert (found.uptime, found.pid, found.alias_ports, found.data_plane) == (0.0, 0, (), None)
+    assert (found.uptime, found.pid, found.stand_ins, found.data_plane) == (0.0, 0, (), None)
     assert (found.master.up, found.master.uri) == (True, "http://robot:11311")
     assert (found.master.error, found.master.round_trip, found.master.since) == ("", None, 0.0)
     assert (found.ports.used, found.ports.free) == (0, 99)

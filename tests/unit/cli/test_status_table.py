@@ -42,15 +42,18 @@ def test_head_names_offset_and_blocked_ports_and_the_published_master() -> None:
     assert lines[4] == "outside  ROS_MASTER_URI=http://robot-host:11411"
 
 
-def test_head_names_alias_ports() -> None:
+def test_head_names_stand_ins() -> None:
     status = make_status()
-    status["alias_ports"] = []
-    assert "alias" not in shown(status, 120)
-    status["alias_ports"] = [{"port": port, "connections": 2} for port in range(40001, 40008)]
+    status["stand_ins"] = []
+    assert "reached from inside" not in shown(status, 120)
+    status["stand_ins"] = [
+        {"port": port, "uri": f"http://r:{port}/", "connections": 2} for port in range(4001, 4008)
+    ]
     assert (
-        "alias    7 ports of nodes on the master's host (14 connections): "
-        "40001, 40002, 40003, 40004, 40005 and 2 more"
-    ) in shown(status, 120).split("\n")
+        "outside  reached from inside at 7 ports (14 connections): 4001 for http://r:4001/, "
+        "4002 for http://r:4002/, 4003 for http://r:4003/, 4004 for http://r:4004/, "
+        "4005 for http://r:4005/ and 2 more"
+    ) in shown(status, 200).split("\n")
 
 
 @pytest.mark.parametrize(

@@ -202,6 +202,27 @@ def test_a_subscriber_outside_that_does_not_come() -> None:
     assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 
+def subscriber_inside(**settings: str) -> DoctorFinding:
+    """A publisher outside that serves its topic, and a subscriber behind the proxy."""
+    giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
+    ports = {("/talker", "/chatter"): ("192.168.0.9:5000", Attempt(Reach.ANSWERED))}
+    status = make_status(make_node("/listener"), settings=settings)
+    return apart(giver, listener(uri=INSIDE_URI), data_ports=ports, status=status)
+
+
+def test_a_subscriber_inside_that_has_no_route_outwards() -> None:
+    found = subscriber_inside()
+    assert "/listener, behind the proxy, has not come to 192.168.0.9:5000 by itself" in found.text
+    assert found.fix.startswith("where /listener runs: nc -vz 192.168.0.9 5000; if there is no")
+    assert "--direction both" in found.fix
+
+
+def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
+    found = subscriber_inside(direction="both")
+    assert f"has not come to the proxy's port for {OUTSIDE_URI}" in found.text
+    assert "--direction" not in found.fix
+
+
 def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:
     """A publisher outside whose data port was tried."""
     giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))

@@ -6,12 +6,19 @@ import pytest
 
 from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.alias import policy
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
+from rosproxy.ros1.registry import stand_ins as book
 from rosproxy.ros1.rewriting import master_api, slave_api
 from rosproxy.settings import Settings
-from tests.unit.builders import DIALECTS, make_addressing, make_asker, py_call, py_reply
+from tests.unit.builders import (
+    DIALECTS,
+    make_addressing,
+    make_asker,
+    make_stand_ins,
+    py_call,
+    py_reply,
+)
 
 ROBOT, ADDRESS = "robot", "192.0.2.7"
 URI, SERVICE, LAPTOP = "http://robot:40001/", "rosrpc://robot:40003", "http://laptop:33445/"
@@ -34,7 +41,7 @@ def settings(**options: Any) -> Settings:
     ],
 )
 def test_only_a_host_name_can_lead_to_the_proxy(master_uri: str, host: str | None) -> None:
-    assert policy.aliased_host(master_uri) == host
+    assert book.aliased_host(master_uri) == host
 
 
 def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = False) -> list[str]:
@@ -109,25 +116,27 @@ def test_only_ports_of_the_masters_host_need_a_port() -> None:
         "http://robot/",
         "",
     ]
-    found = policy.ports_needed(uris, ROBOT, make_addressing("robot"))
-    assert found == {40001: URI, 40003: SERVICE, 40004: "http://ROBOT:40004/"}
+    addressing = make_addressing("robot")
+    needed = {uri for uri in uris if addressing.foreign(uri)}
+    assert needed == {URI, SERVICE, "http://ROBOT:40004/"}
 
 
 def test_ports_that_the_proxy_needs_itself_do_not_stand_in() -> None:
     own = settings(publish_master=11411, admin=HostPort("0.0.0.0", 11312))
-    assert {port: policy.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
+    assert {port: book.obstacle(port, own) for port in (45000, 45009, 11311, 11411, 11312)} == {
         45000: "lies in --port-range 45000-45009",
         45009: "lies in --port-range 45000-45009",
         11311: "is that of --master-port",
         11411: "is that of --publish-master",
         11312: "is that of --admin-bind",
     }
-    assert policy.obstacle(45010, own) is None
-    assert policy.obstacle(40001, settings()) is None
+    assert book.obstacle(45010, own) is None
+    assert book.obstacle(40001, settings()) is None
 
 
 def test_advice_says_what_to_do() -> None:
-    text = policy.advice(45000, "lies in --port-range 45000-45009", ADDRESS)
+    where, why = HostPort(ROBOT, 45000), "lies in --port-range 45000-45009"
+    text = make_stand_ins().advice(where, why, ADDRESS)
     assert "port 45000 lies in --port-range 45000-45009" in text
     assert "ROS_IP=192.0.2.7" in text
 
@@ -140,7 +149,7 @@ def test_datagrams_are_sent_to_the_address(dialect: str) -> None:
         return DIALECTS[dialect][0](method, "/listener", "/chatter", offers)
 
     def sent(given: bytes) -> bytes:
-        return policy.direct_call(xmlrpc.parse_call(given), given, ROBOT, ADDRESS)
+        return slave_api.with_address(given, xmlrpc.parse_call(given), ROBOT, ADDRESS)
 
     for named in ("robot", "Robot"):
         assert sent(body(named)) == body(ADDRESS)
@@ -150,7 +159,7 @@ def test_datagrams_are_sent_to_the_address(dialect: str) -> None:
 
 def direct(reply: bytes, method: str = "requestTopic", address: str = ADDRESS) -> bytes:
     call = xmlrpc.parse_call(py_call(method, "/n", "/chatter", [["TCPROS"]]))
-    return policy.direct_reply(call, reply, ROBOT, address)
+    return slave_api.sent_directly(call, reply, ROBOT, address)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)

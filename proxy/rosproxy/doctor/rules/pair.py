@@ -127,8 +127,27 @@ def _why_no_transport(
             f"{giver.name} is behind the proxy and fine; {taker.name} has not come to {port}",
             f"on the machine of {taker.name}: nc -vz {port.host} {port.port}; then {restart}",
         )
+    if facts.ours(taker.where) and not facts.ours(giver.where):
+        return _why_not_from_inside(facts, address, giver, taker)
     text = "both answer and their types fit; perhaps their message definitions differ (md5sum)"
     return text, f"look into the log of {taker.name}; {restart}"
+
+
+def _why_not_from_inside(
+    facts: DoctorFacts, address: str, giver: NodeFacts, taker: NodeFacts
+) -> tuple[str, str]:
+    """Why a subscriber behind the proxy has not come to a publisher that is well."""
+    text = f"{giver.name} is fine; {taker.name}, behind the proxy, has not come to"
+    if facts.proxy.settings.direction == "both":
+        text = f"{text} the proxy's port for {giver.uri}"
+        return text, f"look into the log of {taker.name} and of the proxy; restart {taker.name}"
+    where = parse_host_port(address)
+    test = f"nc -vz {where.host} {where.port}" if where else f"a connection to {giver.uri}"
+    return (
+        f"{text} {address or giver.uri} by itself",
+        f"where {taker.name} runs: {test}; if there is no route outwards, the proxy can be the "
+        "way: --direction both (label rosproxy.direction=both, spec.direction: Both)",
+    )
 
 
 def _service(facts: DoctorFacts, service: str) -> DoctorFinding:

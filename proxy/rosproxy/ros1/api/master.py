@@ -16,7 +16,6 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 
 from rosproxy.net.http_client import LongReply
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import LONGEST_NAME, too_long_to_register
@@ -34,6 +33,7 @@ from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
@@ -47,7 +47,7 @@ class MasterApi:
 
     _context: Context
     _admission: NodeAdmission
-    _alias: Alias
+    _stand_ins: StandInPorts
     _recovery: Recovery
     _adopter: Adopter
     _judge: PolicyJudge
@@ -119,7 +119,7 @@ class MasterApi:
             answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_api.read_reply(exported, answer)
             self._note(reply.facts(self._context.now()), request.asker.address)
-            await self._alias.listen_for(reply.uris())
+            await self._stand_ins.listen_for(reply.uris(), request.asker)
             if self._context.policy.version != version:
                 self._enforcer.look_again()
             return master_api.import_reply(reply, addressing, self._judge.unseen(reply))

@@ -14,7 +14,6 @@ from typing import TypeVar
 from rosproxy.leases.leases import Leases
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import LongReply
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import MANY_VALUES, Context
 from rosproxy.ros1.protocol.bounds import too_long_to_ask
@@ -24,11 +23,11 @@ from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.rewriting import policing, slave_api
-from rosproxy.ros1.rewriting.slave_api import Visit
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
-from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.servers.tcpros import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 
 log = logging.getLogger(__name__)
@@ -44,19 +43,21 @@ class SlaveApi:
         self,
         context: Context,
         leases: Leases[Endpoint],
-        alias: Alias,
+        stand_ins: StandInPorts,
         adopter: Adopter,
         tcpros: TcprosServer,
         judge: PolicyJudge,
     ) -> None:
-        self._context, self._leases, self._alias = context, leases, alias
+        self._context, self._leases, self._stand_ins = context, leases, stand_ins
         self._adopter, self._tcpros, self._judge = adopter, tcpros, judge
+        self._nodes = InsideNodes(context, judge)
         greeting = "rosproxy: slave API of a ROS node behind it\n"
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
     async def serve(self, endpoint: Endpoint, conn: socket.socket, peer: str) -> None:
         """Serve a connection to one of an endpoint's ports. Raises TimeoutError, OSError."""
-        await self.server.dispatch(conn, peer, partial(self._tcpros.serve, endpoint, peer))
+        target = self._nodes.target(endpoint)
+        await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
 
     def end_calls(self, port: int) -> None:
         """Let the XML-RPC connections of a port end, which refuses from now on."""
@@ -165,23 +166,27 @@ class SlaveApi:
         if parsed.method == "publisherUpdate":
             await self._context.after_registration(endpoint)
             topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
-            await self._alias.listen_for_announced(topic, announced)
+            node = self._context.node_asker(endpoint)
+            await self._stand_ins.listen_for_announced(topic, announced, node)
             if len(announced) > MANY_VALUES:
                 await self._context.take_turn()
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
-        node, addressing = self._context.node_asker(endpoint), self._context.addressing
-        body = self._alias.import_call(body, parsed)
-        reply = await self._ask(endpoint, slave_api.import_call(body, parsed, node, addressing))
+        addressing, near = self._context.addressing, call.reached_locally
+        node = self._context.node_asker(endpoint)
+        view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
+        if self._context.stand_ins.both:
+            body = await self._stand_ins.udpros.lead_outwards(endpoint, parsed, body, call.source)
+        else:
+            body = self._stand_ins.with_address(body, parsed)
+        reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
         port, said = endpoint.port, slave_api.topic_port(parsed, reply)
         if said is not None:
             endpoint.note_tcpros_port(said, parsed.string(1) or "")
             if self._judge.may_bypass(endpoint):
                 port = await self._leases.fast_port(endpoint, said) or port
-        near = call.reached_locally
         reached = HostPort(call.local.host, port) if near else addressing.outside(port)
-        visit = Visit(node, reached, self._context.settings.master_uri)
-        return slave_api.export_reply(parsed, reply, visit, addressing)
+        return slave_api.rewrite_reply(parsed, reply, reached, view)
 
     def _with_hidden(
         self, endpoint: Endpoint, parsed: xmlrpc.Call, body: bytes

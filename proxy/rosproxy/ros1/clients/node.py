@@ -121,15 +121,23 @@ class NodeClient:
     async def _topics(self, where: HostPort, method: str) -> dict[str, str]:
         return read_types(await self._upstream.call_node(where, self._within, method))
 
+    async def topic_port(self, where: HostPort, topic: str) -> int | None:
+        """The TCPROS port that a node names for a topic. Raises Unreachable, MasterError."""
+        answer = await self._upstream.call_node(
+            where, self._within, "requestTopic", topic, [["TCPROS"]]
+        )
+        match answer:
+            case [_, _, int(port)] if 0 < port < 65536:
+                return port
+        return None
+
     async def _tcpros_port(self, where: HostPort, topics: list[str]) -> int | None:
         for topic in topics[:TOPICS_ASKED]:
             try:
-                answer = await self._upstream.call_node(
-                    where, self._within, "requestTopic", topic, [["TCPROS"]]
-                )
+                port = await self.topic_port(where, topic)
             except (Unreachable, MasterError) as error:
                 log.debug("%s gives no TCPROS port for %s: %s", where, topic, error)
                 continue
-            if isinstance(answer, list) and len(answer) == 3 and isinstance(answer[2], int):
-                return answer[2]
+            if port is not None:
+                return port
         return None

@@ -22,6 +22,7 @@ from rosproxy.ros1.protocol.uris import (
 )
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.registry import Registry
+from rosproxy.ros1.registry.stand_ins import StandIns
 
 
 class Asker(msgspec.Struct, frozen=True):
@@ -49,6 +50,7 @@ class Addressing:
     registry: Registry
     host: str
     ports: PortMap
+    stand_ins: StandIns
     networks: Sequence[Network] = field(default_factory=tuple)
     _advertised: dict[int, tuple[HostPort, Place, str]] = field(default_factory=dict)
     """What `advertised_uri` said last of each port, and what it was made of."""
@@ -71,6 +73,8 @@ class Addressing:
 
     def export_slave(self, uri: str, asker: Asker) -> str:
         """The outside form of a slave URI that an inside node gave."""
+        if (original := self.stand_ins.export_uri(uri)) is not None:
+            return original
         where = parse_slave_uri(uri)
         endpoint = self._own(uri, asker) if where else None
         if endpoint:
@@ -81,6 +85,8 @@ class Addressing:
 
     def export_service(self, uri: str, service: str, asker: Asker) -> str:
         """The outside form of the URI of a service that an inside node gave."""
+        if (original := self.stand_ins.export_uri(uri)) is not None:
+            return original
         where = parse_service_uri(uri)
         if where is None:
             return uri
@@ -94,17 +100,24 @@ class Addressing:
     def import_slave(self, uri: str, asker: Asker) -> str:
         """The form of a slave URI from outside that an inside node can use."""
         endpoint = self.stands_for(uri)
-        return self._import(endpoint, asker) if endpoint else uri
+        return self._import(endpoint, asker) if endpoint else self._import_foreign(uri, asker)
 
     def import_service(self, uri: str, service: str, asker: Asker) -> str:
         """The form of a service URI from outside that an inside node can use."""
         endpoint = self._endpoint_at(parse_service_uri(uri))
         if endpoint is None:
-            return uri
+            return self._import_foreign(uri, asker)
         literal = self._service_literal(endpoint, service)
         if literal and self._direct(endpoint, asker):
             return literal
         return service_uri(HostPort(asker.proxy, endpoint.port))
+
+    def foreign(self, uri: str) -> HostPort | None:
+        """What a stand-in for a URI that the master has needs to lead to; None if it needs none."""
+        where = self.stand_ins.target(uri)
+        if where is None or self.advertises(where) or is_inside(where.host, self.networks):
+            return None
+        return where
 
     def handed_out(self, uri: str, asker: Asker) -> bool:
         """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
@@ -121,6 +134,9 @@ class Addressing:
         """The listening port and inside address of an advertised slave URI of this proxy."""
         port, path = self._listening(parse_slave_uri(uri)), parse_inside_path(uri)
         return (port, path) if port and path else None
+
+    def _import_foreign(self, uri: str, asker: Asker) -> str:
+        return self.stand_ins.import_uri(uri, asker.proxy) if self.foreign(uri) else uri
 
     def _import(self, endpoint: Endpoint, asker: Asker) -> str:
         if self._direct(endpoint, asker) and self._own(endpoint.uri, asker) is endpoint:

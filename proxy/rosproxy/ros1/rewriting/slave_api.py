@@ -1,8 +1,15 @@
-"""The slave API as outside and the master call it: what is rewritten on the way in and back.
+"""The slave API: what is rewritten in a call that passes the proxy, and in its reply.
+
+It is the same both ways. What an address becomes on its way is told by a `View`: `from_outside`
+where outside or the master calls a node inside, `from_inside` where a node inside calls one
+outside.
 
 Rows: http://wiki.ros.org/ROS/Slave_API; the replies' shapes: ros_comm's
 clients/rospy/src/rospy/impl/masterslave.py and clients/roscpp/src/libros/topic_manager.cpp.
 """
+
+from collections.abc import Callable
+from functools import partial
 
 import msgspec
 
@@ -23,16 +30,28 @@ _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
-class Visit(msgspec.Struct, frozen=True):
-    """A call at an endpoint.
+class View(msgspec.Struct, frozen=True):
+    """How the two ends of a call see the nodes that they name.
 
-    ``node`` is the endpoint's node as an asker of imported addresses, ``reached`` the address and
-    port at which the caller is to find its topics, ``master_uri`` the master's URI outside.
+    ``asked`` is what a slave URI in the call becomes, ``answered`` one in the reply, ``master_uri``
+    the URI that the caller has for the master.
     """
 
-    node: Asker
-    reached: HostPort
+    asked: Callable[[str], str]
+    answered: Callable[[str], str]
     master_uri: str
+
+
+def from_outside(node: Asker, master_uri: str, addressing: Addressing) -> View:
+    """The view of a call from outside at a node inside."""
+    imported = partial(addressing.import_slave, asker=node)
+    return View(imported, partial(addressing.export_slave, asker=node), master_uri)
+
+
+def from_inside(asker: Asker, master_uri: str, addressing: Addressing) -> View:
+    """The view of a call from a node inside at one outside."""
+    exported = partial(addressing.export_slave, asker=asker)
+    return View(exported, partial(addressing.import_slave, asker=asker), master_uri)
 
 
 def rewritten(call: Call) -> bool:
@@ -40,32 +59,69 @@ def rewritten(call: Call) -> bool:
     return call.method in _REWRITTEN
 
 
-def import_call(body: bytes, call: Call, node: Asker, addressing: Addressing) -> bytes:
-    """The call for the inside node: the publishers of a ``publisherUpdate`` imported.
+def rewrite_call(body: bytes, call: Call, view: View) -> bytes:
+    """The call for the node: the publishers of a ``publisherUpdate`` as it sees them.
 
     Their order is kept; a publisher that is named twice is left out the second time.
     """
     edits, seen = [], set()
     for item in _publishers(call):
-        uri = addressing.import_slave(item.text, node)
+        uri = view.asked(item.text)
         edits.append(xmlrpc.remove(item) if uri in seen else xmlrpc.replace(item, uri))
         seen.add(uri)
     return xmlrpc.apply(body, edits)
 
 
-def export_reply(call: Call, reply: bytes, visit: Visit, addressing: Addressing) -> bytes:
-    """The reply for outside: addresses exported."""
+def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: View) -> bytes:
+    """The reply for the caller: addresses as it sees them.
+
+    ``reached`` is the address and port at which it is to find the node's topics.
+    """
     triple = ros_triple(xmlrpc.parse_reply(reply))
     if triple is None:
         return reply
     edits: list[Edit] = []
     if call.method == "requestTopic" and _is_tcpros(triple):
-        edits = send_to(triple, visit.reached)
+        edits = send_to(triple, reached)
     elif call.method == "getBusInfo":
-        edits = _export_bus_info(triple, visit, addressing)
+        edits = [xmlrpc.replace(peer, view.answered(peer.text)) for peer in _peers(triple)]
     elif call.method in _URI_REPLIES:
-        edits = _export_uri(call.method, triple, visit, addressing)
+        edits = _rewrite_uri(call.method, triple, view)
     return xmlrpc.apply(reply, edits)
+
+
+def sent_directly(call: Call, reply: bytes, host: str, address: str) -> bytes:
+    """A node's reply with an address in place of a host's name where a topic is to be had.
+
+    So topics flow without the proxy. Everything else stays as it is. Raises XmlRpcError.
+    """
+    triple = ros_triple(xmlrpc.parse_reply(reply)) if call.method == "requestTopic" else None
+    said = tcpros_address(triple) if triple else None
+    if triple is None or said is None or said.host.lower() != host:
+        return reply
+    return xmlrpc.apply(reply, send_to(triple, HostPort(address, said.port)))
+
+
+def with_address(body: bytes, call: Call, host: str, address: str) -> bytes:
+    """A ``requestTopic`` from outside, with the address where it names a host for UDPROS.
+
+    A subscriber tells there where it wants its datagrams; no port could stand in for that.
+    """
+    if call.method != "requestTopic" or len(call.params) < 3:
+        return body
+    offers = [offer.items for offer in call.params[2].items if len(offer.items) > 2]
+    hosts = [items[2] for items in offers if items[0].string() == "UDPROS"]
+    return xmlrpc.apply(
+        body, [xmlrpc.replace(h, address) for h in hosts if (h.string() or "").lower() == host]
+    )
+
+
+def told_uris(call: Call, reply: bytes) -> list[str]:
+    """The slave URIs of other nodes in a reply."""
+    triple = ros_triple(xmlrpc.parse_reply(reply))
+    if triple is None or call.method != "getBusInfo":
+        return []
+    return [peer.text for peer in _peers(triple)]
 
 
 def announced_publishers(call: Call) -> list[str]:
@@ -138,19 +194,15 @@ def _is_tcpros(triple: Value) -> bool:
     return len(protocol) == 3 and protocol[0].string() == "TCPROS"
 
 
-def _export_bus_info(triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
-    peers = [row.items[1] for row in triple.items[2].items if len(row.items) > 1]
-    return [
-        xmlrpc.replace(peer, addressing.export_slave(peer.text, visit.node))
-        for peer in peers
-        if parse_slave_uri(peer.string() or "")
-    ]
+def _peers(triple: Value) -> list[Value]:
+    """The nodes that the rows of ``getBusInfo`` name by their slave URIs."""
+    named = [row.items[1] for row in triple.items[2].items if len(row.items) > 1]
+    return [peer for peer in named if parse_slave_uri(peer.string() or "")]
 
 
-def _export_uri(method: str, triple: Value, visit: Visit, addressing: Addressing) -> list[Edit]:
+def _rewrite_uri(method: str, triple: Value, view: View) -> list[Edit]:
     held = triple.items[2].string()
     if not held:
         return []
-    if method == "getMasterUri":
-        return replace_held(triple, visit.master_uri)
-    return replace_held(triple, addressing.export_slave(held, visit.node))
+    uri = view.master_uri if method == "getMasterUri" else view.answered(held)
+    return replace_held(triple, uri)

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from rosproxy.access.access_policy import OUTWARDS, PARAMETERS, AccessPolicy
 from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
+from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.master_methods import Kind, row
+from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
@@ -166,6 +168,43 @@ class PolicyJudge:
                 return None
             why = "only TCPROS is passed where a policy may deny a topic of the node"
         return None if why is None else policing.no_publisher(topic, why)
+
+    # What a node inside asks of outside
+
+    def inside_may_not(self, kind: RuleKind, name: str, source: str, caller_id: str) -> str | None:
+        """Why a node inside may not have a topic or service of outside; None if it may.
+
+        Whoever connects gives any name: unless a node of that name is known at its address, what
+        one of the nodes there may not have is denied.
+        """
+        there = [one for e in self._registry if e.address == source for one in e.caller_ids]
+        callers = [caller_id] if caller_id in there else [caller_id, *there]
+        for one in policing.topic_names(name, caller_id):
+            verdict = self._policy.ask(kind, one, callers, source)
+            if not verdict.allowed:
+                return verdict.reason
+        return None
+
+    def inside_may_not_keep(self, relay: Relay) -> bool:
+        """Whether a node inside may not have any more what it has of a node outside.
+
+        Of a service's connection only the address is known: it may be denied as well.
+        """
+        if parse_service_uri(relay.name):
+            kinds = {RuleKind.CALL}
+            return self._policy.may_deny(kinds, [relay.caller_id], relay.peer)
+        kind = RuleKind.SUBSCRIBE
+        return bool(self.inside_may_not(kind, relay.name, relay.peer, relay.caller_id))
+
+    def inside_may_not_ask(self, call: Call, source: str) -> list[object] | None:
+        """The ROS triple of requestTopic for what a node inside may not have; None if it may."""
+        if call.method != "requestTopic":
+            return None
+        topic, caller_id = call.string(1) or "", call.string(0) or ""
+        why = self.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
+        return None if why is None else policing.no_publisher(topic, why)
+
+    # What outside calls at a node inside
 
     async def outside_may_not_call(
         self, method: str, endpoint: Endpoint, source: str, caller_id: str

@@ -8,7 +8,10 @@ or is asked for now. The header is sent on to that port, and the bytes are relay
 import asyncio
 import logging
 import socket
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
@@ -31,19 +34,43 @@ UNREGISTERED = "unregistered"
 """What a relay's topic or service is called that its node has not registered."""
 
 
+class Target(Protocol):
+    """The node that a connection to one of the proxy's ports leads to."""
+
+    inside: bool
+    """Whether it is inside; who connects is then outside, and the other way round."""
+
+    @property
+    def port(self) -> int:
+        """The proxy's port."""
+
+    def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
+        """Why somebody may not have a topic or service; None if he may."""
+
+    async def connect(self, kind: str, name: str) -> socket.socket | None:
+        """A connection to the node's TCPROS server; None if there is none."""
+
+    def label(self, kind: str, name: str) -> str:
+        """What a topic or service is called in status and metrics: whoever connects names it."""
+
+    def note_connection(self) -> None:
+        """Note that a connection is relayed."""
+
+    def note_disconnection(self) -> None:
+        """Note that one is relayed no more."""
+
+    def note_failure(self, name: str) -> None:
+        """Note that there was no connection for a topic or service."""
+
+
 class TcprosServer:
-    """Relays TCPROS connections to inside nodes.
+    """Relays TCPROS connections to nodes."""
 
-    The target is a port on the endpoint's own address, as that node itself named it; the host in
-    a reply or registration is never used, so none can lead to another inside host.
-    """
-
-    def __init__(self, context: Context, judge: PolicyJudge) -> None:
-        self._context, self._judge = context, judge
+    def __init__(self, context: Context) -> None:
+        self._context = context
         self._may_splice = context.settings.data_plane != "copy"
         self.relays = OpenRelays()
         self._ended = Traffic()
-        self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
 
     def topic_connections(self) -> set[tuple[int, str, str]]:
         """The open connections of topics: port, topic and the subscriber's name."""
@@ -63,7 +90,7 @@ class TcprosServer:
         for relay in self.relays:
             relay.sample(now)
 
-    async def serve(self, endpoint: Endpoint, peer: str, conn: socket.socket) -> None:
+    async def serve(self, target: Target, peer: str, conn: socket.socket) -> None:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
             header = await read_header(self._context, peer, conn)
@@ -75,39 +102,34 @@ class TcprosServer:
         except HeaderError as error:
             await self._refuse(conn, str(error), "bad header")
             return
-        kind = "service" if "service" in fields else "topic"
+        kind, caller_id = "service" if "service" in fields else "topic", fields.get("callerid", "")
         name, version = fields.get(kind, ""), self._context.policy.version
-        if why := self._why_not(endpoint, kind, name, peer):
+        if why := target.why_not(kind, name, peer, caller_id):
             await self._refuse(conn, why, "denied")
             return
-        inside = await self._connect(endpoint, kind, name)
-        if inside is None or not await hand_on(header, inside):
-            self._fail(endpoint, conn, name)
+        node = await target.connect(kind, name)
+        if node is None or not await hand_on(header, node):
+            self._fail(target, conn, name)
             return
         changed = self._context.policy.version != version
-        if changed and self._why_not(endpoint, kind, name, peer):
-            inside.close()
-            self._fail(endpoint, conn, name)
+        if changed and target.why_not(kind, name, peer, caller_id):
+            node.close()
+            self._fail(target, conn, name)
             return
-        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
-        if name not in endpoint.names(wanted):  # a label that outsiders can't multiply
-            name = UNREGISTERED
-        caller_id, splice = fields.get("callerid", ""), self._may_splice
-        relay = Relay(endpoint.port, kind, name, caller_id, peer, conn, inside, splice=splice)
-        endpoint.note_connection()
-        self._context.gate.enter(peer, endpoint.port)
-        self.relays.start(relay, lambda ended: self._finished(endpoint, ended))
+        outside, inside = (conn, node) if target.inside else (node, conn)
+        relay = Relay(
+            target.port, kind, target.label(kind, name), caller_id, peer, outside, inside,
+            splice=self._may_splice, inside_asks=not target.inside,
+        )  # fmt: skip
+        target.note_connection()
+        self._context.gate.enter(peer, target.port)
+        self.relays.start(relay, lambda ended: self._finished(target, ended))
 
     def cut(self, port: int) -> None:
         """End the connections through a port."""
         for relay in self.relays:
             if relay.port == port:
                 relay.end()
-
-    def _why_not(self, endpoint: Endpoint, kind: str, name: str, peer: str) -> str | None:
-        """Why somebody may not have a topic or service; None if he may."""
-        asked = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
-        return self._judge.outside_may_not(asked, name, endpoint, peer)
 
     async def _refuse(self, conn: socket.socket, why: str, reason: str) -> None:
         """Say why in a header, as ROS's servers do, and close."""
@@ -116,16 +138,33 @@ class TcprosServer:
         conn.close()
         self._context.metrics.relay_errors.labels(reason).inc()
 
-    async def _connect(self, endpoint: Endpoint, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node; its port is asked for anew if the known one refuses."""
-        if kind == "service":
-            known = self._context.registry.service_port(endpoint, name) or endpoint.tcpros_port
-        else:
-            known = endpoint.topic_ports.get(name, endpoint.tcpros_port)
-        inside = await _dial(endpoint.place.address, known)
-        if inside is not None:
-            return inside
-        return await _dial(endpoint.place.address, await self._learn_port(endpoint))
+    def _finished(self, target: Target, relay: Relay) -> None:
+        target.note_disconnection()
+        self._context.gate.leave(relay.peer, relay.port)
+        self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
+
+    def _fail(self, target: Target, conn: socket.socket, name: str) -> None:
+        """Reset, as a node that is gone would: roscpp and rospy try again."""
+        self._context.metrics.relay_errors.labels("node unreachable").inc()
+        sockets.reset_on_close(conn)
+        conn.close()
+        target.note_failure(name)
+
+
+class InsideNodes:
+    """The nodes inside as targets.
+
+    A connection leads to a port on the endpoint's own address, as that node itself named it; the
+    host in a reply or registration is never used, so none can lead to another inside host.
+    """
+
+    def __init__(self, context: Context, judge: PolicyJudge) -> None:
+        self._context, self._judge = context, judge
+        self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
+
+    def target(self, endpoint: Endpoint) -> "InsideNode":
+        """What connections to an endpoint's ports lead to."""
+        return InsideNode(self._context, self._judge, endpoint, self._learn_port)
 
     async def _learn_port(self, endpoint: Endpoint) -> int | None:
         """The TCPROS port that the node names now; it is asked once for all who wait."""
@@ -142,16 +181,55 @@ class TcprosServer:
         endpoint.replace_tcpros_ports(info.tcpros_port if info else None)
         return endpoint.tcpros_port
 
-    def _finished(self, endpoint: Endpoint, relay: Relay) -> None:
-        endpoint.note_disconnection()
-        self._context.gate.leave(relay.peer, relay.port)
-        self._ended.add(relay.kind, relay.name, relay.sent, relay.received)
 
-    def _fail(self, endpoint: Endpoint, conn: socket.socket, name: str) -> None:
-        """Reset, as a node that is gone would: roscpp and rospy try again."""
-        self._context.metrics.relay_errors.labels("node unreachable").inc()
-        sockets.reset_on_close(conn)
-        conn.close()
+@dataclass(slots=True)
+class InsideNode:
+    """A node inside as a target, for those who connect from outside."""
+
+    _context: Context
+    _judge: PolicyJudge
+    _endpoint: Endpoint
+    _learn_port: Callable[[Endpoint], Awaitable[int | None]]
+    inside: bool = True
+
+    @property
+    def port(self) -> int:
+        """The lease."""
+        return self._endpoint.port
+
+    def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
+        """Why somebody outside may not have a topic or service; None if he may."""
+        asked = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
+        return self._judge.outside_may_not(asked, name, self._endpoint, peer)
+
+    async def connect(self, kind: str, name: str) -> socket.socket | None:
+        """A connection to the node; its port is asked for anew if the known one refuses."""
+        endpoint = self._endpoint
+        if kind == "service":
+            known = self._context.registry.service_port(endpoint, name) or endpoint.tcpros_port
+        else:
+            known = endpoint.topic_ports.get(name, endpoint.tcpros_port)
+        node = await _dial(endpoint.place.address, known)
+        if node is not None:
+            return node
+        return await _dial(endpoint.place.address, await self._learn_port(endpoint))
+
+    def label(self, kind: str, name: str) -> str:
+        """The topic or service if the node has registered it."""
+        wanted = Kind.SERVICE if kind == "service" else Kind.PUBLISHER
+        return name if name in self._endpoint.names(wanted) else UNREGISTERED
+
+    def note_connection(self) -> None:
+        """Note that a connection is relayed."""
+        self._endpoint.note_connection()
+
+    def note_disconnection(self) -> None:
+        """Note that one is relayed no more."""
+        self._endpoint.note_disconnection()
+
+    def note_failure(self, name: str) -> None:
+        """Tell of a node that is registered, and whose TCPROS server can't be reached."""
+        endpoint = self._endpoint
         if not endpoint.registrations:
             return
         text = f"no TCPROS connection to it for {name or '?'}"

@@ -13,7 +13,6 @@ import logging
 from collections.abc import Iterable, Sequence
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.alias.alias import Alias
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
@@ -22,6 +21,7 @@ from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import hidden
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.rewriting import policing
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.policy import registration as policy
 
 log = logging.getLogger(__name__)
@@ -34,8 +34,8 @@ RETRY = 2.0
 class Matchmaker:
     """Hands subscribers their publishers."""
 
-    def __init__(self, context: Context, alias: Alias) -> None:
-        self._context, self._alias = context, alias
+    def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
+        self._context, self._stand_ins = context, stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._telling: set[str] = set()
         self._changed: dict[str, bool] = {}
@@ -56,7 +56,7 @@ class Matchmaker:
     ) -> bool:
         """The same for an endpoint's node, which gets the hidden ones, too, in its own form."""
         asker, addressing = self._context.node_asker(endpoint), self._context.addressing
-        await self._alias.listen_for(publishers)
+        await self._stand_ins.listen_for(publishers, asker)
         found = policing.publishers_for(endpoint, topic, publishers, addressing)
         imported = dict.fromkeys(addressing.import_slave(uri, asker) for uri in found)
         return await self._update(endpoint.slave, topic, [*imported])

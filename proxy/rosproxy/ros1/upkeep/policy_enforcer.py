@@ -22,6 +22,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import UNREGISTERED, TcprosServer
+from rosproxy.ros1.standins.udpros import UdprosRelays
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 
@@ -50,6 +51,7 @@ class PolicyEnforcer:
     _tcpros: TcprosServer
     _plane: KernelPlane
     _judge: PolicyJudge
+    _udpros: UdprosRelays
     _enforced: int = -1
     _again: bool = False
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -70,7 +72,7 @@ class PolicyEnforcer:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._one_at_a_time:
             version, self._again = self._context.policy.version, False
-            cut = self._cut_relays() + self._take_fast_ports()
+            cut = self._cut_relays() + self._udpros.sweep() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()
                 hidden, shown = await self._registrar.apply_policy()
@@ -85,14 +87,15 @@ class PolicyEnforcer:
         return done
 
     def _cut_relays(self) -> int:
-        """End the connections that outside may not have; how many.
+        """End the connections that outside, or a node inside, may not have; how many.
 
         Of one for what is not registered the name is not known: it may be denied as well.
         """
         count = 0
         for relay in self._tcpros.relays:
             endpoint = self._context.registry.by_port.get(relay.port)
-            if endpoint and self._is_denied(relay, endpoint):
+            denied = endpoint is not None and self._is_denied(relay, endpoint)
+            if denied or (relay.inside_asks and self._judge.inside_may_not_keep(relay)):
                 relay.end()
                 count += 1
         return count

@@ -7,7 +7,8 @@ connection, since it costs the others theirs. For the second one publisher of ea
 registered again, which makes the master tell all of the topic's subscribers.
 
 Inside subscribers can have missed publishers outside in the same way. Registering a subscriber
-again yields its publishers, which it is then handed.
+again yields its publishers, which it is then handed; with ``--direction both`` those that it has no
+relay to are withdrawn first, too.
 
 `announce` does this for endpoints that a fresh proxy has found at the master, `remind` for a node
 that answers again. Both have the endpoints looked at again later (`look`): what a subscriber does
@@ -24,9 +25,10 @@ from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.endpoint import Endpoint, Held
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.standins.udpros import UdprosRelays
 from rosproxy.ros1.upkeep.matchmaker import PARALLEL_CALLS, Matchmaker
 from rosproxy.ros1.upkeep.policy import resubscription as policy
 from rosproxy.ros1.upkeep.policy.registration import one_publisher_per_topic
@@ -44,6 +46,8 @@ keep-alive probes begin after 60 seconds, and are answered by a reset, or for 90
 """
 RESUBSCRIBE_TICK = 1.0
 """Seconds between checks whether it is time to look at any."""
+Missed = tuple[str, str, str]
+"""A topic, a subscriber's name, and the URI at the master of a publisher that it does not hear."""
 
 
 class Resubscriber:
@@ -56,9 +60,10 @@ class Resubscriber:
         matchmaker: Matchmaker,
         tcpros: TcprosServer,
         plane: KernelPlane,
+        udpros: UdprosRelays,
     ) -> None:
         self._context, self._registrar, self._matchmaker = context, registrar, matchmaker
-        self._tcpros, self._plane = tcpros, plane
+        self._tcpros, self._plane, self._udpros = tcpros, plane, udpros
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
 
@@ -72,9 +77,9 @@ class Resubscriber:
         """Make up for what was missed while the proxy was away. Raises Unreachable, MasterError."""
         self.watch(endpoints)
         await self._withdraw(endpoints, ask=False)
-        held = [(e, held) for e in endpoints for held in e.registrations.values()]
-        subscribers = [one for one in held if one[1].kind is Kind.SUBSCRIBER]
-        await self._registrar.register([*one_publisher_per_topic(endpoints), *subscribers])
+        await self._registrar.register(
+            [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
+        )
 
     async def remind(self, endpoint: Endpoint) -> None:
         """Make up for what was missed while a node's port refused. Raises Unreachable, MasterError.
@@ -94,7 +99,7 @@ class Resubscriber:
             topics = await self._withdraw(endpoints) if endpoints else set()
             if topics:
                 log.info("subscribers of %d topics had no connection; told anew", len(topics))
-                held = one_publisher_per_topic(endpoints)
+                held = [*one_publisher_per_topic(endpoints), *_subscribers(endpoints)]
                 await self._registrar.register([one for one in held if one[1].name in topics])
         except (Unreachable, MasterError) as error:
             log.debug("looking for subscribers without a connection: %s", error)
@@ -108,7 +113,7 @@ class Resubscriber:
         due = [e for e, times in left.items() if len(times) < len(there[e])]
         return [e for e in due if e.answers and not e.health.cleaned]
 
-    async def _withdraw(self, endpoints: Iterable[Endpoint], ask: bool = True) -> set[str]:
+    async def _withdraw(self, endpoints: Sequence[Endpoint], ask: bool = True) -> set[str]:
         """Tell subscribers without connection that these publishers have gone; the topics.
 
         They make a new connection once they are told that the publishers are there again. Unless
@@ -118,7 +123,7 @@ class Resubscriber:
         held = await self._context.upstream.read_registrations()
         wanted = policy.subscriptions(held, endpoints, self._context.addressing)
         left = policy.without_relay(wanted, self._tcpros.topic_connections())
-        if not left:
+        if not left and not self._context.stand_ins.both:
             return set()
         graph = Graph(held, await self._context.upstream.look_up("lookupNode", held))
         left = self._through_proxy(graph, left)
@@ -127,7 +132,11 @@ class Resubscriber:
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, left)
         left = policy.without_relay(left, self._tcpros.topic_connections())
-        return await self._send_without(graph, policy.unconnected(left, bus, addresses))
+        missed = [
+            (one.topic, one.caller_id, self._context.addressing.advertised_uri(one.endpoint))
+            for one in policy.unconnected(left, bus, addresses)
+        ]
+        return await self._send_without(graph, missed + self._without_outside(graph, endpoints))
 
     def _through_proxy(
         self, graph: Graph, left: Iterable[TopicSubscription]
@@ -177,19 +186,34 @@ class Resubscriber:
         found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, found, strict=True))
 
-    async def _send_without(self, graph: Graph, found: Iterable[TopicSubscription]) -> set[str]:
+    def _without_outside(self, graph: Graph, endpoints: Iterable[Endpoint]) -> list[Missed]:
+        """The publishers outside that subscribers inside have no relay to, but ought to have."""
+        context = self._context
+        relays = self._tcpros.topic_connections() | self._udpros.connections()
+        publishers, found = graph.by_topic(Kind.PUBLISHER), list[Missed]()
+        for endpoint in endpoints if context.stand_ins.both else ():
+            proxy = context.node_asker(endpoint).proxy
+            for held in endpoint.registrations.values():
+                if held.kind is not Kind.SUBSCRIBER or held.hidden:
+                    continue
+                for uri in filter(context.addressing.foreign, publishers.get(held.name, ())):
+                    there = context.stand_ins.find(proxy, uri)
+                    port = there.local.port if there else 0
+                    if (port, held.name, held.caller_id) not in relays:
+                        found.append((held.name, held.caller_id, uri))
+        return found
+
+    async def _send_without(self, graph: Graph, found: Iterable[Missed]) -> set[str]:
         """Send each subscriber its publishers without those that it misses; the topics."""
-        missed: dict[tuple[str, str], set[Endpoint]] = {}
-        for one in found:
-            missed.setdefault((one.topic, one.caller_id), set()).add(one.endpoint)
-        publishers, addressing = graph.by_topic(Kind.PUBLISHER), self._context.addressing
+        missed: dict[tuple[str, str], set[str]] = {}
+        for topic, node, uri in found:
+            missed.setdefault((topic, node), set()).add(uri)
+        publishers = graph.by_topic(Kind.PUBLISHER)
         calls = (
             self._matchmaker.update(
-                graph.uris[node],
-                topic,
-                policy.publishers_left(publishers.get(topic, []), endpoints, addressing),
+                graph.uris[node], topic, [u for u in publishers.get(topic, []) if u not in uris]
             )
-            for (topic, node), endpoints in missed.items()
+            for (topic, node), uris in missed.items()
         )
         topics = set()
         for (topic, node), heard in zip(missed, await asyncio.gather(*calls), strict=True):
@@ -197,3 +221,9 @@ class Resubscriber:
                 log.debug("%s has no connection for %s; it is told anew", node, topic)
                 topics.add(topic)
         return topics
+
+
+def _subscribers(endpoints: Iterable[Endpoint]) -> list[Held]:
+    """All that the nodes of some endpoints subscribe to."""
+    held = [(e, held) for e in endpoints for held in e.registrations.values()]
+    return [one for one in held if one[1].kind is Kind.SUBSCRIBER]

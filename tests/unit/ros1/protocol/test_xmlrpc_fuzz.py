@@ -57,7 +57,8 @@ PLAIN = st.recursive(
 WORLD = make_addressing()
 NODE = add_node(WORLD)
 ASKER = make_asker("10.0.0.5")
-VISIT = slave_api.Visit(ASKER, HostPort("robot-host", 45000), "http://robot:11311/")
+REACHED = HostPort("robot-host", 45000)
+VIEW = slave_api.from_outside(ASKER, "http://robot:11311/", WORLD)
 METHODS = ["getParam", "registerPublisher", "lookupService", "system.multicall", "x", "__proto__"]
 
 
@@ -137,8 +138,8 @@ def test_the_slave_side_leaves_other_values_alone(
     named = values[2] if len(values) > 2 and isinstance(values[2], list) else []
     publishers = [item for item in named if isinstance(item, str)]
     if len(publishers) == len(set(publishers)):  # publisherUpdate drops what comes twice
-        assert slave_api.import_call(body, parsed, ASKER, WORLD) == body
-    assert slave_api.export_reply(parsed, answer, VISIT, WORLD) == answer
+        assert slave_api.rewrite_call(body, parsed, VIEW) == body
+    assert slave_api.rewrite_reply(parsed, answer, REACHED, VIEW) == answer
 
 
 def everything(body: bytes) -> None:
@@ -146,7 +147,7 @@ def everything(body: bytes) -> None:
     request = master_api.read_request(body, ASKER)
     exported(request)
     parsed = xmlrpc.parse_call(body)
-    slave_api.import_call(body, parsed, ASKER, WORLD)
+    slave_api.rewrite_call(body, parsed, VIEW)
     for call in (parsed, *multicall.inner_calls(parsed)):
         if call:
             xmlrpc.parse_call(multicall.single_call(call))
@@ -156,7 +157,7 @@ def everything_in_reply(reply: bytes) -> None:
     """Do all that the shell does with a reply from somebody else."""
     call = xmlrpc.parse_call(py_call("requestTopic", "/a", "/b", [["TCPROS"]]))
     slave_api.topic_port(call, reply)
-    slave_api.export_reply(call, reply, VISIT, WORLD)
+    slave_api.rewrite_reply(call, reply, REACHED, VIEW)
     request = master_api.read_request(py_call("system.multicall", []), ASKER)
     master_api.import_reply(master_api.read_reply(exported(request), reply), WORLD)
     multicall.results_reply([multicall.result_value(reply)])

@@ -17,6 +17,7 @@ from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.rewriting.hidden_graph import completed
+from tests.unit.builders import make_stand_ins
 
 PORTS = PortRange(11000, 11009)
 OUTSIDE = "http://robot:40001/"
@@ -30,7 +31,8 @@ def make(*held: tuple[str, Kind, str, bool]) -> Addressing:
         uri, node = f"http://{address}:1/", HostPort(address, 1)
         endpoint = registry.admit(uri, node, Place(address, named=True), address)
         registry.register(endpoint, Registration(kind, what, name, "T", hidden=is_hidden))
-    return Addressing(registry, "host", PortMap(PORTS, PORTS))
+    ports = PortMap(PORTS, PORTS)
+    return Addressing(registry, "host", ports, make_stand_ins(ports))
 
 
 def nodes(endpoints: list[Endpoint]) -> list[str]:

@@ -10,8 +10,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.rewriting import slave_api
-from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.rewriting.slave_api import Visit
+from rosproxy.ros1.rewriting.slave_api import View
 from tests.unit.builders import (
     DIALECTS,
     PROXY,
@@ -34,23 +33,21 @@ OUTSIDE = HostPort("robot-host", 45000)
 MASTER_ID = "/master"
 
 
-def world(reached: HostPort = OUTSIDE) -> tuple[Addressing, Visit]:
+def world() -> View:
     addressing = make_addressing()
     node = add_node(addressing, OWN)
     add_node(addressing, OTHER)
     add_node(addressing, "http://172.20.0.7:40001/")
-    return addressing, Visit(make_asker("10.0.0.5", endpoint=node), reached, MASTER)
+    return slave_api.from_outside(make_asker("10.0.0.5", endpoint=node), MASTER, addressing)
 
 
 def inward(body: bytes) -> bytes:
-    addressing, visit = world()
-    return slave_api.import_call(body, xmlrpc.parse_call(body), visit.node, addressing)
+    return slave_api.rewrite_call(body, xmlrpc.parse_call(body), world())
 
 
 def outward(method: str, reply: bytes, reached: HostPort = OUTSIDE) -> bytes:
-    addressing, visit = world(reached)
     call = xmlrpc.parse_call(py_call(method, "/tool", "/chatter"))
-    return slave_api.export_reply(call, reply, visit, addressing)
+    return slave_api.rewrite_reply(call, reply, reached, world())
 
 
 UPDATES = [

@@ -182,13 +182,3 @@ def test_a_udpros_subscriber_needs_no_connection_in_the_kernel() -> None:
     endpoint.fast_peers = {LAPTOP: 1}
     bus = {endpoint: [("/t", "/a", "UDPROS")]}
     assert policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
-
-
-def test_only_the_publishers_without_connection_are_withdrawn() -> None:
-    addressing = make_addressing()
-    first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
-    far = "http://laptop:5/"
-    uris = [addressing.advertised_uri(first), far, addressing.advertised_uri(second)]
-    assert policy.publishers_left(uris, {first}, addressing) == uris[1:]
-    assert policy.publishers_left(uris, {first, second}, addressing) == [far]
-    assert policy.publishers_left(uris, set(), addressing) == uris

@@ -110,13 +110,6 @@ def unconnected(
     ]
 
 
-def publishers_left(
-    publishers: Iterable[str], missed: Collection[Endpoint], addressing: Addressing
-) -> list[str]:
-    """The slave URIs, as the master holds them, without those that stand for some endpoints."""
-    return [uri for uri in publishers if addressing.stands_for(uri) not in missed]
-
-
 def _networks_of(address: str, addressing: Addressing) -> frozenset[int]:
     """Which of the inside networks an address is in."""
     ip = ip_address(address)

@@ -1,1 +1,0 @@
-"""Ports of the proxy that stand in for nodes on the master's host, under the master's name."""

@@ -1,0 +1,61 @@
+"""The offers of UDPROS in a ``requestTopic``: read, led elsewhere, or taken out.
+
+An offer is ``["UDPROS", header, host, port, datagram size]`` with a connection header in base64
+(``Subscription::negotiateConnection`` in clients/roscpp/src/libros/subscription.cpp).
+"""
+
+import base64
+import binascii
+
+import msgspec
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+
+PROTOCOL = "UDPROS"
+
+
+class UdprosOffer(msgspec.Struct, frozen=True):
+    """Where a subscriber wants its datagrams, and the topic that its connection header names.
+
+    ``topic`` is empty and ``where`` None if that can't be read.
+    """
+
+    value: Value
+    topic: str
+    where: HostPort | None
+
+
+def read_offers(call: Call) -> list[UdprosOffer]:
+    """The offers in a call."""
+    if call.method != "requestTopic" or len(call.params) < 3:
+        return []
+    return [
+        UdprosOffer(offer, _topic(offer.items), _where(offer.items))
+        for offer in call.params[2].items
+        if offer.items and offer.items[0].string() == PROTOCOL
+    ]
+
+
+def lead_to(offer: UdprosOffer, where: HostPort | None) -> list[Edit]:
+    """The edits by which an offer leads elsewhere; None takes it out of the call."""
+    if where is None or offer.where is None:
+        return [xmlrpc.remove(offer.value)]
+    _, _, host, port, *_ = offer.value.items
+    return [xmlrpc.replace(host, where.host), xmlrpc.replace(port, str(where.port))]
+
+
+def _topic(items: list[Value]) -> str:
+    try:
+        return decode_header(base64.b64decode(items[1].text)).get("topic", "")
+    except (IndexError, binascii.Error, HeaderError, ValueError):
+        return ""
+
+
+def _where(items: list[Value]) -> HostPort | None:
+    if len(items) < 4:
+        return None
+    host, port = items[2].string(), items[3].integer()
+    return HostPort(host, port) if host and port and 0 < port < 65536 else None

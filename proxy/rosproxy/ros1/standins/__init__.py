@@ -1,0 +1,1 @@
+"""Ports of the proxy, on its inside addresses, that stand in for nodes outside."""

@@ -1,0 +1,295 @@
+"""Listens on the ports that stand in for nodes outside, and passes on what arrives there.
+
+A port is opened right before an inside node is given a URI that needs it (`listen_for`), and closed
+when the node behind it refuses, since a dead node must look dead. Only URIs that the master names
+open one: they come with its replies, or it is asked (`listen_for_announced`).
+
+Slave API calls are forwarded to the node, TCPROS connections relayed. Where the URIs are kept
+because the master's name leads here (`registry.stand_ins`), topics flow without the proxy: the
+node's reply to ``requestTopic`` leads to its address. Nothing is relayed that does not begin with a
+TCPROS header.
+"""
+
+import asyncio
+import logging
+import socket
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Any
+
+from rosproxy.net import sockets
+from rosproxy.net.addresses import HostPort
+from rosproxy.net.sockets import Acceptor
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_service_uri, slave_uri
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.registry import stand_ins
+from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.registry.stand_ins import StandIn
+from rosproxy.ros1.rewriting import slave_api
+from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.servers.callers import Callers
+from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.tcpros import TcprosServer
+from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
+from rosproxy.ros1.standins.outside import Outside, OutsideNode
+from rosproxy.ros1.standins.udpros import UdprosRelays
+
+log = logging.getLogger(__name__)
+
+PORTS_PER_TURN = 50
+"""How many are opened before all connections are looked at again."""
+TIDY_INTERVAL = 30.0
+SERVICE_PROBLEM = 600.0
+"""Seconds for which a problem with a service is kept: it is looked up anew for each call."""
+LONGEST_TOLD = 200
+"""Characters of a URI in the status."""
+
+
+class StandInPorts:
+    """Opens and closes the ports that stand in for nodes outside, and serves them."""
+
+    def __init__(
+        self, context: Context, callers: Callers, tcpros: TcprosServer, judge: PolicyJudge
+    ) -> None:
+        self._context, self._callers, self._stand_ins = context, callers, context.stand_ins
+        self._tcpros, self._judge = tcpros, judge
+        self._acceptors: dict[HostPort, Acceptor] = {}
+        self._refused: set[str] = set()
+        """URIs of nodes that refused when they were last tried."""
+        greeting = "rosproxy: a ROS node outside\n"
+        self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
+        self._outside = Outside(context, self._note_refused)
+        self.udpros = UdprosRelays(context, judge, self._outside)
+        self._closed = False
+        self._asking = asyncio.Lock()
+        self._asked: set[str] = set()
+        """Topics whose publishers somebody waits to be told of."""
+        self._publishers: dict[str, set[str]] = {}
+        """The master's last answer to that: slave URIs by topic."""
+
+    async def listen_for(self, uris: Iterable[str], asker: Asker) -> None:
+        """Have a port listen for each of these URIs that needs one, before ``asker`` is given them.
+
+        The URIs are the master's own word.
+        """
+        wanted = self._needed(uris)
+        again = self._refused & wanted.keys()
+        still = await asyncio.gather(*(self._outside.refuses(wanted[uri]) for uri in again))
+        self._refused -= {uri for uri, gone in zip(again, still, strict=True) if not gone}
+        for number, (uri, where) in enumerate(wanted.items(), start=1):
+            if number % PORTS_PER_TURN == 0:
+                await asyncio.sleep(0)
+            if uri not in self._refused and not self._closed:
+                self._listen(uri, where, self._stand_ins.address(asker.proxy))
+
+    async def listen_for_announced(self, topic: str, uris: Sequence[str], asker: Asker) -> None:
+        """The same for the publishers that a ``publisherUpdate`` names, as far as they are some.
+
+        Anybody may call that at a lease, and name any port. Its source proves nothing: every
+        program on the master's host has that address, and NAT gives it to others. So where a
+        port would have to be opened the master is asked whether it has that publisher.
+        """
+        wanted = self._needed(uris)
+        address = self._stand_ins.address(asker.proxy)
+        known = {uri for uri in wanted if self._stand_ins.find(address, uri)}
+        if len(known) < len(wanted):
+            known |= await self._publishers_of(topic)
+        await self.listen_for((uri for uri in wanted if uri in known), asker)
+
+    def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
+        """A call from outside, parsed as ``call``, in a form that an inside node can use."""
+        address = self._context.upstream.master_address
+        if not address or not self._stand_ins.aliased:
+            return body
+        return slave_api.with_address(body, call, self._stand_ins.aliased, address)
+
+    async def tidy(self) -> None:
+        """Forget the problems of nodes that have ended, and of services not looked up any more.
+
+        rospy complains of connections to a service's port that say nothing: none is made.
+        """
+        self.udpros.sweep()
+        for problem in self._context.problems.all():
+            uri = problem.subject
+            for where in self._needed([uri]).values():
+                if parse_service_uri(uri):
+                    ended = time.time() - problem.when > SERVICE_PROBLEM
+                else:
+                    ended = await self._outside.refuses(where)
+                if ended:
+                    self._context.problems.solved(uri)
+
+    def status(self) -> list[dict[str, Any]]:
+        """The ports with their nodes and open connections, for ``/status``."""
+        counts = self._connections()
+        found = sorted(self._stand_ins.by_local.values(), key=lambda one: (one.local.port, one.uri))
+        return [
+            {"port": port, "uri": one.uri[:LONGEST_TOLD], "connections": counts[port]}
+            for one in found
+            for port in [one.local.port]
+        ]
+
+    def close(self) -> None:
+        """Stop listening, for good."""
+        self._closed = True
+        self.udpros.close()
+        for stand_in in list(self._stand_ins.by_local.values()):
+            self._close(stand_in)
+
+    @property
+    def _active(self) -> bool:
+        """Whether any URI may need a stand-in now."""
+        return self._stand_ins.both or self._context.upstream.master_address is not None
+
+    def _needed(self, uris: Iterable[str]) -> dict[str, HostPort]:
+        """Those of the URIs that need a stand-in, with what it has to lead to."""
+        if self._closed or not self._active:
+            return {}
+        found = ((uri, self._context.addressing.foreign(uri)) for uri in uris)
+        return {uri: where for uri, where in found if where}
+
+    async def _publishers_of(self, topic: str) -> set[str]:
+        """The slave URIs of a topic's publishers as the master has them now; none if it is away.
+
+        There is one question at a time, for all topics that have come up meanwhile.
+        """
+        self._asked.add(topic)
+        async with self._asking:
+            if topic in self._asked:  # nobody has asked since
+                topics, self._asked = self._asked, set()
+                self._publishers = await self._ask_publishers(topics)
+            return self._publishers.get(topic, set())
+
+    async def _ask_publishers(self, topics: set[str]) -> dict[str, set[str]]:
+        upstream = self._context.upstream
+        try:
+            state = await upstream.read_registrations()
+            names = [
+                name
+                for name, held in state.items()
+                if any(one.kind is Kind.PUBLISHER and one.name in topics for one in held)
+            ]
+            graph = Graph(state, await upstream.look_up("lookupNode", names))
+        except (Unreachable, MasterError) as error:
+            log.debug("the master can't be asked who publishes: %s", error)
+            return {}
+        publishers = graph.by_topic(Kind.PUBLISHER)
+        return {topic: set(publishers.get(topic, ())) for topic in topics}
+
+    def _listen(self, uri: str, where: HostPort, address: str) -> None:
+        """Let a port listen that a URI needs, or report why none can."""
+        problems = self._context.problems
+        if known := self._stand_ins.find(address, uri):
+            self._stand_ins.note_used(known)
+            return
+        why = self._make_room()
+        if why is None:
+            for candidate in self._stand_ins.candidates(uri, where, address):
+                why = self._open(candidate)
+                if why is None:
+                    problems.solved(uri)
+                    return
+        text = self._stand_ins.advice(where, why or "", self._context.upstream.master_address or "")
+        if (uri, text) not in ((p.subject, p.text) for p in problems.all()):
+            log.warning("%s: %s", uri, text)
+        problems.add(uri, text)
+
+    def _make_room(self) -> str | None:
+        """Close the port that was of no use for longest if there are too many; else why not."""
+        if len(self._stand_ins.by_local) < stand_ins.MOST_STAND_INS:
+            return None
+        counts = self._connections()
+        unused = (one for one in self._stand_ins.by_local.values() if not counts[one.local.port])
+        stand_in = next(unused, None)
+        if stand_in is None:
+            return f"is one too many: {stand_ins.MOST_STAND_INS} stand in for nodes and are in use"
+        self._close(stand_in)
+        return None
+
+    def _open(self, stand_in: StandIn) -> str | None:
+        """Open a port; the reason if that can't be done."""
+        local = stand_in.local
+        if why := stand_ins.obstacle(local.port, self._context.settings):
+            return why
+        if local in self._stand_ins.by_local:
+            return "stands in for another node"
+        try:
+            sock = sockets.listen(local.host, local.port)
+        except OSError as error:
+            return f"can't be opened here ({error.strerror})"
+        serve, gate = partial(self._serve, stand_in), self._context.gate
+        self._acceptors[local] = Acceptor(self._context.tasks, sock, serve, gate)
+        self._stand_ins.add(stand_in)
+        log.debug("%s stands in for %s", local, stand_in.uri)
+        return None
+
+    def _close(self, stand_in: StandIn) -> None:
+        """Let a port refuse; relays that are open stay."""
+        acceptor = self._acceptors.pop(stand_in.local, None)
+        if acceptor is not None:
+            acceptor.close()
+            self._stand_ins.remove(stand_in)
+            self.server.close_port(stand_in.local.port)
+
+    def _note_refused(self, stand_in: StandIn) -> None:
+        """A node that refuses has ended: its port refuses as well, until it is found again."""
+        log.debug("%s refuses; so does %s", stand_in.uri, stand_in.local)
+        self._close(stand_in)
+        self._refused.add(stand_in.uri)
+
+    def _connections(self) -> Counter[int]:
+        counts = Counter(relay.port for relay in self._tcpros.relays if relay.inside_asks)
+        ports = {one.local.port for one in self._stand_ins.by_local.values()}
+        counts.update({port: self.server.count(port) for port in ports})
+        return counts
+
+    async def _serve(self, stand_in: StandIn, conn: socket.socket, peer: str) -> None:
+        """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
+        await self._callers.begin()
+        self._context.refresh_networks()
+        if self._context.standing(peer) is not Standing.ADMITTED:
+            log.debug("%s may not use the proxy: refused at %s", peer, stand_in.local)
+            conn.close()
+            return
+        self._stand_ins.note_used(stand_in)
+        target = OutsideNode(self._outside, self._context, self._judge, stand_in)
+        await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
+
+    async def _forward(self, call: IncomingCall) -> bytes:
+        """A node's reply to a call. Raises XmlRpcError, Unreachable."""
+        if call.comes_from(self._context.instance):
+            raise Unreachable("the address of a node outside leads back to the proxy itself")
+        stand_in = self._stand_ins.at(call.local)
+        if stand_in is None:
+            raise Unreachable(f"{call.local} stands in for nobody any more")
+        parsed = xmlrpc.parse_call(call.body, self._context.master_call)
+        answer = self._answer(stand_in, parsed, call)
+        return await counted(self._context.metrics, "stand_in", parsed.method, answer)
+
+    async def _answer(self, stand_in: StandIn, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
+        denied = self._judge.inside_may_not_ask(parsed, call.source)
+        if denied is not None:
+            return xmlrpc.dump_reply(denied)
+        asker = Asker(call.source, call.local.host)
+        master = slave_uri(HostPort(asker.proxy, self._context.settings.master_port))
+        view = slave_api.from_inside(asker, master, self._context.addressing)
+        body = slave_api.rewrite_call(call.body, parsed, view)
+        if not stand_in.kept:
+            body = await self.udpros.lead_inwards(stand_in, parsed, body, call.source)
+        reply = await self._outside.ask(stand_in, body, call.path)
+        if not slave_api.rewritten(parsed):
+            return reply
+        if stand_in.kept:
+            address = self._context.upstream.master_address or stand_in.where.host
+            return slave_api.sent_directly(parsed, reply, stand_in.where.host.lower(), address)
+        said = slave_api.topic_port(parsed, reply)
+        if said is not None:
+            stand_in.topic_ports[parsed.string(1) or ""] = said
+        await self.listen_for(slave_api.told_uris(parsed, reply), asker)
+        return slave_api.rewrite_reply(parsed, reply, stand_in.local, view)

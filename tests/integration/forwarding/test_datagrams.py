@@ -1,0 +1,71 @@
+"""Datagrams that are passed on, one way."""
+
+import asyncio
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from rosproxy.forwarding.datagrams import DatagramRelay, bind
+from rosproxy.net.addresses import HostPort
+from tests.integration.net import NODE, OTHER_NODE, OUTSIDE, PROXY, until
+
+BOTH_LOOPS = True
+
+
+@pytest.fixture
+def target() -> Iterator[socket.socket]:
+    with bind(NODE, 0) as sock:
+        yield sock
+
+
+def sender(address: str) -> socket.socket:
+    sock = bind(address, 0)
+    sock.setblocking(False)
+    return sock
+
+
+async def received(sock: socket.socket) -> bytes:
+    async with asyncio.timeout(5):
+        return await asyncio.get_running_loop().sock_recv(sock, 65536)
+
+
+def relay_to(target: socket.socket, *sources: str) -> tuple[DatagramRelay, list[bool]]:
+    """A relay, and what it tells of its end."""
+    ends: list[bool] = []
+    where = HostPort(*target.getsockname())
+    return DatagramRelay(bind(PROXY, 0), sources, where, lambda: ends.append(True)), ends
+
+
+async def test_datagrams_arrive_as_they_were_sent(target: socket.socket) -> None:
+    relay, _ = relay_to(target, OUTSIDE)
+    with sender(OUTSIDE) as out:
+        for data in (b"a", b"b" * 1500, b"c" * 60_000):
+            out.sendto(data, (PROXY, relay.port))
+            assert await received(target) == data
+    assert relay.sent == 61_501
+    relay.close()
+
+
+async def test_those_of_others_are_dropped(target: socket.socket) -> None:
+    relay, _ = relay_to(target, OUTSIDE)
+    with sender(OTHER_NODE) as stranger, sender(OUTSIDE) as out:
+        stranger.sendto(b"forged", (PROXY, relay.port))
+        await until(lambda: relay.dropped, "it was dropped")
+        out.sendto(b"real", (PROXY, relay.port))
+        assert await received(target) == b"real"
+    relay.close()
+
+
+async def test_a_target_that_is_gone_ends_it_and_the_sender_learns_of_it() -> None:
+    gone = bind(NODE, 0)
+    relay, ends = relay_to(gone, OUTSIDE)
+    gone.close()
+    with sender(OUTSIDE) as out:
+        out.connect((PROXY, relay.port))
+        out.send(b"one")
+        await until(lambda: ends, "it has ended")
+        relay.close()
+        out.send(b"two")
+        with pytest.raises(ConnectionRefusedError):
+            await received(out)

@@ -1,0 +1,304 @@
+"""``--direction both``: inside reaches outside through the proxy, at ports of the proxy alone."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+from xmlrpc.client import Binary
+
+import pytest
+
+from examples.demo.fake_http import Where, value, where
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
+from rosproxy.forwarding.datagrams import bind
+from rosproxy.ros1.protocol.tcpros import encode_header
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.net import (
+    HOST,
+    MASTER,
+    NODE,
+    OTHER_NODE,
+    OUTSIDE,
+    PROXY,
+    connect,
+    knock,
+    post,
+    read_header,
+    refuses,
+    rpc,
+    service_header,
+    topic_header,
+    until,
+    xml,
+)
+from tests.integration.proxy import Proxy
+
+BOTH_LOOPS = True
+
+
+@pytest.fixture(autouse=True)
+def _loopback_is_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All hosts of these tests are on one machine: none of their addresses is another's."""
+    monkeypatch.setattr("rosproxy.ros1.standins.outside.address_towards", lambda address: "")
+
+
+@pytest.fixture
+async def proxy(make_proxy: MakeProxy) -> Proxy:
+    return await make_proxy(direction="both")
+
+
+@pytest.fixture
+async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
+    """A node outside that publishes and serves."""
+    made = await make_node("/robot", MASTER)
+    await made.publish(where(master.uri))
+    await made.serve(where(master.uri))
+    return made
+
+
+def stand_ins(proxy: Proxy) -> dict[str, int]:
+    """What is stood in for, with the open connections."""
+    return {row["uri"]: row["connections"] for row in proxy.app.status()["stand_ins"]}
+
+
+def master_of(proxy: Proxy) -> Where:
+    return where(proxy.settings.master_uri)
+
+
+async def look_up(proxy: Proxy, node: FakeNode) -> str:
+    """A node's slave URI as inside is given it."""
+    found = (await rpc(proxy.master, "lookupNode", "/tool", node.name, source=NODE))[2]
+    assert isinstance(found, str)
+    return found
+
+
+async def look_up_service(proxy: Proxy) -> str:
+    found = (await rpc(proxy.master, "lookupService", "/tool", "/add", source=NODE))[2]
+    assert isinstance(found, str)
+    return found
+
+
+async def by_subscribing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
+    return (await node.subscribe(proxy.master))[2][0]
+
+
+async def by_publishing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
+    await robot.subscribe(master_of(proxy))
+    return (await node.publish(proxy.master))[2][0]
+
+
+async def by_lookup(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
+    return await look_up(proxy, robot)
+
+
+async def by_update(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
+    await node.subscribe(proxy.master, "/later")
+    await robot.publish(master_of(proxy), "/later")
+    await until(lambda: node.updates("/later"), "a publisherUpdate")
+    return node.updates("/later")[0][0]
+
+
+WAYS = [by_subscribing, by_publishing, by_lookup, by_update]
+
+
+@pytest.mark.parametrize("way", WAYS)
+async def test_whatever_way_a_node_is_named_it_is_reached_at_the_proxy(
+    proxy: Proxy, robot: FakeNode, node: FakeNode, way: Callable[..., Awaitable[Any]]
+) -> None:
+    given = await way(proxy, robot, node)
+    assert given != robot.uri
+    assert where(given)[0] in (PROXY, "127.0.0.1")
+    assert where(given)[1] not in proxy.settings.ports.listen
+    assert (await rpc(where(given), "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
+
+
+async def test_a_topic_flows_through_the_proxy(proxy: Proxy, robot: FakeNode) -> None:
+    at = where(await look_up(proxy, robot))
+    asked = await rpc(at, "requestTopic", "/n", "/chatter", [["TCPROS"]], source=NODE)
+    assert asked == [1, f"ready on {at[0]}:{at[1]}", ["TCPROS", *at]]
+    async with connect(at, NODE) as wire:
+        await wire.send(topic_header(caller="/n"))
+        assert (await read_header(wire))["callerid"] == "/robot"
+        await wire.send(b"x" * 300_000)
+        assert await wire.exactly(300_000) == b"x" * 300_000
+        assert stand_ins(proxy)[robot.uri] == 1
+    await until(lambda: stand_ins(proxy)[robot.uri] == 0, "the relay ends")
+
+
+async def test_a_service_is_called_through_the_proxy(proxy: Proxy, robot: FakeNode) -> None:
+    given = await look_up_service(proxy)
+    async with connect(where(given), NODE) as wire:
+        await wire.send(service_header(caller="/tool"))
+        assert (await read_header(wire))["callerid"] == "/robot"
+    assert robot.headers[0]["service"] == "/add"
+
+
+async def test_a_subscriber_comes_back_to_the_same_port_after_a_restart(
+    proxy: Proxy, robot: FakeNode, node: FakeNode
+) -> None:
+    given = (await node.subscribe(proxy.master))[2]
+    node.calls.clear()
+    await proxy.restart()
+    await until(lambda: len(node.updates()) > 1, "publisherUpdates by the proxy")
+    gone, (again,) = node.updates()[:2]  # who has given up tries again once it is told of both
+    assert gone == []
+    assert where(again)[1] == where(given[0])[1]
+    async with connect(where(again), NODE) as wire:  # its port is not known yet: it is asked for
+        await wire.send(topic_header(caller="/n"))
+        assert (await read_header(wire))["callerid"] == "/robot"
+
+
+async def test_what_comes_back_is_what_the_master_has(
+    proxy: Proxy, robot: FakeNode, master: FakeMaster
+) -> None:
+    """As `rosnode cleanup` unregisters somebody else's node."""
+    given, api = await look_up(proxy, robot), await look_up_service(proxy)
+    await proxy.restart()  # nothing is remembered
+    ended = await rpc(proxy.master, "unregisterPublisher", "/robot", "/chatter", given, source=NODE)
+    assert ended[2] == 1
+    assert await look_up_service(proxy) == api
+    ended = await rpc(proxy.master, "unregisterService", "/robot", "/add", api, source=NODE)
+    assert ended[2] == 1
+
+
+async def test_tools_see_addresses_that_they_can_use(
+    proxy: Proxy, robot: FakeNode, node: FakeNode, make_node: MakeNode, master: FakeMaster
+) -> None:
+    other = await make_node("/laptop", OUTSIDE)
+    await other.publish(where(master.uri), "/far")
+    await node.publish(proxy.master, "/near")
+    rows = [
+        [1, other.uri, "i", "TCPROS", "/far", True],
+        [2, proxy.uri(node), "i", "TCPROS", "/near", True],
+    ]
+    robot.answers["getBusInfo"] = value([1, "", rows])
+    at = where(await look_up(proxy, robot))
+    seen = (await rpc(at, "getBusInfo", "/tool", source=NODE))[2]
+    assert seen[1][1] == node.uri
+    assert (await rpc(where(seen[0][1]), "getPid", "/tool", source=NODE))[2] == other.pid
+
+
+async def test_only_inside_is_let_in(proxy: Proxy, robot: FakeNode) -> None:
+    at, service = where(await look_up(proxy, robot)), where(await look_up_service(proxy))
+    for source in (OUTSIDE, MASTER, "127.0.0.1"):
+        assert await knock(at, post(xml("getPid", "/tool")), source) in ("closed", "reset")
+        assert await knock(service, service_header(), source) in ("closed", "reset")
+
+
+async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot: FakeNode) -> None:
+    at = where(await look_up(proxy, robot))
+    await robot.stop()
+    assert await knock(at, post(xml("getPid", "/tool")), NODE) == "reset"
+    assert await refuses(at, NODE)
+    await robot.start()
+    assert where(await look_up(proxy, robot)) == at
+    assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
+
+
+async def test_denied_topics_and_services_are_not_reached_by_an_address_that_is_known(
+    make_proxy: MakeProxy, robot: FakeNode
+) -> None:
+    proxy = await make_proxy(
+        direction="both", policy=("deny subscribe /chatter by /spy; deny call /add by /spy",)
+    )
+    at, service = where(await look_up(proxy, robot)), where(await look_up_service(proxy))
+    for caller, may in (("/spy", False), ("/friend", True)):
+        asked = await rpc(at, "requestTopic", caller, "/chatter", [["TCPROS"]], source=NODE)
+        assert (asked[0] == 1) is may
+        for port, header in ((at, topic_header), (service, service_header)):
+            async with connect(port, NODE) as wire:
+                await wire.send(header(caller=caller))
+                assert ("error" in await read_header(wire)) is not may
+
+
+async def test_another_node_at_the_address_does_not_lend_its_name(
+    make_proxy: MakeProxy, robot: FakeNode, make_node: MakeNode
+) -> None:
+    proxy = await make_proxy(direction="both", policy=("deny subscribe /chatter by /spy",))
+    spy = await make_node("/spy", OTHER_NODE)
+    await spy.publish(proxy.master, "/own")
+    at = where(await look_up(proxy, robot))
+    async with connect(at, OTHER_NODE) as wire:
+        await wire.send(topic_header(caller="/friend"))
+        assert "error" in await read_header(wire)
+
+
+async def test_nobody_inside_has_the_proxy_connect_to_what_he_names(
+    proxy: Proxy, node: FakeNode
+) -> None:
+    """With no way out but the proxy, an address that one names oneself would be one."""
+    secret = await asyncio.start_server(lambda *_: None, OUTSIDE)
+    port = secret.sockets[0].getsockname()[1]
+    params = "/node", "/t", "x/Y", f"http://{OUTSIDE}:{port}/"
+    await rpc(proxy.master, "registerPublisher", *params, source=NODE)
+    await node.subscribe(proxy.master, "/t")
+    assert f"http://{OUTSIDE}:{port}/" not in stand_ins(proxy)
+    secret.close()
+
+
+# UDPROS
+
+
+def udp_offer(topic: str, host: str, port: int) -> list[Any]:
+    header = encode_header({"topic": topic, "callerid": "/node", "md5sum": "*"})[4:]
+    return ["UDPROS", Binary(header), host, port, 1500]
+
+
+def offers_heard(node: FakeNode) -> list[Any]:
+    """The offers of the last requestTopic that a node got."""
+    params: list[Any] = next(params for method, params in node.calls if method == "requestTopic")[2]
+    return params
+
+
+async def test_udpros_from_outside_comes_in_through_the_range(
+    make_proxy: MakeProxy, make_node: MakeNode, robot: FakeNode
+) -> None:
+    proxy = await make_proxy(direction="both", udp=True)
+    node = await make_node("/node")
+    await node.subscribe(proxy.master)
+    at = where(await look_up(proxy, robot))
+    with bind(NODE, 0) as ear, bind(MASTER, 0) as mouth:
+        port = ear.getsockname()[1]
+        offer = udp_offer("/chatter", "node", port)
+        await rpc(at, "requestTopic", "/node", "/chatter", [offer], source=NODE)
+        ((_, _, host, told, _),) = offers_heard(robot)
+        assert (host, told in proxy.settings.ports.listen) == (HOST, True)
+        mouth.sendto(b"message", (HOST, told))
+        async with asyncio.timeout(5):
+            assert await asyncio.get_running_loop().sock_recv(ear, 100) == b"message"
+        (row,) = proxy.app.status()["udpros"]
+        assert (row["topic"], row["port"], row["bytes"]) == ("/chatter", told, 7)
+        await node.stop()
+        await rpc(proxy.master, "unregisterSubscriber", "/node", "/chatter", node.uri, source=NODE)
+        await proxy.app.stand_ins.tidy()
+        assert not proxy.app.status()["udpros"]
+
+
+async def test_udpros_goes_out_through_a_port_inside(
+    proxy: Proxy, node: FakeNode, master: FakeMaster
+) -> None:
+    await node.publish(proxy.master)
+    with bind(OUTSIDE, 0) as ear, bind(NODE, 0) as mouth:
+        offer = udp_offer("/chatter", OUTSIDE, ear.getsockname()[1])
+        await rpc(proxy.lease(node), "requestTopic", "/ear", "/chatter", [offer], source=OUTSIDE)
+        ((_, _, host, told, _),) = offers_heard(node)
+        assert host != OUTSIDE
+        mouth.sendto(b"message", (host, told))
+        async with asyncio.timeout(5):
+            assert await asyncio.get_running_loop().sock_recv(ear, 100) == b"message"
+
+
+@pytest.mark.parametrize(
+    ("udp", "topic"), [(False, "/chatter"), (True, "/secret")], ids=["not published", "a lie"]
+)
+async def test_an_offer_that_can_not_be_had_is_taken_out(
+    make_proxy: MakeProxy, make_node: MakeNode, robot: FakeNode, udp: bool, topic: str
+) -> None:
+    proxy = await make_proxy(direction="both", udp=udp)
+    node = await make_node("/node")
+    await node.subscribe(proxy.master)
+    at = where(await look_up(proxy, robot))
+    offers = [udp_offer(topic, "node", 40000), ["TCPROS"]]
+    asked = await rpc(at, "requestTopic", "/node", "/chatter", offers, source=NODE)
+    assert offers_heard(robot) == [["TCPROS"]]
+    assert asked[2] == ["TCPROS", *at]

@@ -1,0 +1,71 @@
+"""The offers of UDPROS: read, led elsewhere, taken out."""
+
+import xmlrpc.client
+from typing import Any
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.tcpros import encode_header
+from rosproxy.ros1.protocol.xmlrpc import document
+from rosproxy.ros1.rewriting.udpros import lead_to, read_offers
+
+HERE = HostPort("10.0.0.1", 25000)
+
+
+def header(topic: str) -> xmlrpc.client.Binary:
+    """As roscpp writes it, without the length of the whole."""
+    return xmlrpc.client.Binary(encode_header({"topic": topic, "callerid": "/n"})[4:])
+
+
+def offer(topic: str = "/t", host: Any = "laptop", port: Any = 40000) -> list[Any]:
+    return ["UDPROS", header(topic), host, port, 1500]
+
+
+def asked(*offers: list[Any]) -> bytes:
+    return xmlrpc.client.dumps(("/n", "/t", list(offers)), "requestTopic").encode()
+
+
+def led(body: bytes, where: HostPort | None) -> Any:
+    """The offers of a call, each led to somewhere."""
+    call = document.parse_call(body)
+    edits = [edit for one in read_offers(call) for edit in lead_to(one, where)]
+    return xmlrpc.client.loads(document.apply(body, edits).decode())[0][2]
+
+
+def test_an_offer_is_read() -> None:
+    (found,) = read_offers(document.parse_call(asked(["TCPROS"], offer("/other"))))
+    assert (found.topic, found.where) == ("/other", HostPort("laptop", 40000))
+
+
+def test_an_offer_leads_elsewhere_and_all_else_stays() -> None:
+    assert led(asked(["TCPROS"], offer()), HERE) == [["TCPROS"], offer(host=HERE.host, port=25000)]
+
+
+def test_an_offer_is_taken_out() -> None:
+    assert led(asked(offer(), ["TCPROS"]), None) == [["TCPROS"]]
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        ["UDPROS"],
+        ["UDPROS", "no header", "laptop", 40000, 1500],
+        ["UDPROS", xmlrpc.client.Binary(b"\xff\xff"), "laptop", 40000, 1500],
+        offer(port=0),
+        offer(port=70000),
+        offer(port="40000"),
+        offer(host=""),
+        offer(host=7),
+    ],
+)
+def test_what_can_not_be_read_is_taken_out(odd: list[Any]) -> None:
+    (found,) = read_offers(document.parse_call(asked(odd)))
+    assert found.where is None or found.topic == ""
+    if found.where is None:
+        assert led(asked(odd, ["TCPROS"]), HERE) == [["TCPROS"]]
+
+
+def test_other_calls_have_none() -> None:
+    body = xmlrpc.client.dumps(("/n", "/t", [offer()]), "publisherUpdate").encode()
+    assert read_offers(document.parse_call(body)) == []
