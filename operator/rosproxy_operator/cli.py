@@ -144,6 +144,13 @@ def main() -> None:
     default="auto",
     help="How proxies forward topics. kernel: they get the capability NET_ADMIN for it.",
 )
+@click.option(
+    "--direction",
+    type=click.Choice(["out", "both"]),
+    default="out",
+    help="Who needs no route to the other side: outside alone, or (both) containers as well. Those "
+    "on an internal network get both by themselves.",
+)
 @bound_options
 @proxy_bound_options
 @policy_options

@@ -119,6 +119,8 @@ GOOD: list[Json] = [
     {"master": {"uri": "http://r"}, "hostAliases": [{"ip": "1.2.3.4", "hostnames": ["Robot"]}]},
     {"master": {"uri": "http://r"}, "policy": {"slaveControl": "Master"}},
     {"master": {"uri": "http://r"}, "dataPlane": "Kernel"},
+    {"master": {"uri": "http://r"}, "direction": "Both"},
+    {"master": {"uri": "http://r"}, "direction": "Both", "podEgress": "Proxy"},
 ]
 BAD: list[tuple[Json, str]] = [
     ({"master": {"uri": "http://r:65536"}}, "must be of the form http://host:11311"),
@@ -133,6 +135,8 @@ BAD: list[tuple[Json, str]] = [
     ({"master": {"uri": "http://r", "publish": 11300}}, "is outside already"),
     ({"master": {"uri": "http://r"}, "portWindow": {"last": 70000}}, "portWindow.last"),
     ({"master": {"uri": "http://r"}, "dataPlane": "kernel"}, "dataPlane"),
+    ({"master": {"uri": "http://r"}, "direction": "In"}, "direction"),
+    ({"master": {"uri": "http://r"}, "podEgress": "Proxy"}, "direction: Both"),
     ({"master": {"uri": "http://r"}, "tolerations": [{"key": "", "operator": "Exists"}]}, "key"),
     ({"master": {"uri": "http://r"}, "tolerations": [{"value": "a"}]}, "needs the operator Exists"),
     (

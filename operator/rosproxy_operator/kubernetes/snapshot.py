@@ -121,7 +121,7 @@ class SnapshotReader:
         """
         try:
             found = filter(None, map(objects.policy, self._api.own(POLICIES)))
-            return {one.of: one for one in found}
+            return {one.id: one for one in found}
         except ApiAway:
             raise
         except ApiError as error:

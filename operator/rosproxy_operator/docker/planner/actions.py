@@ -10,7 +10,7 @@ import msgspec
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane, SlaveControl
+from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
 
@@ -76,6 +76,7 @@ class Create(_CreateContainer, frozen=True):
     fingerprint: str = ""
     replaces: str = ""
     slave_control: SlaveControl = "any"
+    direction: Direction = "out"
     policy: tuple[PolicyLayer, ...] = ()
 
     def _more(self) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import is_address
-from rosproxy.settings import DataPlane, SlaveControl
+from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.labels.values import ALIAS, BUILT_IN, DATA_PLANE
@@ -40,8 +40,8 @@ def desire(
     """One Desired for each key that a container asks for or that has a proxy, sorted by key.
 
     A member for networks that are not there (any more) is dropped. Containers that have exited
-    keep networks joined that a proxy is on, and its data plane, for the settings' grace, but join
-    none.
+    keep networks joined that a proxy is on, and what else their labels made it, for the settings'
+    grace, but join none.
     """
     bad = _before_uplink(observed, settings.uplink)
     usable = {network.name for network in observed.networks} - BUILT_IN - bad
@@ -58,10 +58,20 @@ def desire(
         left = [member for member in recent if member.key == key]
         there = {name for box in observed.sandboxes_of(key) for name in box.container.networks}
         networks = _networks(own) | (_networks(left) & there)
-        plane = chosen_plane([*own, *left], settings.data_plane)
-        control = chosen_control([*own, *left], settings.slave_control)
         ports = max([settings.ports, *(member.ports for member in own)])
-        desired.append(Desired(key, bool(own), ports, networks & usable, own, plane, control))
+        every = [*own, *left]
+        desired.append(
+            Desired(
+                key,
+                bool(own),
+                ports,
+                networks & usable,
+                own,
+                chosen_plane(every, settings.data_plane),
+                chosen_control(every, settings.slave_control),
+                chosen_direction(every, settings.direction),
+            )
+        )
     told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
     return tuple(desired), (*told, *_outvoted(desired))
 
@@ -79,6 +89,15 @@ def chosen_control(members: Iterable[Member], default: SlaveControl) -> SlaveCon
     """
     asked = {default, *(member.slave_control for member in members)}
     return "master" if "master" in asked else "any"
+
+
+def chosen_direction(members: Iterable[Member], default: Direction) -> Direction:
+    """The direction of a proxy with these containers: both ways if one of them needs that.
+
+    Who has a route outwards loses nothing by going through the proxy.
+    """
+    asked = {member.direction or default for member in members} or {default}
+    return "both" if "both" in asked else "out"
 
 
 def _networks(members: Iterable[Member]) -> frozenset[str]:

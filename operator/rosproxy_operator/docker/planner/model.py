@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane, SlaveControl
+from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
 ALIVE = frozenset({"created", "running", "paused", "restarting"})
@@ -26,9 +26,10 @@ WINDOW = PortRange(11400, 65535)
 class PlanSettings:
     """The operator's options that decide what is planned, by their names.
 
-    ``master_uri``, ``advertise_host`` (None if not given) and ``data_plane`` are for containers
-    without a label of their own. ``ports`` is the least number that a proxy gets, ``port_window``
-    where they are looked for, ``publish_address`` the host's addresses on which they are published.
+    ``master_uri``, ``advertise_host`` (None if not given), ``data_plane`` and ``direction`` are for
+    containers without a label of their own. ``ports`` is the least number that a proxy gets,
+    ``port_window`` where they are looked for, ``publish_address`` the host's addresses on which
+    they are published.
     ``grace`` is in seconds: how long a proxy outlives its last container.
 
     What labels may ask for at most: a master that one of ``allow_master`` means (patterns as
@@ -57,6 +58,7 @@ class PlanSettings:
     grace: float = 60.0
     uplink: str = "0-rosproxy"
     data_plane: DataPlane = "auto"
+    direction: Direction = "out"
     allow_master: tuple[str, ...] = ()
     max_ports: int = 100
     allow_data_plane: tuple[DataPlane, ...] = ()
@@ -225,12 +227,12 @@ class HostState:
 class Member:
     """A labelled container, and what it wants of its proxy: labels and settings put together.
 
-    ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label. ``networks`` are
-    the names of those on which it wants to meet its proxy. ``needs`` is the host in its
-    ROS_MASTER_URI: the name by which it looks for the proxy, ``rosproxy`` if it has no such
-    variable, empty where no alias can help it. ``policy`` are rules for its own nodes alone. A
-    container that is not alive only keeps networks joined, the data plane and the slave control for
-    a while.
+    ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label, ``direction`` is
+    None if any will do. ``networks`` are the names of those on which it wants to meet its proxy.
+    ``needs`` is the host in its ROS_MASTER_URI: the name by which it looks for the proxy,
+    ``rosproxy`` if it has no such variable, empty where no alias can help it. ``policy`` are rules
+    for its own nodes alone. A container that is not alive only keeps networks joined, and what else
+    its labels made its proxy, for a while.
     """
 
     container: Container
@@ -240,6 +242,7 @@ class Member:
     needs: str = ""
     data_plane: DataPlane | None = None
     slave_control: SlaveControl | None = None
+    direction: Direction | None = None
     policy: tuple[Rule, ...] = ()
 
 
@@ -258,3 +261,4 @@ class Desired:
     members: tuple[Member, ...] = ()
     data_plane: DataPlane = "auto"
     slave_control: SlaveControl = "any"
+    direction: Direction = "out"

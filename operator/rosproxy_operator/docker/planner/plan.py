@@ -184,5 +184,6 @@ def _ends(
     for member in found.members:
         boxes = [one.container for one in observed.sandboxes_of(member.key)]
         joined = any(b.networks & member.networks for b in boxes if b.state != "removing")
-        if not member.container.alive and (joined or member.data_plane):
+        asks = member.data_plane or member.direction
+        if not member.container.alive and (joined or asks):
             yield settings.grace - (now - memory.exited[member.container.id])

@@ -202,6 +202,7 @@ def container_config(
         "ROSPROXY_MASTER_PORT": str(master(made.key).port),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(made.key)}",
         "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
+        "ROSPROXY_DIRECTION": "" if made.direction == "out" else made.direction,
         "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
         "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
         "ROSPROXY_MASTER_ADDRESS": master_address,

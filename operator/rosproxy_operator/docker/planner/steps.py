@@ -269,6 +269,7 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         home.name,
         context.desired.data_plane,
         slave_control=context.desired.slave_control,
+        direction=context.desired.direction,
         policy=context.label_policy,
     )
     observed = context.observed

@@ -59,7 +59,7 @@ def within_bounds(observed: ClusterSnapshot, settings: ClusterSettings) -> Clust
 def objection(of: RosProxy, consents: Consents, settings: ClusterSettings) -> str:
     """What a RosProxy asks for that it may not have: field, value, what to do. Empty if nothing."""
     every = (
-        *_beyond(of.spec, settings.bounds, settings.image),
+        *_beyond(of.spec, settings),
         _unasked(of, consents),
     )
     return next(filter(None, every), "")
@@ -78,8 +78,9 @@ def may_name(master: str, allowed: tuple[str, ...]) -> bool:
     return any(is_address(where.host) or not _NUMERIC.fullmatch(one) for one in fits)
 
 
-def _beyond(spec: RosProxySpec, bounds: Bounds, own_image: str) -> Iterator[str]:
+def _beyond(spec: RosProxySpec, settings: ClusterSettings) -> Iterator[str]:
     """What goes beyond the administrator's bounds."""
+    bounds = settings.bounds
     if bounds.masters:
         for uri in _masters(spec):
             if not may_name(uri, bounds.masters):
@@ -90,7 +91,9 @@ def _beyond(spec: RosProxySpec, bounds: Bounds, own_image: str) -> Iterator[str]
         others = " or ".join(one.capitalize() for one in bounds.data_planes)
         value = spec.data_plane.capitalize()
         yield _refused("spec.dataPlane", value, f"choose {others}", "allow.dataPlanes")
-    known = (own_image, *bounds.images)
+    if spec.pod_egress == "proxy" and not settings.network_policy:
+        yield _refused("spec.podEgress", "Proxy", "choose Any", "proxy.networkPolicy.enabled")
+    known = (settings.image, *bounds.images)
     if spec.image and not any(_fits(spec.image, one) for one in known):
         yield _refused("spec.image", spec.image, "leave it out", "allow.images")
 

@@ -260,6 +260,7 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
         "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
+        "ROSPROXY_DIRECTION": "" if spec.direction == "out" else spec.direction,
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
         **bound_variables(settings.proxy_bounds),

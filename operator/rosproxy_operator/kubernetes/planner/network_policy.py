@@ -1,18 +1,26 @@
-"""The NetworkPolicy of a RosProxy's proxies: who may connect to which of their ports.
+"""The NetworkPolicies of a RosProxy, for its proxies and for its pods.
+
+That of the proxies says who may connect to which of their ports (`policy`).
 
 The port range, and a published master, are for everybody: that is what they are for. The master
-port is for the pods that the RosProxy selects, the admin port for the operator and for whom the
+port is for the pods that the RosProxy selects, as are, with ``direction: Both``, the ports that
+stand in for nodes outside; the admin port for the operator and for whom the
 administrator names. What a proxy connects to is not limited. The kubelet's probes need no rule:
 a pod is always reached from its own node (``NetworkPolicySpec`` in k8s.io/api, networking/v1).
 
 The policy allows the whole window instead of the ranges of the moment: nothing else listens there,
 and a proxy that gets a range finds it open.
+
+That of the pods says to what they may connect (`pods_policy`); there is one with ``podEgress:
+Proxy`` alone. The selected pods reach the proxies, one another and any DNS server, and
+nothing else. All that they have of outside then comes through their proxy, where rules hold.
 """
 
 from collections.abc import Iterator
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.ros1.registry.stand_ins import PORTS as STAND_IN_PORTS
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
     CreatePolicy,
@@ -23,14 +31,16 @@ from rosproxy_operator.kubernetes.planner.manifests import metadata
 from rosproxy_operator.kubernetes.planner.reconcile import ClusterContext
 from rosproxy_operator.kubernetes.planner.retries import Task
 from rosproxy_operator.kubernetes.planner.selection import OFF, own_values
-from rosproxy_operator.kubernetes.resources.model import Json, ProxyPolicy, RosProxy
+from rosproxy_operator.kubernetes.resources.model import Json, Name, ProxyPolicy, RosProxy
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
     INJECT,
     MASTER_PORT,
     own_labels,
+    pods_policy_id,
     policy_id,
 )
+from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 
@@ -44,23 +54,65 @@ def policy(rosproxy: RosProxy, settings: ClusterSettings) -> Json:
     }
 
 
-def reconcile_policy(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
-    """Make, mend or remove the NetworkPolicy of a RosProxy."""
-    there, settings = context.observed.policies.get(of.id), context.settings
-    name = policy_id(of.id)
+def pods_policy(rosproxy: RosProxy) -> Json:
+    """The NetworkPolicy of the pods that a RosProxy selects."""
+    pods = _selected(rosproxy)
+    dns = [{"protocol": protocol, "port": 53} for protocol in ("UDP", "TCP")]
+    spec = {
+        "podSelector": pods,
+        "policyTypes": ["Egress"],
+        "egress": [
+            {"to": [{"podSelector": {"matchLabels": own_labels(rosproxy.id.name)}}]},
+            {"to": [{"podSelector": pods}]},
+            {"ports": dns},
+        ],
+    }
+    return {
+        "apiVersion": "networking.k8s.io/v1",
+        "kind": "NetworkPolicy",
+        "metadata": metadata(rosproxy, pods_policy_id(rosproxy.id), {}),
+        "spec": spec,
+    }
+
+
+def wanted_policies(of: RosProxy, settings: ClusterSettings) -> dict[Name, Json]:
+    """The NetworkPolicies that a RosProxy is to have, by their names."""
+    if not settings.network_policy:
+        return {}
+    wanted = {policy_id(of.id): policy(of, settings)}
+    if of.spec.pod_egress == "proxy":
+        wanted[pods_policy_id(of.id)] = pods_policy(of)
+    return wanted
+
+
+def reconcile_policies(context: ClusterContext, of: RosProxy) -> Iterator[Action]:
+    """Make, mend or remove the NetworkPolicies of a RosProxy."""
     if context.observed.no_policies:
         return
+    wanted = wanted_policies(of, context.settings)
+    there = {name: one for name, one in context.observed.policies.items() if one.of == of.id}
+    for found in there.values():
+        if found.owner != of.uid:
+            yield from _delete(context, found, "it is that of a RosProxy that is gone")
+        elif found.id not in wanted:
+            on = context.settings.network_policy
+            yield from _delete(context, found, "not asked for" if on else "--no-network-policy")
+    for name, body in wanted.items():
+        yield from _keep(context, of, body, there.get(name))
+
+
+def _keep(
+    context: ClusterContext, of: RosProxy, body: Json, there: ProxyPolicy | None
+) -> Iterator[Action]:
+    """Make a policy that is not there, or mend the one that is."""
+    name, ask = name_of(body["metadata"]), context.retries.ask
     if there is None:
-        if settings.network_policy and context.retries.ask(Task(of.id, "create policy", name)):
-            yield CreatePolicy(of.id, policy(of, settings))
-    elif there.owner != of.uid or not settings.network_policy:
-        gone = there.owner != of.uid
-        why = "it is that of a RosProxy that is gone" if gone else "--no-network-policy"
-        yield from _delete(context, there, why)
-    elif (spec := _spec(of, settings)) != there.spec and context.retries.ask(
-        Task(of.id, "set policy", name, there.uid)
-    ):
-        yield SetPolicy(of.id, name, there.uid, spec)
+        if ask(Task(of.id, "create policy", name)):
+            yield CreatePolicy(of.id, body)
+        return
+    changed = there.owner == of.uid and there.spec != body["spec"]
+    if changed and ask(Task(of.id, "set policy", name, there.uid)):
+        yield SetPolicy(of.id, name, there.uid, body["spec"])
 
 
 def reconcile_orphaned_policies(context: ClusterContext) -> Iterator[Action]:
@@ -72,10 +124,9 @@ def reconcile_orphaned_policies(context: ClusterContext) -> Iterator[Action]:
 
 
 def _delete(context: ClusterContext, there: ProxyPolicy, why: str) -> Iterator[Action]:
-    name = policy_id(there.of)
-    task = Task(there.of, "delete policy", name, there.uid)
+    task = Task(there.of, "delete policy", there.id, there.uid)
     if not there.deleting and context.retries.ask(task):
-        yield DeletePolicy(there.of, name, there.uid, why)
+        yield DeletePolicy(there.of, there.id, there.uid, why)
 
 
 def _spec(of: RosProxy, settings: ClusterSettings) -> Json:
@@ -88,7 +139,7 @@ def _spec(of: RosProxy, settings: ClusterSettings) -> Json:
         "policyTypes": ["Ingress"],
         "ingress": [
             {"ports": [*_open(of)]},
-            {"ports": [_port(MASTER_PORT)], "from": [{"podSelector": _selected(of)}]},
+            {"ports": [*_for_pods(of)], "from": [{"podSelector": _selected(of)}]},
             admin,
         ],
     }
@@ -107,6 +158,12 @@ def _open(of: RosProxy) -> Iterator[Json]:
     publish = of.spec.master.publish
     if publish and publish not in PortRange(of.spec.window.first, of.spec.window.last):
         yield _port(publish)
+
+
+def _for_pods(of: RosProxy) -> Iterator[Json]:
+    yield _port(MASTER_PORT)
+    if of.spec.direction == "both":
+        yield _port(STAND_IN_PORTS[0], STAND_IN_PORTS[-1])
 
 
 def _port(first: int, last: int = 0) -> Json:

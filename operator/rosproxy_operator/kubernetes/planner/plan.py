@@ -22,7 +22,7 @@ from rosproxy_operator.kubernetes.planner.callers import callers
 from rosproxy_operator.kubernetes.planner.injection import unwired
 from rosproxy_operator.kubernetes.planner.network_policy import (
     reconcile_orphaned_policies,
-    reconcile_policy,
+    reconcile_policies,
 )
 from rosproxy_operator.kubernetes.planner.policies import policies
 from rosproxy_operator.kubernetes.planner.reconcile import (
@@ -95,7 +95,7 @@ def plan(
     problems = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
     for _, rosproxy in sorted(seen.rosproxies.items()):
-        own = [*reconcile_service(context, rosproxy), *reconcile_policy(context, rosproxy)]
+        own = [*reconcile_service(context, rosproxy), *reconcile_policies(context, rosproxy)]
         own += reconcile_proxies(context, rosproxy)
         states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)

@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, Direction
 from rosproxy_operator.common.problem import Problem
 
 Json = Mapping[str, Any]
@@ -41,6 +41,10 @@ class Selector(msgspec.Struct, frozen=True):
 
     labels: Mapping[str, str] = {}
     expressions: tuple[tuple[str, str, frozenset[str]], ...] = ()
+
+
+PodEgress = Literal["any", "proxy"]
+"""What selected pods may connect to: anything, or the proxies, one another and the DNS alone."""
 
 
 class MasterSpec(msgspec.Struct, frozen=True):
@@ -87,6 +91,8 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     slave_control: str = "any"
     policy: tuple[PolicyLayer, ...] = ()
     data_plane: DataPlane = "auto"
+    direction: Direction = "out"
+    pod_egress: PodEgress = "any"
     image: str = ""
     image_pull_policy: str = ""
     image_pull_secrets: tuple[Json, ...] = ()
@@ -205,8 +211,9 @@ class ProxyService(msgspec.Struct, frozen=True):
 
 
 class ProxyPolicy(msgspec.Struct, frozen=True):
-    """A NetworkPolicy of the operator: who may connect to a RosProxy's proxies."""
+    """A NetworkPolicy of the operator, for the proxies of a RosProxy or for its pods."""
 
+    id: Name
     of: Name
     owner: str
     uid: str
@@ -300,8 +307,8 @@ class ClusterSnapshot(msgspec.Struct, frozen=True):
     ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
     wrong; one of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies
     may name it, besides its own. ``selected`` are the uids of the pods that a RosProxy selects.
-    ``policies`` are the operator's own NetworkPolicies; ``no_policies`` is why they can't be
-    listed. ``key`` is that from which the proxies' tokens are made.
+    ``policies`` are the operator's own NetworkPolicies by their names; ``no_policies`` is why they
+    can't be listed. ``key`` is that from which the proxies' tokens are made.
     ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
     ``reports`` are what the proxies say of themselves, by the uid of the pod; ``failures`` are, by
     RosProxy and object, what the API server said of the actions that failed at the last try:

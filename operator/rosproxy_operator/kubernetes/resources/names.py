@@ -82,6 +82,14 @@ def policy_id(of: Name) -> Name:
     return Name(of.namespace, f"{_PREFIX}{of.name}")
 
 
+def pods_policy_id(of: Name) -> Name:
+    """The namespace and name of the NetworkPolicy of a RosProxy's pods.
+
+    No RosProxy's name has a dot: it is never that of another one's proxies.
+    """
+    return Name(of.namespace, f"{_PREFIX}{of.name}.pods")
+
+
 def token_of(key: bytes, proxy: Name, node: str) -> str:
     """The token of a proxy's admin endpoint, which only who has the operator's key can tell.
 

@@ -117,9 +117,12 @@ def policy(obj: Json) -> ProxyPolicy | None:
     meta = part(obj, "metadata")
     labels, owner = words(meta, "labels"), _owner(meta)
     of = Name(word(meta, "namespace"), labels.get(names.PROXY_OF, ""))
-    if not names.is_own(labels) or not owner or names.policy_id(of) != name_of(meta):
+    id = name_of(meta)
+    if not names.is_own(labels) or not owner:
         return None
-    return ProxyPolicy(of, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
+    if id not in (names.policy_id(of), names.pods_policy_id(of)):
+        return None
+    return ProxyPolicy(id, of, owner, word(meta, "uid"), part(obj, "spec"), is_deleted(meta))
 
 
 def allowed_from(service: Json) -> frozenset[str]:

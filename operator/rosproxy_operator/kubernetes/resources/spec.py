@@ -14,7 +14,7 @@ from rosproxy.access.rules import Rule, RuleAction, RuleKind
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, is_address, is_loopback, parse_address
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, Direction
 from rosproxy_operator.common.policy import too_much
 from rosproxy_operator.kubernetes.resources.fields import Field, InvalidField, bare
 from rosproxy_operator.kubernetes.resources.model import (
@@ -23,6 +23,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     Json,
     MasterSpec,
     Name,
+    PodEgress,
     RosProxy,
     RosProxySpec,
     Selector,
@@ -67,6 +68,8 @@ _DATA_PLANE: dict[str, DataPlane] = {
     "Splice": "splice",
     "Copy": "copy",
 }
+_DIRECTION: dict[str, Direction] = {"Out": "out", "Both": "both"}
+_POD_EGRESS: dict[str, PodEgress] = {"Any": "any", "Proxy": "proxy"}
 _ADVERTISE = {one.value: one for one in Advertise}
 _PULL_POLICY = {policy: policy for policy in ("", "Always", "IfNotPresent", "Never")}
 _OPERATORS = {one: one for one in ("In", "NotIn", "Exists", "DoesNotExist")}
@@ -133,12 +136,22 @@ def _spec(given: Field, of: Name) -> RosProxySpec:
         slave_control=given["policy"]["slaveControl"].one_of(_SLAVE_CONTROL, "Any"),
         policy=_policy(given["policy"], of),
         data_plane=given["dataPlane"].one_of(_DATA_PLANE, "Auto"),
+        direction=given["direction"].one_of(_DIRECTION, "Out"),
+        pod_egress=_pod_egress(given),
         image=given["image"].text(),
         image_pull_policy=given["imagePullPolicy"].one_of(_PULL_POLICY, ""),
         image_pull_secrets=tuple(one.map() for one in given["imagePullSecrets"].each()),
         resources=given["resources"].map(RESOURCES),
         host_aliases=tuple(_host_alias(one) for one in given["hostAliases"].each()),
     )
+
+
+def _pod_egress(given: Field) -> PodEgress:
+    found, direction = given["podEgress"].one_of(_POD_EGRESS, "Any"), given["direction"]
+    if found == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
+        fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
+        raise given["podEgress"].refused("does not go with spec.direction: Out", fix)
+    return found
 
 
 def _policy(given: Field, of: Name) -> tuple[PolicyLayer, ...]:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, Direction
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox, Start
-from rosproxy_operator.docker.planner.desired import chosen_plane
+from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane
 from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
@@ -347,12 +347,14 @@ class Hosts:
             if not fatal & {f"proxy image {SETTINGS.proxy_image}", f"proxy {proxy_name(key)}"}:
                 mine = [member for member in live if member.key == key]
                 plane = chosen_plane(mine, SETTINGS.data_plane)
-                self.check_key(key, {n for member in mine for n in member.networks & fine}, plane)
+                direction = chosen_direction(mine, SETTINGS.direction)
+                wanted = {n for member in mine for n in member.networks & fine}
+                self.check_key(key, wanted, plane, direction)
                 for member in mine:
                     if f"container {member.container.name}" not in told:
                         self.check_names(member, member.networks & fine)
 
-    def check_key(self, key: Key, wanted: set[str], plane: DataPlane) -> None:
+    def check_key(self, key: Key, wanted: set[str], plane: DataPlane, direction: Direction) -> None:
         own = [(box, own) for box, own in self.own() if own.key == key]
         if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
             return
@@ -367,12 +369,11 @@ class Hosts:
         assert proxy.namespace == sandbox.namespace or proxy.state == "restarting"
         assert runs.range == is_.range
         if self.engine.image:
-            self.check_made_of(key, is_, runs, plane)
+            box = CreateSandbox("", key, is_.range, forwards=plane == "kernel")
+            assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
+            self.check_process(runs, Create("", key, is_.range, "", plane, direction=direction))
 
-    def check_made_of(self, key: Key, is_: OwnLabels, runs: OwnLabels, plane: DataPlane) -> None:
-        box = CreateSandbox("", key, is_.range, forwards=plane == "kernel")
-        assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
-        proxy = Create("", key, is_.range, "", plane)
+    def check_process(self, runs: OwnLabels, proxy: Create) -> None:
         assert runs.fingerprint == proxy_fingerprint(proxy, SETTINGS, self.engine.image, "")
 
     def is_named(self, box: Box, name: str) -> bool:

@@ -286,7 +286,7 @@ class Cluster:
             pods=tuple(pods),
             proxies=tuple(own),
             services={one.of: one for one in services},
-            policies={one.of: one for one in filter(None, map(parse.policy, policies))},
+            policies={one.id: one for one in filter(None, map(parse.policy, policies))},
             key=self.key,
             masters=dict.fromkeys(masters, there),
             reports={

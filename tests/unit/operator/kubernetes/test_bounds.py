@@ -70,6 +70,9 @@ def condition(found: Mapping[str, Any], kind: str = "Ready") -> tuple[str, str, 
          "choose Auto or Splice or Copy, or have its administrator allow it (chart value "
          "allow.dataPlanes)"),
         (bounded(data_planes=("auto", "kernel")), {"data_plane": "kernel"}, ""),
+        (OWN, {"pod_egress": "proxy"}, "spec.podEgress: 'Proxy' is not what the operator allows: "
+         "choose Any, or have its administrator allow it (chart value "
+         "proxy.networkPolicy.enabled)"),
         (OWN, {"image": "rosproxy:1"}, ""),
         (OWN, {"image": "evil:1"}, "spec.image: 'evil:1' is not what the operator allows: leave it "
          "out, or have its administrator allow it (chart value allow.images)"),

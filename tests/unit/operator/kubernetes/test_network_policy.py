@@ -6,9 +6,10 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.ros1.registry.stand_ins import PORTS
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import CreatePolicy, DeletePolicy, SetPolicy
-from rosproxy_operator.kubernetes.planner.network_policy import policy
+from rosproxy_operator.kubernetes.planner.network_policy import policy, wanted_policies
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
@@ -18,6 +19,7 @@ from rosproxy_operator.kubernetes.resources.model import (
     MasterSpec,
     Name,
     ProxyPolicy,
+    RosProxy,
     Selector,
 )
 from tests.unit.operator.kubernetes.objects import (
@@ -45,8 +47,9 @@ def look(seen: ClusterSnapshot, memory: ClusterState | None = None) -> ClusterPl
 
 def there(spec: Json | None = None, **changes: Any) -> dict[Name, ProxyPolicy]:
     own = policy(rosproxy(), ON)["spec"] if spec is None else spec
-    found = ProxyPolicy(ROBOT, "uid-robot", "uid-policy", own)
-    return {ROBOT: replace(found, **changes)}
+    name = names.policy_id(ROBOT)
+    found = ProxyPolicy(name, ROBOT, "uid-robot", "uid-policy", own)
+    return {name: replace(found, **changes)}
 
 
 def rules(**changes: Any) -> list[Json]:
@@ -123,7 +126,7 @@ def test_the_admin_port_is_for_the_operator() -> None:
 def test_it_is_read_back_as_it_was_made() -> None:
     made = policy(rosproxy(), ON)
     found = objects.policy({**made, "metadata": {**made["metadata"], "uid": "uid-policy"}})
-    assert found == there()[ROBOT]
+    assert found == there()[names.policy_id(ROBOT)]
     other = {**made["metadata"], "name": "other"}
     assert objects.policy({**made, "metadata": other}) is None
 
@@ -176,3 +179,52 @@ def test_a_role_that_lacks_the_right_is_told() -> None:
     assert done(found) == []
     assert "the operator's role lacks a rule" in told(found, "NoNetworkPolicy")[0]
     assert told(look_at(seen), "NoNetworkPolicy") == []
+
+
+# direction Both, and podEgress
+
+
+def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
+    everybody, pods, _ = rules(direction="both")
+    stand_ins = {"protocol": "TCP", "port": PORTS[0], "endPort": PORTS[-1]}
+    assert pods["ports"] == [{"protocol": "TCP", "port": 11311}, stand_ins]
+    assert stand_ins not in everybody["ports"]
+
+
+def held(**changes: Any) -> RosProxy:
+    """A RosProxy whose pods are kept to their proxies."""
+    return rosproxy(direction="both", pod_egress="proxy", **changes)
+
+
+def test_pods_are_kept_to_their_proxies_on_demand() -> None:
+    both = wanted_policies(held(), ON)
+    assert both[names.policy_id(ROBOT)] == policy(held(), ON)
+    pods = both[names.pods_policy_id(ROBOT)]["spec"]
+    assert pods["policyTypes"] == ["Egress"]
+    assert pods["podSelector"] == rules()[1]["from"][0]["podSelector"]
+    to_proxies, to_pods, to_dns = pods["egress"]
+    proxy = manifests.proxy_pod(site(rosproxy(), node()), ON)
+    selected = to_proxies["to"][0]["podSelector"]["matchLabels"]
+    assert selected.items() <= proxy["metadata"]["labels"].items()
+    assert to_pods == {"to": [{"podSelector": pods["podSelector"]}]}
+    assert {(one["protocol"], one["port"]) for one in to_dns["ports"]} == {("UDP", 53), ("TCP", 53)}
+    assert list(wanted_policies(rosproxy(direction="both"), ON)) == [names.policy_id(ROBOT)]
+    assert wanted_policies(held(), SETTINGS) == {}
+
+
+def seen_policies(of: RosProxy) -> dict[Name, ProxyPolicy]:
+    """What is there once all policies of a RosProxy have been made."""
+    found = (
+        objects.policy({**body, "metadata": {**body["metadata"], "uid": f"uid-{name}"}})
+        for name, body in wanted_policies(of, ON).items()
+    )
+    return {one.id: one for one in found if one}
+
+
+def test_the_pods_policy_is_made_and_goes_when_it_is_not_asked_for_any_more() -> None:
+    seen = replace(complete(policies=there()), rosproxies=(held(),))
+    made = [one for one in done(look(seen)) if isinstance(one, CreatePolicy)]
+    assert [one.body["metadata"]["name"] for one in made] == ["rosproxy-robot.pods"]
+    all_there = replace(complete(policies=seen_policies(held())), rosproxies=(rosproxy(),))
+    (deleted,) = [one for one in done(look(all_there)) if isinstance(one, DeletePolicy)]
+    assert deleted.id == names.pods_policy_id(ROBOT)

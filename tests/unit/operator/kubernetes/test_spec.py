@@ -94,6 +94,18 @@ def test_masters(uri, read):
     assert rosproxy(rosproxy_obj({"master": {"uri": uri}})).spec.master.uri == read
 
 
+def test_directions():
+    def read(**spec):
+        found = rosproxy(rosproxy_obj({"master": {"uri": "http://robot"}, **spec})).spec
+        return found.direction, found.pod_egress
+
+    assert read() == ("out", "any")
+    assert read(direction="Both") == ("both", "any")
+    assert read(direction="Both", podEgress="Proxy") == ("both", "proxy")
+    with pytest.raises(InvalidField, match=r"spec\.podEgress.*direction: Both"):
+        read(podEgress="Proxy")
+
+
 def test_a_masters_address():
     master = {"uri": "http://robot:11311", "address": "192.0.2.7"}
 
@@ -248,7 +260,7 @@ _FIELDS = [
     *("master", "uri", "address", "service", "publish", "ports", "portWindow", "first", "last"),
     *("podSelector", "matchLabels", "matchExpressions", "key", "operator", "values", "advertise"),
     *("nodeSelector", "tolerations", "policy", "slaveControl", "cleanupAfterSeconds", "image"),
-    "dataPlane",
+    *("dataPlane", "direction", "podEgress"),
     *("imagePullSecrets", "resources", "hostAliases", "ip", "hostnames"),
 ]
 _json = st.recursive(

@@ -96,15 +96,17 @@ def find_members(
 def _request(
     container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
 ) -> Member:
-    uri = values.master_uri(container, settings, proxies)
+    labels, uri = container.labels, values.master_uri(container, settings, proxies)
+    networks = values.networks(container, observed, settings.uplink)
     return Member(
         container,
-        Key(uri, values.advertise_host(container.labels, settings)),
-        ports=values.ports(container.labels),
-        networks=values.networks(container, observed, settings.uplink),
-        data_plane=values.data_plane(container.labels),
-        slave_control=values.slave_control(container.labels),
-        policy=values.policy(container.labels),
+        Key(uri, values.advertise_host(labels, settings)),
+        ports=values.ports(labels),
+        networks=networks,
+        data_plane=values.data_plane(labels),
+        direction=values.direction(labels, networks, observed.networks),
+        slave_control=values.slave_control(labels),
+        policy=values.policy(labels),
     )
 
 

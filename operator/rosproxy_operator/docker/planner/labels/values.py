@@ -4,14 +4,14 @@ Each function that reads a label raises UnusableLabel for a value that can't be.
 """
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import get_args
 from urllib.parse import urlsplit
 
 from rosproxy.access.rules import Rule, parse_rules
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.settings import DataPlane, SlaveControl
+from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.problem import bounded
 from rosproxy_operator.docker.planner.labels import bounds
 from rosproxy_operator.docker.planner.model import (
@@ -19,6 +19,7 @@ from rosproxy_operator.docker.planner.model import (
     Container,
     HostState,
     Key,
+    Network,
     PlanSettings,
 )
 from rosproxy_operator.docker.planner.specs import is_proxy_name, master, proxy_name
@@ -29,9 +30,13 @@ PORTS = "rosproxy.ports"
 ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
+DIRECTION = "rosproxy.direction"
 SLAVE_CONTROL = "rosproxy.slave-control"
 POLICY = "rosproxy.policy"
-LABELS = (ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, SLAVE_CONTROL, POLICY)
+LABELS = (
+    *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, DIRECTION),
+    *(SLAVE_CONTROL, POLICY),
+)
 
 ALIAS = "rosproxy"
 """The name under which every proxy is found on the networks of its containers."""
@@ -96,6 +101,25 @@ def data_plane(labels: Labels) -> DataPlane | None:
     raise UnusableLabel(
         f"{named(DATA_PLANE, labels)} is none of {', '.join(planes)}: write {DATA_PLANE}=kernel "
         "for a proxy that lets the kernel forward, or leave it out"
+    )
+
+
+def direction(
+    labels: Labels, joined: Collection[str], networks: Iterable[Network]
+) -> Direction | None:
+    """Who has no route to the other side, or None if the option says.
+
+    Without a label: a container on an internal network has none, of those that it ``joined``.
+    """
+    if DIRECTION not in labels:
+        return "both" if any(one.internal and one.name in joined for one in networks) else None
+    words: tuple[Direction, ...] = get_args(Direction)
+    for word in words:
+        if labels[DIRECTION].strip().lower() == word:
+            return word
+    raise UnusableLabel(
+        f"{named(DIRECTION, labels)} is none of {', '.join(words)}: write {DIRECTION}=both where "
+        "its nodes have no way outwards but the proxy, or leave it out"
     )
 
 

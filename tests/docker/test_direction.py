@@ -1,0 +1,57 @@
+"""Containers whose only way out is their proxy: an internal network, or a label that says so."""
+
+import json
+import time
+
+import pytest
+
+from tests.docker.controller import Controller, the_proxy
+from tests.docker.engine import docker, inspect
+from tests.docker.inside import ENABLE, Inside, unique
+from tests.docker.nodes import LIBRARIES
+from tests.docker.robot import Robot
+from tests.docker.test_proxy_lost import recovered
+from tests.docker.traffic import traffic
+
+CONNECT = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 2)"
+
+
+def told_direction() -> str:
+    """What the proxy has been told."""
+    env = dict(one.split("=", 1) for one in inspect(the_proxy().name)["Config"]["Env"])
+    return env.get("ROSPROXY_DIRECTION", "out")
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_containers_on_an_internal_network_hear_and_are_heard(
+    library: str, controller: Controller, net: Inside, named: Robot
+) -> None:
+    network, service = net.network("--internal"), f"/{unique('far').replace('-', '_')}"
+    with traffic(net, named, network, library) as flow:
+        flow.wait()
+        assert told_direction() == "both"
+        route = flow.listener.run("python3", "-c", CONNECT, named.address, "11311", check=False)
+        assert "Error" in route  # it has no other way
+        named.node("far", library, "serve", "--service", service)
+        try:
+            caller = net.node(network, library, "call", "--service", service)
+            caller.log.wait_for("ask", count=1, verb="reply")
+        finally:
+            named.end("far")
+
+        proxy, lost = the_proxy(), time.time()
+        docker("rm", "--force", proxy.name)
+
+        flow.wait(since=recovered(lost), seconds=40)
+        print(f"docker rm --force, {library}: {flow.gaps(lost)}")
+    assert "Traceback" not in controller.logs()
+
+
+def test_the_label_alone_is_enough(controller: Controller, net: Inside, named: Robot) -> None:
+    with traffic(
+        net, named, net.network(), "roscpp", labels=(ENABLE, "rosproxy.direction=both")
+    ) as flow:
+        flow.wait()
+        assert told_direction() == "both"
+        found = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
+        assert sum(one["connections"] for one in found["stand_ins"]) > 0

@@ -1,0 +1,105 @@
+"""Whose proxies are to carry the way outwards, too: label, option, internal networks."""
+
+from dataclasses import replace
+
+import pytest
+from msgspec import structs
+
+from rosproxy.settings import Direction
+from rosproxy_operator.docker.planner.actions import Create
+from rosproxy_operator.docker.planner.model import Container, Network
+from rosproxy_operator.docker.planner.specs import container_config, proxy_fingerprint
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    APP,
+    ENABLED,
+    IMAGE,
+    KEY,
+    RANGE,
+    SECRET,
+    SETTINGS,
+    UPLINK,
+    container,
+    observed,
+    planned,
+    read_members,
+)
+
+LABEL = "rosproxy.direction"
+CELL = Network("n2", "cell", internal=True)
+PROXY = Create("p", KEY, RANGE, "s")
+
+
+def labelled(name: str, word: str, network: str = "app", state: str = "running") -> Container:
+    return container(name, {**ENABLED, LABEL: word}, [network], state)
+
+
+def inside(name: str) -> Container:
+    return container(name, networks=["cell"])
+
+
+def direction_of(
+    *containers: Container, option: Direction = "out", now: float = 0.0, memory: DockerMemory
+) -> Direction:
+    seen = observed(*containers, networks=[UPLINK, APP, CELL])
+    found = planned(seen, replace(SETTINGS, direction=option), memory, now)
+    made = [one.direction for one in found.actions if isinstance(one, Create)]
+    assert made in ([], [found.desired[0].direction])
+    return found.desired[0].direction
+
+
+@pytest.mark.parametrize(
+    ("containers", "option", "gets"),
+    [
+        ([container("a")], "out", "out"),
+        ([container("a")], "both", "both"),
+        ([labelled("a", "Both ")], "out", "both"),
+        ([labelled("a", "out")], "both", "out"),
+        ([labelled("a", "out"), container("b")], "both", "both"),
+        ([labelled("a", "out"), labelled("b", "both")], "out", "both"),
+        ([inside("a")], "out", "both"),
+        ([inside("a"), container("b")], "out", "both"),
+        ([labelled("a", "out", "cell")], "out", "out"),
+        ([container("a", networks=["app", "cell"])], "out", "both"),
+    ],
+)
+def test_who_asks(containers: list[Container], option: Direction, gets: str) -> None:
+    assert direction_of(*containers, option=option, memory=DockerMemory()) == gets
+
+
+def test_the_network_that_the_label_names_is_what_counts() -> None:
+    """A container on two networks that is to meet its proxy on the one with a route."""
+    labels = {**ENABLED, "rosproxy.network": "app"}
+    on_both = container("a", labels, ["app", "cell"])
+    assert direction_of(on_both, memory=DockerMemory()) == "out"
+
+
+def test_a_direction_that_can_not_be() -> None:
+    members, (problem,) = read_members(observed(labelled("a", "inwards")))
+    assert members == ()
+    assert problem.text.startswith("label rosproxy.direction='inwards' is none of out, both:")
+
+
+def test_who_has_exited_keeps_it_for_the_grace() -> None:
+    """A container that is restarted does not have its proxy made anew twice."""
+    seen = observed(container("a"), labelled("b", "both", state="exited"))
+    first = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    assert first.desired[0].direction == "both"
+    assert first.again_in is not None
+    later = planned(seen, SETTINGS, first.memory, 60.0)
+    assert later.desired[0].direction == "out"
+
+
+@pytest.mark.parametrize("direction", ["out", "both"])
+def test_the_proxy_is_told(direction: Direction) -> None:
+    body = container_config(structs.replace(PROXY, direction=direction), SETTINGS, "t", "")
+    told = [pair for pair in body["Env"] if pair.startswith("ROSPROXY_DIRECTION=")]
+    assert told == ([] if direction == "out" else ["ROSPROXY_DIRECTION=both"])
+
+
+def test_another_direction_makes_a_proxy_anew() -> None:
+    digests = {
+        proxy_fingerprint(structs.replace(PROXY, direction=one), SETTINGS, IMAGE, SECRET)
+        for one in ("out", "both")
+    }
+    assert len(digests) == 2
