@@ -302,3 +302,18 @@ async def test_an_offer_that_can_not_be_had_is_taken_out(
     asked = await rpc(at, "requestTopic", "/node", "/chatter", offers, source=NODE)
     assert offers_heard(robot) == [["TCPROS"]]
     assert asked[2] == ["TCPROS", *at]
+
+
+async def test_who_asks_for_many_takes_no_udpros_from_others(
+    proxy: Proxy, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.standins.udpros.MOST_RELAYS", 4)
+    monkeypatch.setattr("rosproxy.ros1.standins.udpros.MOST_RELAYS_EACH", 3)
+    await node.publish(proxy.master)
+    at = proxy.lease(node)
+    for source, ports in ((OUTSIDE, [40000]), (MASTER, range(40001, 40010))):
+        for port in ports:
+            offer = udp_offer("/chatter", source, port)
+            await rpc(at, "requestTopic", "/ear", "/chatter", [offer], source=source)
+    peers = [row["peer"] for row in proxy.app.status()["udpros"]]
+    assert sorted(peers) == [MASTER] * 3 + [OUTSIDE]

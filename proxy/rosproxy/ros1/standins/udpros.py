@@ -20,6 +20,7 @@ have the topic any more (`sweep`).
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from hashlib import blake2b
 
@@ -42,7 +43,9 @@ from rosproxy.ros1.standins.outside import Outside
 log = logging.getLogger(__name__)
 
 MOST_RELAYS = 256
-"""Relays of one proxy; with one more the oldest goes."""
+MOST_RELAYS_EACH = 64
+"""Relays of one proxy, and of subscribers at one address; with one more the oldest of those that
+have most goes: who asks for many takes none from others."""
 TRIES = 64
 """Ports of the range that are tried for one."""
 
@@ -179,8 +182,7 @@ class UdprosRelays:
         """
         if known := self._open.get(one):
             return known[0].port
-        while len(self._open) >= MOST_RELAYS:
-            self._end(next(iter(self._open)))
+        self._make_room(one.peer)
         for port in ports:
             try:
                 sock = bind(address, port)
@@ -192,6 +194,15 @@ class UdprosRelays:
             log.debug("datagrams of %s at port %d go to %s", one.topic, relay.port, one.target)
             return relay.port
         return None
+
+    def _make_room(self, peer: str) -> None:
+        """End a relay if there are too many of a subscriber's address, or at all."""
+        crowds = Counter(one.peer for one in self._open)
+        if crowds[peer] < MOST_RELAYS_EACH:
+            if len(self._open) < MOST_RELAYS:
+                return
+            peer = crowds.most_common(1)[0][0]
+        self._end(next(one for one in self._open if one.peer == peer))
 
     def _end(self, one: UdprosSubscription) -> None:
         relay, _ = self._open.pop(one, (None, None))
