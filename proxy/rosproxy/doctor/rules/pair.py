@@ -138,15 +138,18 @@ def _why_not_from_inside(
 ) -> tuple[str, str]:
     """Why a subscriber behind the proxy has not come to a publisher that is well."""
     text = f"{giver.name} is fine; {taker.name}, behind the proxy, has not come to"
+    differ = "or their message definitions differ (md5sum)"
+    log = f"look into the log of {taker.name}"
     if facts.proxy.settings.direction == "both":
-        text = f"{text} the proxy's port for {giver.uri}"
-        return text, f"look into the log of {taker.name} and of the proxy; restart {taker.name}"
+        text = f"{text} the proxy's port for {giver.uri}, {differ}"
+        return text, f"{log} and of the proxy; restart {taker.name}"
     where = parse_host_port(address)
     test = f"nc -vz {where.host} {where.port}" if where else f"a connection to {giver.uri}"
     return (
-        f"{text} {address or giver.uri} by itself",
+        f"{text} {address or giver.uri} by itself, {differ}",
         f"where {taker.name} runs: {test}; if there is no route outwards, the proxy can be the "
-        "way: --direction both (label rosproxy.direction=both, spec.direction: Both)",
+        "way: --direction both (label rosproxy.direction=both, spec.direction: Both); else "
+        f"{log}",
     )
 
 
