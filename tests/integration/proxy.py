@@ -7,6 +7,7 @@ from typing import Any
 from examples.demo.fake_http import Where, free_ports, where
 from examples.demo.fake_node import FakeNode
 from rosproxy.app import App
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.settings import Settings
@@ -24,7 +25,10 @@ def options_for(**options: Any) -> dict[str, Any]:
     ``publish_master`` may be True: on a free port.
     """
     count = options.pop("ports", PORTS)
+    own = PortRange(*map(int, str(options.get("port_range", "0-0")).split("-")))
     first = free_ports(count + 3)
+    while first <= own.last and own.first < first + count + 3:  # a former proxy's, free by now
+        first = free_ports(count + 3)
     if options.get("publish_master") is True:
         options["publish_master"] = first + count + 2
     return {
