@@ -22,8 +22,9 @@ from rosproxy.net.addresses import HostPort, Network, parse_host_port
 MEBIBYTE = 1024 * 1024
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
-Direction = Literal["out", "both"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
+Direction = Literal["out", "both"]
+"""Who reaches the other side through the proxy: outside alone, or the nodes inside, too."""
 SlaveControl = Literal["any", "master"]
 """Who may call shutdown, publisherUpdate and paramUpdate at inside nodes."""
 

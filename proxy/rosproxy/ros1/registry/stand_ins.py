@@ -99,8 +99,7 @@ class StandIns:
         seed = int.from_bytes(blake2b(uri.encode(), digest_size=8).digest(), "big")
         for number in range(TRIES):
             port = PORTS[(seed + number * number) % len(PORTS)]
-            if obstacle(port, self._settings) is None:
-                yield StandIn(HostPort(address, port), uri, where, kept=False)
+            yield StandIn(HostPort(address, port), uri, where, kept=False)
 
     def address(self, towards: str) -> str:
         """Where stand-ins listen for a node inside that sees the proxy at an address.

@@ -5,7 +5,7 @@ Each function that reads a label raises UnusableLabel for a value that can't be.
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from typing import get_args
+from typing import TypeVar, get_args
 from urllib.parse import urlsplit
 
 from rosproxy.access.rules import Rule, parse_rules
@@ -50,6 +50,7 @@ _PATH = re.compile(r"[\w./~%-]*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_.-]{0,252}[A-Za-z0-9_.])?")
 
 Labels = Mapping[str, str]
+_Word = TypeVar("_Word", bound=str)
 
 
 class UnusableLabel(Exception):
@@ -92,16 +93,8 @@ def ports(labels: Labels) -> int:
 
 def data_plane(labels: Labels) -> DataPlane | None:
     """One of the proxy's data planes, or None."""
-    if DATA_PLANE not in labels:
-        return None
-    planes: tuple[DataPlane, ...] = get_args(DataPlane)
-    for plane in planes:
-        if labels[DATA_PLANE].strip().lower() == plane:
-            return plane
-    raise UnusableLabel(
-        f"{named(DATA_PLANE, labels)} is none of {', '.join(planes)}: write {DATA_PLANE}=kernel "
-        "for a proxy that lets the kernel forward, or leave it out"
-    )
+    fix = "kernel for a proxy that lets the kernel forward, or leave it out"
+    return _word(DATA_PLANE, labels, get_args(DataPlane), fix)
 
 
 def direction(
@@ -113,28 +106,14 @@ def direction(
     """
     if DIRECTION not in labels:
         return "both" if any(one.internal and one.name in joined for one in networks) else None
-    words: tuple[Direction, ...] = get_args(Direction)
-    for word in words:
-        if labels[DIRECTION].strip().lower() == word:
-            return word
-    raise UnusableLabel(
-        f"{named(DIRECTION, labels)} is none of {', '.join(words)}: write {DIRECTION}=both where "
-        "its nodes have no way outwards but the proxy, or leave it out"
-    )
+    fix = "both where its nodes have no way outwards but the proxy, or leave it out"
+    return _word(DIRECTION, labels, get_args(Direction), fix)
 
 
 def slave_control(labels: Labels) -> SlaveControl | None:
     """Who may call what controls a node, or None."""
-    if SLAVE_CONTROL not in labels:
-        return None
-    words: tuple[SlaveControl, ...] = get_args(SlaveControl)
-    for word in words:
-        if labels[SLAVE_CONTROL].strip().lower() == word:
-            return word
-    raise UnusableLabel(
-        f"{named(SLAVE_CONTROL, labels)} is none of {', '.join(words)}: write {SLAVE_CONTROL}="
-        "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
-    )
+    fix = "master to keep shutdown, publisherUpdate and paramUpdate to the master, or leave it out"
+    return _word(SLAVE_CONTROL, labels, get_args(SlaveControl), fix)
 
 
 def policy(labels: Labels) -> tuple[Rule, ...]:
@@ -173,6 +152,18 @@ def networks(container: Container, observed: HostState, uplink: str) -> frozense
     if not own:
         raise UnusableLabel(_why_none(owner))
     return own
+
+
+def _word(label: str, labels: Labels, words: tuple[_Word, ...], fix: str) -> _Word | None:
+    """The one of some words that a label says, None without the label; ``fix`` begins with one."""
+    if label not in labels:
+        return None
+    for word in words:
+        if labels[label].strip().lower() == word:
+            return word
+    raise UnusableLabel(
+        f"{named(label, labels)} is none of {', '.join(words)}: write {label}={fix}"
+    )
 
 
 def _host(source: str, value: str) -> str:
