@@ -7,7 +7,7 @@ from xmlrpc.client import Binary
 
 import pytest
 
-from examples.demo.fake_http import Where, value, where
+from examples.demo.fake_http import value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
@@ -32,6 +32,7 @@ from tests.integration.net import (
     xml,
 )
 from tests.integration.proxy import Proxy
+from tests.integration.ros1.test_alias import WAYS, look_up, look_up_service
 
 BOTH_LOOPS = True
 
@@ -59,46 +60,6 @@ async def robot(make_node: MakeNode, master: FakeMaster) -> FakeNode:
 def stand_ins(proxy: Proxy) -> dict[str, int]:
     """What is stood in for, with the open connections."""
     return {row["uri"]: row["connections"] for row in proxy.app.status()["stand_ins"]}
-
-
-def master_of(proxy: Proxy) -> Where:
-    return where(proxy.settings.master_uri)
-
-
-async def look_up(proxy: Proxy, node: FakeNode) -> str:
-    """A node's slave URI as inside is given it."""
-    found = (await rpc(proxy.master, "lookupNode", "/tool", node.name, source=NODE))[2]
-    assert isinstance(found, str)
-    return found
-
-
-async def look_up_service(proxy: Proxy) -> str:
-    found = (await rpc(proxy.master, "lookupService", "/tool", "/add", source=NODE))[2]
-    assert isinstance(found, str)
-    return found
-
-
-async def by_subscribing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
-    return (await node.subscribe(proxy.master))[2][0]
-
-
-async def by_publishing(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
-    await robot.subscribe(master_of(proxy))
-    return (await node.publish(proxy.master))[2][0]
-
-
-async def by_lookup(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
-    return await look_up(proxy, robot)
-
-
-async def by_update(proxy: Proxy, robot: FakeNode, node: FakeNode) -> Any:
-    await node.subscribe(proxy.master, "/later")
-    await robot.publish(master_of(proxy), "/later")
-    await until(lambda: node.updates("/later"), "a publisherUpdate")
-    return node.updates("/later")[0][0]
-
-
-WAYS = [by_subscribing, by_publishing, by_lookup, by_update]
 
 
 @pytest.mark.parametrize("way", WAYS)
