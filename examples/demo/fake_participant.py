@@ -1,0 +1,250 @@
+"""A small participant of DDS, which is what a node of ROS 2 is: discovery, and a reliable topic.
+
+Each second it announces itself where it is told to (SPDP). Whoever hears that answers in the same
+way; then each tells the other of its writers and readers (SEDP), and where topic and type are the
+same on both sides, samples go from the one to the other. All goes to the addresses that the other
+one gives in its announcements, its *locators*. Of these it has two, a socket for each: one for
+discovery, one for what users send.
+
+It talks with any DDS in this way. What it lacks of one: liveliness, fragments, descriptions of
+types, the names of nodes; and it forgets nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from math import inf
+from time import monotonic
+
+from examples.demo.reliable_topics import ReliableReader, ReliableWriter
+from examples.demo.rtps_messages import VENDOR, Told, data, message, parameter_list, string, told
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import (
+    VERSION,
+    RtpsError,
+    SubmessageId,
+    destination,
+    samples,
+    source_prefix,
+)
+from rosproxy.ros2.registry.participants import EndpointKind
+from rosproxy.ros2.rewriting.discovery import Announcement, BuiltinWriter, read_discovery
+
+ANNOUNCE_INTERVAL = 1.0
+"""Seconds between announcements; Fast DDS takes three."""
+HEARTBEAT_INTERVAL = 0.1
+LEASE = 100
+"""Seconds for which others remember it unheard: what DDS has where nothing is said (9.6.3.2)."""
+ANYBODY = bytes(12)
+PARTICIPANT, SPDP_READER = 0x000001C1, 0x000100C7
+WRITER, READER = 0x00000103, 0x00000104
+"""The entity id of the writer or reader that it may have; they have no key (9.3.1.2)."""
+TO_READER = 5
+"""From the entity id of a writer of SEDP to that of its reader."""
+BUILT_IN = {BuiltinWriter.PUBLICATIONS: (0x04, 0x08), BuiltinWriter.SUBSCRIPTIONS: (0x10, 0x20)}
+"""The bits that say whether a participant has a writer of SEDP, and its reader (9.3.2.12)."""
+RELIABILITY, RELIABLE = 0x1A, struct.pack("<IiI", 2, 0, 0)
+"""The one quality of service that isn't what DDS has where nothing is said."""
+STRING_TYPE = "std_msgs::msg::dds_::String_"
+
+
+@dataclass
+class DdsPeer:
+    """Another participant: its locators for discovery and for users, and when it was heard."""
+
+    discovery: HostPort
+    user: HostPort
+    heard: float
+
+
+class FakeParticipant(asyncio.DatagramProtocol):
+    """A participant at an address; see the module. `start` it in a running event loop.
+
+    `admits` tells of a datagram's source whether it is let in; `turned_away` counts the others.
+    `peers` are those that it has heard of, by prefix; `locators` are its own, for discovery and for
+    users.
+    """
+
+    def __init__(self, name: str, address: str, topic: str) -> None:
+        self.name, self.address = name, address
+        self.prefix = VENDOR + os.urandom(10)
+        self.dds_topic = f"rt{topic}"
+        self.admits: Callable[[str], bool] = lambda _peer: True
+        self.turned_away = 0
+        self.peers: dict[bytes, DdsPeer] = {}
+        self.writers = {one.value: ReliableWriter(one, durable=True) for one in BUILT_IN}
+        self.readers = {one + TO_READER: ReliableReader(one + TO_READER) for one in BUILT_IN}
+        self.locators: list[HostPort] = []
+        self._announced_to: list[HostPort] = []
+        self._own_locators: dict[bytes, HostPort] = {}
+        self._sockets: list[asyncio.DatagramTransport] = []
+        self._ticking: asyncio.Task[None] | None = None
+
+    @property
+    def listening(self) -> bool:
+        """Whether it is there."""
+        return bool(self._sockets)
+
+    async def start(self) -> None:
+        """Open both sockets."""
+        loop = asyncio.get_running_loop()
+        for _ in range(2):
+            where = (self.address, 0)
+            transport, _ = await loop.create_datagram_endpoint(lambda: self, where)
+            self._sockets.append(transport)
+            self.locators.append(HostPort(*transport.get_extra_info("sockname")))
+        self._ticking = asyncio.create_task(self._tick())
+
+    async def stop(self) -> None:
+        """End, without a word to anybody."""
+        if self._ticking:
+            self._ticking.cancel()
+            await asyncio.gather(self._ticking, return_exceptions=True)
+        for transport in self._sockets:
+            transport.close()
+        self._sockets.clear()
+
+    def announce_to(self, to: list[HostPort]) -> None:
+        """Announce itself there from now on, and nowhere else."""
+        self._announced_to = to
+        self._announce(to)
+
+    def describe(self, entity: int, by: BuiltinWriter) -> None:
+        """Tell all others of the one writer or reader that it has."""
+        held = [
+            (Pid.ENDPOINT_GUID, self._guid(entity)),
+            (Pid.TOPIC_NAME, string(self.dds_topic)),
+            (Pid.TYPE_NAME, string(STRING_TYPE)),
+            (RELIABILITY, RELIABLE),
+        ]
+        self.writers[by].write(parameter_list(held))
+
+    def publish(self, payload: bytes) -> None:
+        """Write a sample, and send it to all readers."""
+        writer = self.writers[WRITER]
+        writer.write(payload)
+        for reader in writer.acknowledged:
+            parts = writer.sample(reader, writer.last), writer.heartbeat(reader)
+            self._send_to(reader, *parts)
+
+    def hear(self, payload: bytes) -> None:
+        """Take in a sample of its topic."""
+
+    def datagram_received(self, datagram: bytes, sender: tuple[str, int]) -> None:
+        """Take in what comes to either socket."""
+        if not self.admits(sender[0]):
+            self.turned_away += 1
+            return
+        with suppress(RtpsError, struct.error, UnicodeDecodeError):
+            if destination(datagram) in (None, self.prefix):
+                self._take(datagram, source_prefix(datagram))
+
+    def _announce(self, to: list[HostPort], meant: bytes = ANYBODY) -> None:
+        discovery, user = (pack_locator(one, "<") for one in self.locators)
+        held = parameter_list(
+            [
+                (Pid.PROTOCOL_VERSION, VERSION),
+                (Pid.VENDOR_ID, VENDOR),
+                (Pid.PARTICIPANT_GUID, self._guid(PARTICIPANT)),
+                (Pid.METATRAFFIC_UNICAST_LOCATOR, discovery),
+                (Pid.DEFAULT_UNICAST_LOCATOR, user),
+                (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", LEASE, 0)),
+                (Pid.BUILTIN_ENDPOINT_SET, struct.pack("<I", 0x3F)),
+            ]
+        )
+        spdp = data(SPDP_READER, BuiltinWriter.PARTICIPANTS, 1, held)
+        for one in to:
+            self._send(one, meant, spdp)
+
+    def _take(self, datagram: bytes, prefix: bytes) -> None:
+        for announced in read_discovery(datagram).announcements:
+            if announced.writer is BuiltinWriter.PARTICIPANTS:
+                self._meet(prefix, announced, datagram)
+            elif prefix in self.peers:
+                self._match(prefix, announced, datagram)
+        for sample in samples(datagram):
+            writer = prefix + sample.writer.to_bytes(4, "big")
+            for reader in self.readers.values():
+                taken = reader.take(writer, sample.sequence)
+                if taken and sample.payload and reader.entity == READER:
+                    self.hear(datagram[sample.payload.start : sample.payload.end])
+        for one in told(datagram):
+            self._heed(prefix, one)
+
+    def _meet(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
+        """Take in what a participant announces of itself; answer it if it is new."""
+        found = dict(reversed([*announced.reached_at(datagram)]))
+        discovery = found.get(Pid.METATRAFFIC_UNICAST_LOCATOR)
+        if discovery is None:
+            return
+        if prefix not in self.peers:
+            self._announce([discovery], prefix)
+        user = found.get(Pid.DEFAULT_UNICAST_LOCATOR, discovery)
+        self.peers[prefix] = DdsPeer(discovery, user, monotonic())
+        has = announced.held.number(datagram, Pid.BUILTIN_ENDPOINT_SET) or 0
+        for writer, (has_writer, has_reader) in BUILT_IN.items():
+            if has & has_writer:
+                self.readers[writer + TO_READER].match(prefix + writer.to_bytes(4, "big"))
+            if has & has_reader:
+                self.writers[writer].match(prefix + (writer + TO_READER).to_bytes(4, "big"))
+
+    def _match(self, prefix: bytes, announced: Announcement, datagram: bytes) -> None:
+        """Take in what a participant says of a reader or writer of its own."""
+        entity = announced.endpoint(datagram)
+        type_name = announced.held.text(datagram, Pid.TYPE_NAME)
+        if not entity or (announced.topic(datagram), type_name) != (self.dds_topic, STRING_TYPE):
+            return
+        guid = prefix + entity
+        for _, where in reversed([*announced.reached_at(datagram)]):
+            self._own_locators[guid] = where
+        if announced.kind is EndpointKind.READER and WRITER in self.writers:
+            self.writers[WRITER].match(guid)
+        if announced.kind is EndpointKind.WRITER and READER in self.readers:
+            self.readers[READER].match(guid)
+
+    def _heed(self, prefix: bytes, one: Told) -> None:
+        """Take in a heartbeat or a gap for a reader, or an ACKNACK for a writer."""
+        if one.kind == SubmessageId.ACKNACK:
+            guid = prefix + one.reader.to_bytes(4, "big")
+            if one.writer in self.writers and (again := self.writers[one.writer].heed(guid, one)):
+                self._send_to(guid, *again)
+            return
+        guid = prefix + one.writer.to_bytes(4, "big")
+        for reader in self.readers.values():
+            if guid in reader.expected:
+                is_gap = one.kind == SubmessageId.GAP
+                reader.skip(guid, *((one.first, one.last) if is_gap else (1, one.first - 1)))
+                if one.asks:
+                    self._send_to(guid, reader.answer(guid, one.last))
+
+    async def _tick(self) -> None:
+        announced = -inf
+        while True:
+            if monotonic() - announced >= ANNOUNCE_INTERVAL:
+                announced = monotonic()
+                self._announce(self._announced_to)
+            for writer in self.writers.values():
+                for reader, got in writer.acknowledged.items():
+                    if got < writer.last:
+                        self._send_to(reader, writer.heartbeat(reader))
+            await asyncio.sleep(HEARTBEAT_INTERVAL)
+
+    def _guid(self, entity: int) -> bytes:
+        return self.prefix + entity.to_bytes(4, "big")
+
+    def _send_to(self, guid: bytes, *parts: bytes) -> None:
+        """Send to a reader or writer, where it says itself that it is, or its participant."""
+        peer = self.peers[guid[:12]]
+        is_built_in = guid[15] & 0xC0 == 0xC0
+        usual = peer.discovery if is_built_in else peer.user
+        self._send(self._own_locators.get(guid, usual), guid[:12], *parts)
+
+    def _send(self, to: HostPort, meant: bytes, *parts: bytes) -> None:
+        self._sockets[0].sendto(message(self.prefix, meant, *parts), (to.host, to.port))

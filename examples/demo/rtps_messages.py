@@ -1,0 +1,133 @@
+"""RTPS as the demonstration's participants write it, and what of it the proxy has no need to read.
+
+A message is for one participant, and is a row of submessages: samples (DATA), what a writer has
+(HEARTBEAT), and what a reader has got and lacks (ACKNACK). Those who announce themselves write a
+list of parameters as their sample, the talkers a `std_msgs/String`. Layouts and names are
+DDSI-RTPS 2.5's, 8.3 and 9.4; all numbers are little-endian. The rest of reading, locators too, are
+`rosproxy.ros2.protocol`'s.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from rosproxy.ros2.protocol.rtps import MAGIC, SENTINEL, VERSION, SubmessageId, submessages
+
+VENDOR = b"\x01\xff"
+"""The id of an implementation that OMG's list does not have."""
+MOST_ASKED = 32
+"""Samples that an ACKNACK asks for at once: one word of bits; there may be eight (9.4.2.6)."""
+_LITTLE, _FINAL, _PAYLOAD = 0x01, 0x02, 0x04
+_CDR, _PARAMETER_LIST = b"\x00\x01\x00\x00", b"\x00\x03\x00\x00"
+"""How a payload is encoded: CDR_LE, PL_CDR_LE."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a submessage tells a reader of a writer, or a writer of a reader.
+
+    A heartbeat: the first and the last number that there are; `asks`: it wants an answer. A gap:
+    the numbers from `first` to `last` are for nobody. An ACKNACK: all before `first` have been got,
+    `missing` are asked for.
+    """
+
+    kind: int
+    reader: int
+    writer: int
+    first: int
+    last: int = 0
+    asks: bool = False
+    missing: tuple[int, ...] = ()
+
+
+def message(prefix: bytes, to: bytes, *parts: bytes) -> bytes:
+    """A message of a participant's for the one with the prefix `to`: bytes(12) for anybody."""
+    meant = _submessage(SubmessageId.INFO_DST, 0, to)
+    return MAGIC + VERSION + VENDOR + prefix + meant + b"".join(parts)
+
+
+def data(reader: int, writer: int, sequence: int, payload: bytes) -> bytes:
+    """A sample; with reader 0 for all of them."""
+    body = struct.pack("<HH", 0, 16) + struct.pack(">II", reader, writer) + _number(sequence)
+    return _submessage(SubmessageId.DATA, _PAYLOAD, body + payload)
+
+
+def heartbeat(reader: int, writer: int, first: int, last: int, count: int) -> bytes:
+    """Which samples a writer has: none if `first` is greater than `last`. It wants an answer."""
+    body = struct.pack(">II", reader, writer) + _number(first) + _number(last)
+    return _submessage(SubmessageId.HEARTBEAT, 0, body + struct.pack("<i", count))
+
+
+def acknack(reader: int, writer: int, base: int, missing: range, count: int) -> bytes:
+    """That a reader has all samples before `base` and lacks those from there on; no answer."""
+    bits = min(len(missing), MOST_ASKED)
+    word = 2**MOST_ASKED - 2 ** (MOST_ASKED - bits)  # the first one is the highest bit
+    asked = struct.pack("<II", bits, word) if bits else struct.pack("<I", 0)
+    body = struct.pack(">II", reader, writer) + _number(base) + asked
+    return _submessage(SubmessageId.ACKNACK, _FINAL, body + struct.pack("<i", count))
+
+
+def told(datagram: bytes) -> Iterator[Told]:
+    """All heartbeats, gaps and ACKNACKs in a message. Raises RtpsError, or struct.error."""
+    for kind, flags, body in submessages(datagram):
+        if kind not in (SubmessageId.HEARTBEAT, SubmessageId.GAP, SubmessageId.ACKNACK):
+            continue
+        mark = "<" if flags & _LITTLE else ">"
+        reader, writer = struct.unpack_from(">II", datagram, body.start)
+        (first, *more) = _numbers(mark, datagram[body.start + 8 : body.end])
+        if kind == SubmessageId.HEARTBEAT:
+            yield Told(kind, reader, writer, first, more[0], asks=not flags & _FINAL)
+        elif kind == SubmessageId.GAP:
+            yield Told(kind, reader, writer, first, more[0] - 1)
+        else:
+            missing = _missing(mark, datagram[body.start + 8 : body.end])
+            yield Told(kind, reader, writer, first, missing=missing)
+
+
+def parameter_list(parameters: Iterable[tuple[int, bytes]]) -> bytes:
+    """A payload of discovery."""
+    padded = ((pid, value + bytes(-len(value) % 4)) for pid, value in parameters)
+    held = b"".join(struct.pack("<HH", pid, len(value)) + value for pid, value in padded)
+    return _PARAMETER_LIST + held + struct.pack("<HH", SENTINEL, 0)
+
+
+def string(text: str) -> bytes:
+    """A string of CDR."""
+    held = text.encode() + b"\0"
+    return struct.pack("<I", len(held)) + held
+
+
+def pack_string(text: str) -> bytes:
+    """A `std_msgs/String` as a payload."""
+    return _CDR + string(text)
+
+
+def unpack_string(payload: bytes) -> str:
+    """The text of a `std_msgs/String`. Raises struct.error, UnicodeDecodeError."""
+    (size,) = struct.unpack_from("<I" if payload[1] & 1 else ">I", payload, 4)
+    return payload[8 : 8 + size].rstrip(b"\0").decode()
+
+
+def _submessage(kind: int, flags: int, body: bytes) -> bytes:
+    body += bytes(-len(body) % 4)  # the next one begins at a multiple of four
+    return struct.pack("<BBH", kind, flags | _LITTLE, len(body)) + body
+
+
+def _number(value: int) -> bytes:
+    return struct.pack("<iI", value >> 32, value & 0xFFFFFFFF)
+
+
+def _numbers(mark: str, body: bytes) -> list[int]:
+    """The sequence numbers in a row of them, as many as there may be."""
+    whole = struct.iter_unpack(mark + "iI", body[: len(body) // 8 * 8])
+    return [(high << 32) + low for high, low in whole]
+
+
+def _missing(mark: str, numbers: bytes) -> tuple[int, ...]:
+    """The members of a set of sequence numbers: the first that may be one, and a bit for each."""
+    (base,) = _numbers(mark, numbers[:8])
+    (bits,) = struct.unpack_from(mark + "I", numbers, 8)
+    words = struct.unpack_from(f"{mark}{-(-bits // 32)}I", numbers, 12)
+    return tuple(base + bit for bit in range(bits) if words[bit // 32] >> (31 - bit % 32) & 1)

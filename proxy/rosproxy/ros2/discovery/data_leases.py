@@ -1,0 +1,105 @@
+"""Which ports of the range the kernel may forward, and to which locators: those of user data.
+
+Metatraffic is read and rewritten, so that it stays in user space; what arrives at a lease of user
+data goes to one locator, whatever it is. Whoever had a port before the proxy started has it here
+until it is given to somebody, or until nobody is left who could claim it: meanwhile the kernel goes
+on forwarding as the former process had told it to.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from rosproxy.leases.ports import PortPool
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.registry.participants import LeaseKind
+
+
+@dataclass(eq=False, slots=True)
+class ForwardedLease:
+    """A port and the locator that it leads to, as `rosproxy.leases.fast_ports.Holder`.
+
+    Nothing tells by itself whether a locator is answered. ``fast_peers`` stays empty: datagrams
+    have no connections.
+    """
+
+    port: int
+    where: HostPort
+    label: str
+    fast_port: int | None = None
+    fast_peers: Mapping[str, int] = field(default_factory=dict)
+    inside: bool = True
+    trusted: bool = True
+    is_down: bool = False
+    fast_connections: int = 0
+
+    def __post_init__(self) -> None:
+        """The port is its own fast port: user space and the kernel share it."""
+        self.fast_port = self.port
+
+    @property
+    def address(self) -> str:
+        """The IP address at which the proxy reaches the participant."""
+        return self.where.host
+
+    @property
+    def node_ports(self) -> tuple[int]:
+        """The port of the locator."""
+        return (self.where.port,)
+
+    @property
+    def caller_ids(self) -> list[str]:
+        """What its bytes are counted under."""
+        return [self.label]
+
+
+class DataLeases:
+    """The leases of user data of all domains, as `rosproxy.leases.fast_ports.Holders`.
+
+    ``domains`` are those inside of each; ``pool`` are the ports of all.
+    """
+
+    def __init__(self, pool: PortPool) -> None:
+        self.pool = pool
+        self.domains: list[InsideParticipants] = []
+        self._former: dict[int, ForwardedLease] = {}
+        self._held: dict[int, ForwardedLease] = {}
+        self._seen = -1
+
+    @property
+    def by_port(self) -> Mapping[int, ForwardedLease]:
+        """All of them by their ports."""
+        seen = sum(inside.changes for inside in self.domains)
+        if seen != self._seen:
+            self._seen = seen
+            self._held = {lease.port: lease for lease in self._leases()}
+            given = {port for inside in self.domains for port in inside.leases}
+            for port in given & self._former.keys():
+                del self._former[port]
+            self._held |= self._former
+        return self._held
+
+    def __iter__(self) -> Iterator[ForwardedLease]:
+        """All of them."""
+        return iter(list(self.by_port.values()))
+
+    def note_former(self, forwards: Mapping[int, HostPort]) -> None:
+        """Note what a former process had the kernel forward; with nothing: forget it."""
+        self._former = {
+            port: ForwardedLease(port, where, "a participant of before the start")
+            for port, where in forwards.items()
+        }
+        self._seen = -1
+
+    def _leases(self) -> Iterator[ForwardedLease]:
+        """Those that are given, each as the same object for as long as it leads to the same."""
+        for inside in self.domains:
+            for port, (participant, lease) in inside.leases.items():
+                if lease.kind is not LeaseKind.DATA:
+                    continue
+                label = f"{participant.guid_prefix} at {participant.address}"
+                known = self._held.get(port)
+                if known is not None and (known.where, known.label) == (lease.where, label):
+                    yield known
+                else:
+                    yield ForwardedLease(port, lease.where, label)

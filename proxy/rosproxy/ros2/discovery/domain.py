@@ -1,0 +1,390 @@
+"""One DDS domain: what the proxy does with each datagram of discovery, and with the time.
+
+Participants inside announce themselves to a multicast group, or to the well-known port of a peer
+(SPDP). The proxy hears that, gives every locator of theirs a port of the range, and tells outside
+of the participant with these in place of its own. Where outside answers, at a port of the range
+that stands for a locator of metatraffic, its announcement goes on to the participant inside, led to
+a port of the proxy's that stands for outside's metatraffic (its *stand-in*): so that all of
+discovery passes the proxy, both ways, and can be rewritten. What users send passes without being
+read: to inside through the range, to outside without the proxy.
+
+Nothing here does I/O: each method takes a datagram, where it came from and the time, and gives the
+datagrams to send. Which ports have to be open is told by `leases` and `stand_ins` after each.
+
+Every datagram may be forged. So
+
+- a participant inside is one whose address is inside, and only locators at that very address get a
+  lease: no announcement makes the proxy a way to another host;
+- a prefix that somebody alive has, at another address or on the other side, is nobody else's;
+- a participant outside is one whose address is a peer's, or that the ear has heard from there, and
+  only its locators at the address that it sent from are used;
+- until one outside has shown that it gets what it is sent (it names the prefix of whom it answers),
+  it is sent no more bytes than came from it: nobody can have the proxy flood somebody else;
+- each source may make so much discovery in a second, what it leads to included.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from functools import partial
+
+from rosproxy.leases.ports import PortPool
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Outgoing, Refused, sent_to
+from rosproxy.ros2.discovery.fragments import FragmentStores
+from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.discovery.observer import Observer
+from rosproxy.ros2.discovery.outside import OutsideParticipants
+from rosproxy.ros2.discovery.own import OwnParticipants
+from rosproxy.ros2.discovery.partings import Partings
+from rosproxy.ros2.discovery.policing import has_changed
+from rosproxy.ros2.discovery.rates import DiscoveryRates
+from rosproxy.ros2.discovery.returning import Returning
+from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE, farewell
+from rosproxy.ros2.protocol.envelope import unwrapped
+from rosproxy.ros2.protocol.rtps import (
+    MAGIC,
+    NO_VENDOR,
+    RtpsError,
+    by_source,
+    for_all,
+    source_vendor,
+)
+from rosproxy.ros2.registry.participants import (
+    InsideParticipant,
+    Lease,
+    LeaseKind,
+    OutsideParticipant,
+)
+from rosproxy.ros2.registry.ports import LocatorPorts
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery
+
+ANNOUNCED_AGAIN = 0.5
+"""Seconds in which outside is told the same announcement once."""
+
+_Passing = tuple[list[bytes], list[Outgoing]]
+"""Datagrams that go on, and what goes back to where they came from."""
+
+
+@dataclass(slots=True)
+class Domain:
+    """The participants of one domain, and what is done with their datagrams.
+
+    ``own`` are the proxy's own participants. ``passed`` are the bytes that were passed on, to
+    inside or not.
+    """
+
+    settings: DomainSettings
+    ports: LocatorPorts
+    own: OwnParticipants
+    inside: InsideParticipants
+    outside: OutsideParticipants
+    returning: Returning
+    refused: Refused
+    fragments: FragmentStores
+    partings: Partings
+    rates: DiscoveryRates = field(default_factory=DiscoveryRates)
+    passed: Counter[tuple[LeaseKind, bool]] = field(default_factory=Counter)
+
+    @classmethod
+    def starting(
+        cls, settings: DomainSettings, pool: PortPool, own: bytes, now: float, when: float = 0.0
+    ) -> "Domain":
+        """A domain without participants; its discovery port is taken off the pool.
+
+        ``own`` is a random prefix, ``when`` Unix time.
+        """
+        pool.claim(settings.discovery_port)
+        ports, refused = LocatorPorts(pool, now), Refused(settings.note)
+        keeper = Keeper.of(settings.host, settings.ports.listen, settings.number, when)
+        inside = InsideParticipants(settings, ports, refused)
+        outside = OutsideParticipants(settings, refused)
+        returning, fragments = Returning(settings, ports, keeper), FragmentStores()
+        own_ones = OwnParticipants(
+            settings, Observer(own), keeper, inside, outside, returning, fragments
+        )
+        partings = Partings(settings, outside)
+        return cls(
+            settings, ports, own_ones, inside, outside, returning, refused, fragments, partings
+        )
+
+    def is_kept(self, one: InsideParticipant) -> bool:
+        """Whether a participant inside keeps all the ports that it has, for the next process."""
+        return self.own.keeper.keeps(one.prefix, one.ports)
+
+    def heard_inside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        """What came to the group on an inside network, or to the well-known port, from inside."""
+        if self._is_too_much(datagram, source, now):
+            return []
+        sent = list[Outgoing]()
+        try:
+            for message in map(read_discovery, by_source(datagram)):
+                sent += self._heard_inside(message, source, now)
+        except RtpsError as error:
+            sent += self._drop("malformed", source, str(error))
+        self.rates.charge(source, len(sent))
+        return sent
+
+    def heard_outside(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        """What came to the discovery port.
+
+        Participants announce themselves there, if the ear has heard them or they are a peer's; and
+        those that are known answer the observer.
+        """
+        heard_by_ear = self.settings.ear is not None and source == self.settings.ear.host
+        sent = list[Outgoing]()
+        try:
+            if is_wrapped := heard_by_ear and not datagram.startswith(MAGIC):
+                source, datagram = unwrapped(datagram)
+                self.partings.ear_heard = True
+            if not heard_by_ear and self.outside.is_strange(source):
+                return []
+            if self._is_too_much(datagram, source, now):
+                return []
+            for message in map(read_discovery, by_source(datagram)):
+                if is_wrapped and message.of_participant is None:
+                    raise RtpsError("the ear carries announcements of participants alone")
+                sent += self._heard_outside(message, source, heard_by_ear, now)
+        except RtpsError as error:
+            sent += self._drop("malformed", source, str(error))
+        self.rates.charge(source, len(sent))
+        return sent
+
+    def at_lease(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        """What outside sends to a port of the range."""
+        found = self.inside.leases.get(port)
+        try:
+            if found is None:
+                if self.ports.remembers(now) and not self._is_too_much(datagram, source, now):
+                    self.ports.note_use(port, datagram, now)
+                return []
+            inside, lease = found
+            if lease.kind is LeaseKind.DATA:
+                return [self._passed(lease, datagram, True)]
+            if self.outside.is_strange(source) or self._is_too_much(datagram, source, now):
+                return []
+            imported = partial(self._imported, port, source, inside, now)
+            passed, back = _each(datagram, imported)
+        except RtpsError as error:
+            return self._drop("malformed", source, str(error))
+        return [self._passed(lease, one, True) for one in passed] + back
+
+    def at_stand_in(self, port: int, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        """What inside sends to a port that stands for locators outside."""
+        users = list(self.outside.stand_ins.get(port, ()))
+        passed, back = list[bytes](), list[Outgoing]()
+        try:
+            if any(lease.kind is LeaseKind.METATRAFFIC for _, lease in users):
+                if self._is_too_much(datagram, source, now):
+                    return []
+                exported = partial(self._exported, port, source, users[0][0].prefix, now)
+                passed, back = _each(datagram, exported)
+            elif source in self.inside.here:
+                passed = [datagram]
+        except RtpsError as error:
+            return self._drop("malformed", source, str(error))
+        return back + [
+            sent
+            for there, lease in users
+            for one in passed
+            for sent in self._to_outside(there, lease, one)
+        ]
+
+    def settle(self, now: float) -> list[Outgoing]:
+        """Take in who has waited, once it is known who had which port; and have others meet."""
+        sent = self.returning.asked_again(now)
+        for source, message in self.returning.ready(now):
+            if message.prefix not in self.outside.by_prefix:
+                sent += self._announced_inside(message, source, now)
+        return sent + self.partings.go_on(self.inside.by_prefix.values(), now)
+
+    def expire(self, now: float) -> None:
+        """Forget those that have not been heard for as long as they said."""
+        for inside in [one for one in self.inside.by_prefix.values() if one.until < now]:
+            self._forget_inside(inside)
+        for outside in [one for one in self.outside.by_prefix.values() if one.until < now]:
+            self._forget_outside(outside)
+
+    def gone(self, addresses: Collection[str]) -> list[Outgoing]:
+        """End the participants at addresses inside where nobody is any more; what outside is told.
+
+        They can't say so themselves, and would be believed to be there for many seconds.
+        """
+        self.returning.forget(addresses)
+        sent = list[Outgoing]()
+        for one in [one for one in self.inside.by_prefix.values() if one.address in addresses]:
+            self._forget_inside(one)
+            sent += self.settings.to_outside(farewell(one.prefix, one.vendor, LAST_SEQUENCE))
+        return sent
+
+    def apply_policy(self, now: float) -> list[Outgoing]:
+        """Have those meet anew of whom the policy says something else than before."""
+        sent = list[Outgoing]()
+        self.fragments.clear()  # they were judged by the former one
+        for one in self.inside.by_prefix.values():
+            if has_changed(self.settings.judge, one):
+                one.verdicts.clear()
+                sent += self.partings.part(one, now)
+        return sent
+
+    def _heard_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+        prefix, told = message.prefix, message.of_participant
+        if prefix in self.outside.by_prefix or source_vendor(message.datagram) == NO_VENDOR:
+            return []  # a proxy's own participants are nobody's inside
+        if told is None:
+            return self.own.told_inside(message, source, now)
+        if told.ended:
+            return self._end_inside(message, source, now)
+        if prefix not in self.inside.by_prefix and self.ports.remembers(now):
+            return self.returning.wait(message, source, now)
+        return self._announced_inside(message, source, now)
+
+    def _heard_outside(
+        self, message: DiscoveryMessage, source: str, heard_by_ear: bool, now: float
+    ) -> list[Outgoing]:
+        prefix, told = message.prefix, message.of_participant
+        if prefix in self.inside.by_prefix or prefix == self.own.observer.prefix:
+            return []
+        if told is None:
+            return self.own.told_outside(message, source)
+        if not heard_by_ear and not self.outside.may_announce(
+            message, source, self.own.observer.prefix
+        ):
+            return self._drop("not_a_peer", source, "an announcement from no peer's address")
+        there = self.outside.meet(message, source, now)
+        if there is None:
+            return []
+        there.credit += len(message.datagram)
+        sent = self.outside.introduced([there], self.inside.by_prefix.values(), now)
+        if told.ended:
+            self._forget_outside(there)
+        return sent
+
+    def _announced_inside(
+        self, message: DiscoveryMessage, source: str, now: float
+    ) -> list[Outgoing]:
+        """Take in what a participant inside announces of itself, and tell outside."""
+        prefix = message.prefix
+        is_new = prefix not in self.inside.by_prefix
+        one = self.inside.meet(message, source, now)
+        if one is None:
+            return []
+        told = self.inside.exported(one, message, now, self.returning.had(prefix))
+        sent = self.inside.introduced(one, message)
+        if is_new and prefix in self.returning.former:
+            sent += self.own.met_elsewhere(one)
+            one.parting_from = now
+        sent += self._tell_outside(one, for_all(told), now)  # it may be an answer to the observer
+        if is_new:
+            sent += self.outside.introduced(self.outside.by_prefix.values(), [one], now)
+        return sent + self.own.asked_first(one)
+
+    def _tell_outside(
+        self, one: InsideParticipant, announcement: bytes, now: float
+    ) -> list[Outgoing]:
+        """What tells outside of a participant inside, unless that was told the same just now.
+
+        A crowd repeats itself while its members meet, and each time goes to all ports of peers.
+        """
+        if announcement == one.announcement and now - one.announced < ANNOUNCED_AGAIN:
+            return []
+        one.announcement, one.announced = announcement, now
+        return [] if one.apart_until else self.settings.to_outside(announcement)
+
+    def _end_inside(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+        one = self.inside.at(message.prefix, source)
+        if one is None:
+            return []
+        told = self.inside.exported(one, message, now)  # it may tell other things as well
+        self._forget_inside(one)
+        return self.settings.to_outside(told)
+
+    def _forget_inside(self, one: InsideParticipant) -> None:
+        self.inside.forget(one)
+        self.own.forget(one.prefix)
+        self.fragments.forget(one.prefix)
+
+    def _forget_outside(self, there: OutsideParticipant) -> None:
+        self.partings.forget(self.inside.by_prefix.values(), there.prefix)
+        self.outside.forget(there)
+        self.own.forget(there.prefix)
+        self.fragments.forget(there.prefix)
+
+    def _exported(
+        self, port: int, source: str, reader: bytes, now: float, message: DiscoveryMessage
+    ) -> _Passing:
+        """Metatraffic of inside's as outside gets it. Raises RtpsError."""
+        one = self.inside.at(message.prefix, source)
+        if one is None:
+            self._drop("unknown_participant", source, "it has not announced itself")
+            return [], []
+        if one.is_apart:
+            return [], []
+        self.partings.note_met(one, reader)
+        exported = partial(self.inside.exported, one, now=now)
+        passed, asked = self.fragments.rewritten(port, message, reader, exported)
+        return passed, sent_to(one.metatraffic, asked)
+
+    def _imported(
+        self,
+        port: int,
+        source: str,
+        inside: InsideParticipant,
+        now: float,
+        message: DiscoveryMessage,
+    ) -> _Passing:
+        """Metatraffic of outside's as a participant inside gets it. Raises RtpsError."""
+        prefix, told = message.prefix, message.of_participant
+        if prefix in self.inside.by_prefix or inside.is_apart:
+            return [], []
+        there = self.outside.at(prefix, source)
+        if told is not None:
+            if there is None and not self.settings.is_peer(source):
+                text = "a participant that is neither a peer's nor was heard"
+                self._drop("not_a_peer", source, text)
+                return [], []
+            there = self.outside.meet(message, source, now)
+        if there is None:
+            return [], []
+        there.note_sent(message.datagram, inside.prefix)
+        imported = partial(self.outside.imported, there, inside)
+        passed, asked = self.fragments.rewritten(port, message, inside.prefix, imported)
+        back = self.outside.asked(there, asked)
+        if told is not None and told.ended:
+            self._forget_outside(there)
+        return passed, back
+
+    def _to_outside(
+        self, there: OutsideParticipant, lease: Lease, datagram: bytes
+    ) -> list[Outgoing]:
+        if not there.may_be_sent(len(datagram)):
+            text = f"{there.guid_prefix} at {there.address} has not shown that it gets anything"
+            return self._drop("unproven", there.address, text)
+        return [self._passed(lease, datagram, False)]
+
+    def _passed(self, lease: Lease, datagram: bytes, inwards: bool) -> Outgoing:
+        """A datagram that goes to where a lease leads."""
+        lease.note_passed(len(datagram))
+        self.passed[lease.kind, inwards] += len(datagram)
+        return Outgoing(lease.where, datagram)
+
+    def _is_too_much(self, datagram: bytes, source: str, now: float) -> bool:
+        """Whether a source makes more discovery than it may; what is not is charged to it."""
+        if self.rates.take(source, len(datagram), now):
+            return False
+        self.refused("rate", source, "more discovery than one source may make")
+        return True
+
+    def _drop(self, reason: str, source: str, text: str) -> list[Outgoing]:
+        self.refused(reason, source, text)
+        return []
+
+
+def _each(datagram: bytes, pass_on: Callable[[DiscoveryMessage], _Passing]) -> _Passing:
+    """What is passed on of a datagram, and what goes back, of each who speaks in it. RtpsError."""
+    passed, back = list[bytes](), list[Outgoing]()
+    for message in map(read_discovery, by_source(datagram)):
+        on, asked = pass_on(message)
+        passed += on
+        back += asked
+    return passed, back

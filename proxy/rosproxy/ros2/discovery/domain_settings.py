@@ -1,0 +1,120 @@
+"""What a domain is told, and which ports DDS gives it."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import msgspec
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.leases.ports import PortMap
+from rosproxy.net.addresses import HostPort
+
+PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST = 250, 7400, 7410
+"""DDSI-RTPS 2.5, 9.6.2.3: domain d has the ports from 7400 + 250 d on."""
+PARTICIPANTS_TRIED = 32
+"""How many of a peer's well-known ports are told of participants inside: each program has one."""
+
+MOST_INSIDE, MOST_OUTSIDE = 512, 1024
+"""Participants of a domain on either side."""
+MOST_PER_ADDRESS, MOST_PER_HOST = 64, 256
+"""Participants at one address inside, and outside, where another proxy may be."""
+MOST_LEASES = 16
+"""Ports of the range for one participant; Fast DDS takes three for one address."""
+
+Judge = Callable[[RuleKind, str, str], bool]
+"""Whether something of a name is allowed to the participant inside at an address."""
+Note = Callable[[str, str, str], None]
+"""Told of each refusal: its reason in one word, the source, and a text."""
+
+
+@dataclass(slots=True)
+class Refused:
+    """Counts the datagrams that go nowhere, and tells of them."""
+
+    note: Note
+    count: int = 0
+
+    def __call__(self, reason: str, source: str, text: str) -> None:
+        """Tell why a datagram from a source goes nowhere."""
+        self.count += 1
+        self.note(reason, source, text)
+
+
+class Outgoing(msgspec.Struct, frozen=True):
+    """A datagram to send."""
+
+    to: HostPort
+    datagram: bytes
+
+
+def sent_to(to: HostPort | None, datagrams: Iterable[bytes]) -> list[Outgoing]:
+    """Datagrams for one place; none if nobody knows where that is."""
+    return [Outgoing(to, datagram) for datagram in datagrams] if to else []
+
+
+@dataclass(slots=True)
+class DomainSettings:
+    """What a domain is told; ``peers`` may change.
+
+    ``hosts`` are the IP addresses at which outside reaches the ports of the range, one or one of
+    each family; a participant is led to that of its own family, if there is one. ``peers`` are
+    those outside that are told of participants inside, with port 0 at their well-known ports;
+    ``ear`` is where the program listens that passes announcements on to the LAN. ``near`` gives the
+    proxy's own address that an address inside reaches. ``both_ways``: inside reaches the locators
+    of those outside through the proxy alone.
+    """
+
+    number: int
+    hosts: tuple[str, ...]
+    ports: PortMap
+    near: Callable[[str], str]
+    note: Note
+    judge: Judge
+    both_ways: bool = False
+    peers: tuple[HostPort, ...] = ()
+    ear: HostPort | None = None
+
+    @property
+    def host(self) -> str:
+        """The address by which the proxy is known."""
+        return self.hosts[0]
+
+    def host_for(self, address: str) -> str:
+        """The address of the proxy's by which outside reaches a participant at an address."""
+        same = (host for host in self.hosts if (":" in host) == (":" in address))
+        return next(same, self.host)
+
+    @property
+    def multicast_port(self) -> int:
+        """Where participants announce themselves to the group."""
+        return SPDP_MULTICAST + PORTS_PER_DOMAIN * self.number
+
+    @property
+    def unicast_port(self) -> int:
+        """Where the first participant of a machine is told of others."""
+        return SPDP_UNICAST + PORTS_PER_DOMAIN * self.number
+
+    @property
+    def discovery_port(self) -> int:
+        """The port of the range, its first, at which outside announces itself to the proxy."""
+        return self.ports.listen.first
+
+    def told(self) -> list[HostPort]:
+        """Where participants inside are announced."""
+        found = [self.ear] if self.ear else []
+        for peer in self.peers:
+            found += [peer] if peer.port else self.well_known(peer.host)
+        return found
+
+    def to_outside(self, datagram: bytes) -> list[Outgoing]:
+        """A datagram for all of them."""
+        return [Outgoing(to, datagram) for to in self.told()]
+
+    def well_known(self, host: str, most: int = PARTICIPANTS_TRIED) -> list[HostPort]:
+        """Where the first participants of a host are told of others (9.6.2.3)."""
+        ports = range(self.unicast_port, self.unicast_port + 2 * most, 2)
+        return [HostPort(host, port) for port in ports]
+
+    def is_peer(self, address: str) -> bool:
+        """Whether an address is a peer's."""
+        return any(peer.host == address for peer in self.peers)

@@ -1,0 +1,190 @@
+"""The participants inside, and the ports of the range that lead to their locators."""
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announced import (
+    first_metatraffic,
+    lease_duration,
+    note_endpoints,
+    traits,
+)
+from rosproxy.ros2.discovery.domain_settings import (
+    MOST_INSIDE,
+    MOST_LEASES,
+    MOST_PER_ADDRESS,
+    DomainSettings,
+    Outgoing,
+    Refused,
+)
+from rosproxy.ros2.discovery.policing import is_hidden
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import (
+    RtpsError,
+    by_source,
+    for_all,
+    source_prefix,
+    source_vendor,
+)
+from rosproxy.ros2.registry.participants import (
+    InsideParticipant,
+    Lease,
+    LeaseKind,
+    ParticipantTable,
+)
+from rosproxy.ros2.registry.ports import LocatorPorts
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, rewritten
+
+
+@dataclass(slots=True)
+class InsideParticipants(ParticipantTable[InsideParticipant]):
+    """Those inside; ``leases`` by port of the range, each with whose it is.
+
+    ``lacking`` are the locators that got no port, by the prefix of whose they are. ``changes``
+    counts how often the leases have changed.
+    """
+
+    settings: DomainSettings
+    ports: LocatorPorts
+    refused: Refused
+    leases: dict[int, tuple[InsideParticipant, Lease]] = field(default_factory=dict)
+    lacking: dict[bytes, str] = field(default_factory=dict)
+    changes: int = 0
+
+    def meet(self, message: DiscoveryMessage, source: str, now: float) -> InsideParticipant | None:
+        """The participant that announces itself from an address; None if it may not be.
+
+        One that is on several networks of its own is served at the first.
+        """
+        prefix, datagram, told = message.prefix, message.datagram, message.of_participant
+        known = self.at(prefix, source)
+        if told is None:
+            return known
+        if known is None:
+            if prefix in self.by_prefix:
+                return None
+            if self.here[source] >= MOST_PER_ADDRESS or len(self.by_prefix) >= MOST_INSIDE:
+                text = f"more than {MOST_PER_ADDRESS} participants there, or {MOST_INSIDE} in all"
+                self.refused("participants", source, text)
+                return None
+            known = InsideParticipant(prefix, source, source_vendor(datagram), now)
+            known.near = self.settings.near(source)
+            self.add(known)
+        known.until = now + lease_duration(told, datagram)
+        known.metatraffic = first_metatraffic(told, datagram, source)
+        known.traits = traits(told, datagram, source)
+        return known
+
+    def exported(
+        self,
+        participant: InsideParticipant,
+        message: DiscoveryMessage,
+        now: float,
+        kept: Sequence[int] = (),
+    ) -> bytes:
+        """A message of a participant's, as outside gets it. Raises RtpsError.
+
+        ``kept`` are the ports that it is known to have had before the proxy started, in the order
+        of its locators.
+        """
+        datagram, judge = message.datagram, self.settings.judge
+        note_endpoints(self.notes, participant, datagram, message.announcements)
+        return rewritten(
+            message,
+            partial(self._lead_out, participant, now, kept),
+            lambda told: is_hidden(judge, participant, told, datagram, is_own=True),
+        )
+
+    def observed(
+        self,
+        participant: InsideParticipant,
+        message: DiscoveryMessage,
+        now: float,
+        kept: Sequence[int] = (),
+    ) -> bytes:
+        """Take in what one inside tells the proxy itself: what it has, and where. RtpsError."""
+        note_endpoints(self.notes, participant, message.datagram, message.announcements)
+        lead = partial(self._lead_out, participant, now, kept)
+        return rewritten(message, lead, lambda _: False)
+
+    def note_in_group(self, datagram: bytes, source: str) -> None:
+        """Note whom the group has heard from an address."""
+        with contextlib.suppress(RtpsError):
+            for part in by_source(datagram):
+                if one := self.at(source_prefix(part), source):
+                    one.is_in_group = True
+
+    def introduced(self, one: InsideParticipant, message: DiscoveryMessage) -> list[Outgoing]:
+        """The announcement of one for the others on its network, if that passes on no multicast.
+
+        It goes on as it is: they reach each other without the proxy.
+        """
+        if one.is_in_group:
+            return []
+        told = for_all(message.datagram)
+        return [
+            Outgoing(other.metatraffic, told)
+            for other in self.by_prefix.values()
+            if other.near == one.near and other.address != one.address and other.metatraffic
+        ]
+
+    def forget(self, participant: InsideParticipant) -> None:
+        """Forget one that has gone, and take its ports back."""
+        self.changes += 1
+        for lease in participant.leases.values():
+            del self.leases[lease.port]
+            self.ports.give_back(lease.port)
+        self.remove(participant)
+        self.lacking.pop(participant.prefix, None)
+
+    def _lead_out(
+        self,
+        participant: InsideParticipant,
+        now: float,
+        kept: Sequence[int],
+        pid: int,
+        where: HostPort,
+    ) -> HostPort | None:
+        """The address and port at which outside reaches a locator; None if it does not."""
+        if where.host != participant.address:
+            return None
+        is_metatraffic = pid == Pid.METATRAFFIC_UNICAST_LOCATOR
+        kind = LeaseKind.METATRAFFIC if is_metatraffic else LeaseKind.DATA
+        lease = participant.leases.get(where)
+        if lease is None:
+            index = len(participant.leases)
+            had = kept[index] if index < len(kept) else None
+            lease = self._lend(participant, where, kind, had, now)
+        if lease is None:
+            return None
+        if is_metatraffic and lease.kind is not kind:
+            lease.kind = kind  # Cyclone DDS has one locator for both
+            self.changes += 1
+        host = self.settings.host_for(where.host)
+        return HostPort(host, self.settings.ports.advertised(lease.port))
+
+    def _lend(
+        self,
+        participant: InsideParticipant,
+        where: HostPort,
+        kind: LeaseKind,
+        had: int | None,
+        now: float,
+    ) -> Lease | None:
+        if len(participant.leases) >= MOST_LEASES:
+            text = f"has more than {MOST_LEASES} locators; {where} got no port"
+            self.lacking[participant.prefix] = text
+            return None
+        port = self.ports.take(participant.prefix, where, kind, now, had)
+        if port is None:
+            ports = self.settings.ports.listen
+            text = f"no port of {ports} is free for {where}: give a longer --port-range"
+            self.lacking[participant.prefix] = text
+            return None
+        lease = participant.leases[where] = Lease(port, where, kind)
+        self.leases[port] = participant, lease
+        self.changes += 1
+        return lease

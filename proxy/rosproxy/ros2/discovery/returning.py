@@ -1,0 +1,124 @@
+"""Participants that may have had ports before the proxy started: they are asked which.
+
+For some seconds from the start an announcement from inside waits: until the participant has said
+which ports it had (`Keeper`), or has had the time to, and until outside has had the time to go on
+sending to the ports that it knows (`LocatorPorts`).
+"""
+
+from collections import Counter
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.announced import first_metatraffic
+from rosproxy.ros2.discovery.domain_settings import (
+    MOST_INSIDE,
+    MOST_PER_ADDRESS,
+    DomainSettings,
+    Outgoing,
+)
+from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.registry.participants import InsideParticipant
+from rosproxy.ros2.registry.ports import LocatorPorts
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage
+
+ANSWER_TIME = 5.0
+"""Seconds that a participant has to say which ports it had."""
+
+
+@dataclass(slots=True)
+class Returning:
+    """Those who wait, by prefix: their announcement, where it came from, and since when.
+
+    At one address there may be as many of them as participants. ``former`` are the ports of those
+    that knew the proxy at another address, or with another range, by prefix, until they have gone.
+    Fast DDS heeds no other locators of whom it knows (PDPListener.cpp,
+    PDPSimple::updateInfoMatchesEDP), so these have to meet everybody anew; nor would they answer
+    the keeper.
+    """
+
+    settings: DomainSettings
+    ports: LocatorPorts
+    keeper: Keeper
+    waiting: dict[bytes, tuple[str, DiscoveryMessage, float]] = field(default_factory=dict)
+    former: dict[bytes, tuple[int, ...]] = field(default_factory=dict)
+    _here: Counter[str] = field(default_factory=Counter)
+
+    def has(self, prefix: bytes, source: str) -> bool:
+        """Whether somebody at an address waits."""
+        return prefix in self.waiting and self.waiting[prefix][0] == source
+
+    def wait(self, message: DiscoveryMessage, source: str, now: float) -> list[Outgoing]:
+        """Keep an announcement until ports are given; ask meanwhile which ones it had."""
+        if message.prefix in self.waiting:
+            return []
+        if len(self.waiting) >= MOST_INSIDE or self._here[source] >= MOST_PER_ADDRESS:
+            return []
+        self.waiting[message.prefix] = source, message, now
+        self._here[source] += 1
+        return self._questions(message, source)
+
+    def asked_again(self, now: float) -> list[Outgoing]:
+        """What asks those again that have not answered."""
+        return [
+            question
+            for source, message, since in self.waiting.values()
+            if not self._has_answered(message.prefix, since, now)
+            for question in self._questions(message, source)
+        ]
+
+    def ready(self, now: float) -> Iterator[tuple[str, DiscoveryMessage]]:
+        """Those that may get ports now, which wait no longer."""
+        if not self.ports.settled(now):
+            return
+        for prefix, (source, message, since) in list(self.waiting.items()):
+            if self._has_answered(prefix, since, now):
+                del self.waiting[prefix]
+                self._here -= Counter((source,))
+                yield source, message
+
+    def forget(self, addresses: Collection[str]) -> None:
+        """Forget those who wait at addresses where nobody is any more."""
+        for prefix in [one for one, (source, *_) in self.waiting.items() if source in addresses]:
+            self._here -= Counter((self.waiting.pop(prefix)[0],))
+
+    def note_former(self, former: Mapping[bytes, Sequence[int]], known: Container[bytes]) -> None:
+        """Note which ports participants had at a proxy elsewhere; not of those known.
+
+        Who has not all of them in this range gets others.
+        """
+        for prefix, ports in former.items():
+            lawful = all(port in self.ports.pool.range for port in ports)
+            if ports and prefix not in known and len(self.former) < MOST_INSIDE:
+                self.former[prefix] = tuple(ports) if lawful else ()
+
+    def had(self, prefix: bytes) -> Sequence[int]:
+        """The ports that a participant had before the start, in the order of its locators."""
+        return self.former.get(prefix) or self.keeper.had(prefix)
+
+    def forget_participant(self, prefix: bytes) -> None:
+        """Forget one that has gone."""
+        self.former.pop(prefix, None)
+        self.keeper.forget(prefix)
+
+    def reminders(self, one: InsideParticipant) -> list[Outgoing]:
+        """What has a participant keep the ports that it has now."""
+        if one.metatraffic is None:
+            return []
+        told = self.keeper.reminders(one.prefix, one.ports, self._back(one.address))
+        return [Outgoing(one.metatraffic, datagram) for datagram in told]
+
+    def _has_answered(self, prefix: bytes, since: float, now: float) -> bool:
+        return prefix in self.former or prefix in self.keeper.kept or now - since >= ANSWER_TIME
+
+    def _questions(self, message: DiscoveryMessage, source: str) -> list[Outgoing]:
+        told = message.of_participant
+        to = first_metatraffic(told, message.datagram, source) if told else None
+        if to is None:
+            return []
+        asked = self.keeper.questions(message.prefix, self._back(source))
+        return [Outgoing(to, datagram) for datagram in asked]
+
+    def _back(self, address: str) -> HostPort:
+        """Where a participant inside reaches the proxy's own."""
+        return HostPort(self.settings.near(address), self.settings.unicast_port)

@@ -1,0 +1,136 @@
+"""The QoS of a reader or writer, as far as it decides who matches whom.
+
+SEDP tells it, a parameter for each policy; what is left out has its default (DDSI-RTPS 2.5,
+9.6.3.2; Fast DDS tells all policies, Cyclone DDS only what differs). A policy that can't be read
+counts as left out: nothing follows from it but what the user is told.
+
+    reliability          kind 4 (1 best effort, 2 reliable), the longest blocking 8
+    durability           kind 4 (0 volatile, 1 transient local, 2 transient, 3 persistent)
+    liveliness           kind 4 (0 automatic, 1 by participant, 2 by topic), lease 8
+    deadline             period 8
+    ownership            kind 4 (0 shared, 1 exclusive)
+    partition            count 4, so many strings
+    data representation  count 4, so many kinds of 2 (0 XCDR, 1 XML, 2 XCDR2; XTypes 1.3, 7.6.3.1)
+"""
+
+import struct
+from collections.abc import Iterator
+from enum import IntEnum
+
+import msgspec
+
+from rosproxy.ros2.protocol.parameters import Parameter, ParameterList, Pid
+
+MOST_PARTITIONS, LONGEST_PARTITION = 4, 64
+"""Partitions that are read, and their characters; ROS 2 has none of its own."""
+MOST_REPRESENTATIONS = 3
+_RELIABLE, _EXCLUSIVE = 2, 1
+
+
+class Durability(IntEnum):
+    """Who gets what was written before he came; each more than the one before."""
+
+    VOLATILE = 0
+    TRANSIENT_LOCAL = 1
+    TRANSIENT = 2
+    PERSISTENT = 3
+
+
+class Liveliness(IntEnum):
+    """Who says that a writer lives; each more exact than the one before."""
+
+    AUTOMATIC = 0
+    MANUAL_BY_PARTICIPANT = 1
+    MANUAL_BY_TOPIC = 2
+
+
+class EndpointQos(msgspec.Struct, frozen=True):
+    """What a writer offers, or a reader requests. Times are in seconds.
+
+    ``partitions`` is None where there are more, or longer ones, than are read.
+    ``representations`` are kinds; none is the same as XCDR alone.
+    """
+
+    reliable: bool = False
+    durability: Durability = Durability.VOLATILE
+    deadline: float = float("inf")
+    liveliness: Liveliness = Liveliness.AUTOMATIC
+    liveliness_lease: float = float("inf")
+    exclusive: bool = False
+    partitions: tuple[str, ...] | None = ()
+    representations: tuple[int, ...] = ()
+
+
+def read_qos(datagram: bytes, held: ParameterList, of_writer: bool) -> EndpointQos:
+    """The QoS in what a reader or writer announces; never raises.
+
+    A writer is reliable, and a reader is not, unless it says otherwise (DDS 1.4, 2.2.3.14).
+    """
+    told = {one.pid: one for one in reversed(held.parameters)}  # the first of each
+
+    def kind(pid: Pid, default: int) -> int:
+        numbers = _unpacked(datagram, held, told.get(pid), "I")
+        return numbers[0] if numbers else default
+
+    def seconds(pid: Pid, after: str = "") -> float:
+        numbers = _unpacked(datagram, held, told.get(pid), f"{after}iI")
+        if not numbers or numbers[-2] == 0x7FFFFFFF:
+            return float("inf")
+        return numbers[-2] + numbers[-1] / 2**32
+
+    return EndpointQos(
+        reliable=kind(Pid.RELIABILITY, _RELIABLE if of_writer else 0) >= _RELIABLE,
+        durability=Durability(min(kind(Pid.DURABILITY, 0), max(Durability))),
+        deadline=seconds(Pid.DEADLINE),
+        liveliness=Liveliness(min(kind(Pid.LIVELINESS, 0), max(Liveliness))),
+        liveliness_lease=seconds(Pid.LIVELINESS, "I"),
+        exclusive=kind(Pid.OWNERSHIP, 0) == _EXCLUSIVE,
+        partitions=_partitions(datagram, held, told.get(Pid.PARTITION)),
+        representations=_representations(datagram, held, told.get(Pid.DATA_REPRESENTATION)),
+    )
+
+
+def _unpacked(
+    datagram: bytes, held: ParameterList, parameter: Parameter | None, form: str
+) -> tuple[int, ...]:
+    """Numbers at the start of a parameter; none if it is too short, or not there."""
+    if parameter is None:
+        return ()
+    start, size = parameter.value.start, struct.calcsize(f"={form}")
+    if parameter.value.end - start < size:
+        return ()
+    return struct.unpack_from(held.order + form, datagram, start)
+
+
+def _partitions(
+    datagram: bytes, held: ParameterList, parameter: Parameter | None
+) -> tuple[str, ...] | None:
+    (count,) = _unpacked(datagram, held, parameter, "I") or (0,)
+    if parameter is None or not count:
+        return ()
+    if count > MOST_PARTITIONS:
+        return None
+    found = list(_strings(datagram, held, parameter, count))
+    return tuple(found) if len(found) == count else None
+
+
+def _strings(
+    datagram: bytes, held: ParameterList, parameter: Parameter, count: int
+) -> Iterator[str]:
+    """The strings of a row, up to a bad one: a length and so many bytes, at a multiple of four."""
+    at, end = parameter.value.start + 4, parameter.value.end
+    for _ in range(count):
+        if at + 4 > end:
+            return
+        (size,) = struct.unpack_from(held.order + "I", datagram, at)
+        if size > LONGEST_PARTITION or at + 4 + size > end:
+            return
+        yield datagram[at + 4 : at + 4 + size].split(b"\0")[0].decode("utf-8", "replace")
+        at += 4 + size + -size % 4
+
+
+def _representations(
+    datagram: bytes, held: ParameterList, parameter: Parameter | None
+) -> tuple[int, ...]:
+    (count,) = _unpacked(datagram, held, parameter, "I") or (0,)
+    return _unpacked(datagram, held, parameter, f"I{min(count, MOST_REPRESENTATIONS)}h")[1:]

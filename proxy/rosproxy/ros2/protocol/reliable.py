@@ -1,0 +1,151 @@
+"""What reliable readers and writers tell each other: heartbeats, and which samples are missing.
+
+    HEARTBEAT  reader 4, writer 4, first number 8, last number 8, count 4
+    ACKNACK    reader 4, writer 4, a set of numbers (base 8, bits 4, words), count 4
+    GAP        reader 4, writer 4, first number 8, a set of numbers
+    NACK_FRAG  reader 4, writer 4, number 8, a set of fragments (base 4, bits 4, words), count 4
+
+A writer says by a heartbeat which samples it has; a reader answers with the ones that it lacks, and
+has thereby got all those before (DDSI-RTPS 2.5, 8.3.8.1 and 8.3.8.6). By a GAP the writer says that
+samples are none of the reader's business, which then goes on without them (8.3.8.4).
+"""
+
+import struct
+from collections.abc import Collection, Iterator, Sequence
+
+import msgspec
+
+from rosproxy.ros2.protocol.rtps import (
+    LAST_NUMBER,
+    Overwrite,
+    RtpsError,
+    Sample,
+    SubmessageId,
+    destination,
+    message_header,
+    submessages,
+)
+
+MOST_ASKED = 256
+"""Samples that may be asked for at once: the bits of a set (9.4.2.6)."""
+_LITTLE, _FINAL = 0x01, 0x02
+_GAP_SIZE = 28
+"""Bytes of a GAP with one number."""
+_TO_READER = 5
+"""From a built-in writer's entity id (…c2) to that of its reader (…c7)."""
+
+
+class Heartbeat(msgspec.Struct, frozen=True):
+    """The numbers of the first and the last sample that a writer has; none if first > last."""
+
+    writer: int
+    first: int
+    last: int
+
+
+def heartbeats(datagram: bytes) -> Iterator[Heartbeat]:
+    """All heartbeats in a message. Raises RtpsError if a length or a number can't be."""
+    for kind, flags, body in submessages(datagram):
+        if kind == SubmessageId.HEARTBEAT and body.end - body.start >= 28:
+            mark = "<" if flags & _LITTLE else ">"
+            numbers = struct.unpack_from(mark + "iIiI", datagram, body.start + 8)
+            writer = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
+            first, last = _number(*numbers[:2]), _number(*numbers[2:])
+            if last > LAST_NUMBER:
+                raise RtpsError(f"a heartbeat up to the number {last}")
+            yield Heartbeat(writer, first, last)
+
+
+def heartbeat(own: bytes, to: bytes, writer: int, first: int, count: int) -> bytes:
+    """The message by which a built-in writer tells a participant that it has no sample.
+
+    The next would be ``first``. It is answered with what the reader expects.
+    """
+    body = struct.pack(">II", writer + _TO_READER, writer)
+    last = first - 1
+    body += struct.pack("<iIiI", first >> 32, first & 0xFFFFFFFF, last >> 32, last & 0xFFFFFFFF)
+    return _directed(own, to, SubmessageId.HEARTBEAT, _LITTLE, body + struct.pack("<i", count))
+
+
+def acknowledged(datagram: bytes, meant: bytes, writer: int) -> list[int]:
+    """The numbers that readers expect next of a participant's writer, as a message says.
+
+    Raises RtpsError if a length leads outside.
+    """
+    if destination(datagram) != meant:
+        return []
+    found = []
+    for kind, flags, body in submessages(datagram):
+        if kind == SubmessageId.ACKNACK and body.end - body.start >= 16:
+            of = int.from_bytes(datagram[body.start + 4 : body.start + 8], "big")
+            mark = "<" if flags & _LITTLE else ">"
+            base = _number(*struct.unpack_from(mark + "iI", datagram, body.start + 8))
+            found += [base] if of == writer else []
+    return found
+
+
+def acknack(
+    own: bytes, to: bytes, writer: int, base: int, missing: Collection[int], count: int, final: bool
+) -> bytes:
+    """The message by which a built-in reader asks a participant's writer for samples.
+
+    It has all before ``base``. ``missing`` are at most MOST_ASKED from there on. Unless it is
+    ``final`` the writer answers with a heartbeat.
+    """
+    body = struct.pack(">II", writer + _TO_READER, writer)
+    body += struct.pack("<iI", base >> 32, base & 0xFFFFFFFF)
+    body += _bits([number - base for number in missing]) + struct.pack("<i", count)
+    flags = _LITTLE | (_FINAL if final else 0)
+    return _directed(own, to, SubmessageId.ACKNACK, flags, body)
+
+
+def nack_frag(
+    own: bytes, to: bytes, writer: int, sequence: int, missing: Sequence[int], count: int
+) -> bytes:
+    """The message by which a built-in reader asks for fragments of a sample (8.3.8.10).
+
+    ``missing`` are their numbers, in order; the first MOST_ASKED are asked for.
+    """
+    body = struct.pack(">II", writer + _TO_READER, writer)
+    body += struct.pack("<iII", sequence >> 32, sequence & 0xFFFFFFFF, missing[0])
+    body += _bits([number - missing[0] for number in missing]) + struct.pack("<i", count)
+    return _directed(own, to, SubmessageId.NACK_FRAG, _LITTLE, body)
+
+
+def withheld(sample: Sample) -> Overwrite:
+    """The edit that makes a DATA or DATA_FRAG a GAP: the sample is not for this reader.
+
+    What is left of the submessage's bytes becomes a PAD, and zero. Raises RtpsError if they are too
+    few, which no sample of a reader's or writer's description is.
+    """
+    mark, flag = ("<", _LITTLE) if sample.little else (">", 0)
+    size, after = sample.body.end - sample.body.start, sample.sequence + 1
+    if size < _GAP_SIZE + 4:
+        raise RtpsError(f"a sample of discovery in {size} bytes")
+    pad = size - _GAP_SIZE - 4
+    gap = struct.pack(mark + "BBH", SubmessageId.GAP, flag, _GAP_SIZE)
+    gap += struct.pack(">II", sample.reader, sample.writer)
+    for number in (sample.sequence, after):
+        gap += struct.pack(mark + "iI", number >> 32, number & 0xFFFFFFFF)
+    gap += struct.pack(mark + "IBBH", 0, SubmessageId.PAD, flag, pad)
+    return Overwrite(sample.body.start - 4, gap + bytes(pad))
+
+
+def _directed(own: bytes, to: bytes, kind: int, flags: int, body: bytes) -> bytes:
+    """A message of the proxy's own with one submessage for one participant."""
+    meant = struct.pack("<BBH", SubmessageId.INFO_DST, _LITTLE, len(to)) + to
+    return message_header(own) + meant + struct.pack("<BBH", kind, flags, len(body)) + body
+
+
+def _bits(numbers: Collection[int]) -> bytes:
+    """A set of numbers from 0 on: how many bits, and these in words (9.4.2.6, 9.4.2.8)."""
+    asked = [number for number in numbers if 0 <= number < MOST_ASKED]
+    bits = max(asked, default=-1) + 1
+    words = [0] * -(-bits // 32)
+    for one in asked:
+        words[one // 32] |= 1 << (31 - one % 32)
+    return struct.pack(f"<I{len(words)}I", bits, *words)
+
+
+def _number(high: int, low: int) -> int:
+    return (high << 32) + low

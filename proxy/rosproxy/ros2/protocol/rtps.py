@@ -1,0 +1,329 @@
+"""RTPS messages: what a datagram carries, and where in it.
+
+A message is a header and a row of *submessages*. Two of them carry *samples*, what a writer has
+written: DATA a whole one, DATA_FRAG a part. All others (heartbeats, acknowledgements, what a
+vendor has of its own) are none of the proxy's business and pass as they are.
+
+Nothing is decoded and encoded again: what is read are positions, and whatever changes has the same
+length after as before (`Overwrite`). So every byte that the proxy does not mean to change stays,
+those of versions and vendors that it does not know among them.
+
+    header      "RTPS", version 2, vendor 2, GUID prefix 12
+    submessage  id 1, flags 1, length 2, then so many bytes; bit 0 of flags: little-endian
+    DATA        extra flags 2, octets to inline QoS 2, reader 4, writer 4, sequence number 8,
+                inline QoS if flag 2, payload if flag 4 (or 8: the key alone)
+    DATA_FRAG   the same up to the sequence number, first fragment 4, fragments 2, fragment size 2,
+                sample size 4, inline QoS if flag 2, a part of the payload (flag 4: of the key)
+"""
+
+import struct
+from collections.abc import Iterable, Iterator
+from enum import IntEnum
+
+import msgspec
+
+MAGIC = b"RTPS"
+VERSION, NO_VENDOR = b"\x02\x03", b"\x00\x00"
+HEADER = 20
+"""Bytes of a message's header."""
+PREFIX = 12
+"""Bytes of a GUID prefix."""
+VERSION_TO_PREFIX = HEADER - len(MAGIC)
+"""Bytes of what a header and INFO_SRC tell alike: version, vendor, GUID prefix."""
+MOST_SUBMESSAGES = 256
+"""Submessages of a datagram that are read; real ones have a dozen."""
+
+LAST_NUMBER = 2**63 - 2
+"""The greatest sequence number that is taken, which has a next one; they begin with 1."""
+
+SENTINEL = 1
+"""The id that ends a parameter list; its length means nothing."""
+MOST_PARAMETERS = 512
+"""Parameters of a list that are read, its end among them; real ones have less than a hundred."""
+_LITTLE_HEADER, _BIG_HEADER = struct.Struct("<HH"), struct.Struct(">HH")
+
+_LITTLE, _QOS, _DATA, _KEY, _FRAGMENT_KEY = 0x01, 0x02, 0x04, 0x08, 0x04
+
+
+class RtpsError(ValueError):
+    """A datagram that is no RTPS message, or one whose lengths lead outside of it."""
+
+
+class SubmessageId(IntEnum):
+    """The submessages that the proxy reads."""
+
+    PAD = 0x01
+    ACKNACK = 0x06
+    HEARTBEAT = 0x07
+    GAP = 0x08
+    INFO_TS = 0x09
+    INFO_SRC = 0x0C
+    INFO_DST = 0x0E
+    NACK_FRAG = 0x12
+    HEARTBEAT_FRAG = 0x13
+    DATA = 0x15
+    DATA_FRAG = 0x16
+
+
+# Plain numbers: a member of an enumeration is slow to look up, and this is done for each datagram.
+_INFO_SRC, _INFO_DST = SubmessageId.INFO_SRC.value, SubmessageId.INFO_DST.value
+_DATA_FRAG = SubmessageId.DATA_FRAG.value
+_WITH_SAMPLE = frozenset({SubmessageId.DATA.value, _DATA_FRAG})
+_MAY_BE_EMPTY = frozenset({SubmessageId.PAD.value, SubmessageId.INFO_TS.value})
+_WRITER_AT: dict[int, int] = {
+    SubmessageId.DATA: 8,
+    SubmessageId.DATA_FRAG: 8,
+    SubmessageId.ACKNACK: 4,
+    SubmessageId.HEARTBEAT: 4,
+    SubmessageId.GAP: 4,
+    SubmessageId.NACK_FRAG: 4,
+    SubmessageId.HEARTBEAT_FRAG: 4,
+}
+"""Where in its body a submessage has the writer's entity id."""
+_BUILT_IN = 0xC0
+"""The bits of an entity id's last byte that built-in readers and writers have (9.3.1.2)."""
+
+
+class Span(msgspec.Struct, frozen=True):
+    """A part of a datagram: from ``start`` up to and without ``end``."""
+
+    start: int
+    end: int
+
+
+class Fragments(msgspec.Struct, frozen=True):
+    """Which part of a sample a DATA_FRAG carries.
+
+    ``first`` is the number of its first fragment, from 1 on, ``count`` how many it has, ``size``
+    the bytes of each but a sample's last, ``total`` those of the whole sample.
+    """
+
+    first: int
+    count: int
+    size: int
+    total: int
+
+
+class Sample(msgspec.Struct, frozen=True):
+    """What a DATA or DATA_FRAG carries, and where.
+
+    ``body`` is all of the submessage but its header. ``prefix`` is the GUID prefix of the
+    participant that has written it, ``writer`` and ``reader`` are entity ids (0: any reader).
+    ``little``: the byte order of the submessage, which is that of ``inline_qos``; the payload has
+    one of its own. ``key``: the payload is the key alone, of something that has ended.
+    """
+
+    prefix: bytes
+    reader: int
+    writer: int
+    sequence: int
+    little: bool
+    body: Span
+    inline_qos: Span | None
+    payload: Span | None
+    key: bool = False
+    fragments: Fragments | None = None
+
+
+class Overwrite(msgspec.Struct, frozen=True):
+    """Other bytes at a position of a datagram, as many as were there."""
+
+    at: int
+    after: bytes
+
+
+def source_prefix(datagram: bytes) -> bytes:
+    """The GUID prefix in the header of a message. Raises RtpsError if it is none."""
+    if len(datagram) < HEADER or datagram[:4] != MAGIC:
+        raise RtpsError("no RTPS message")
+    if datagram[4] != 2:
+        raise RtpsError(f"RTPS version {datagram[4]}.{datagram[5]}, not 2")
+    return datagram[8:HEADER]
+
+
+def message_header(prefix: bytes, vendor: bytes = NO_VENDOR) -> bytes:
+    """The header of a message that the proxy makes; its own have no vendor (VENDORID_UNKNOWN)."""
+    return MAGIC + VERSION + vendor + prefix
+
+
+def source_vendor(datagram: bytes) -> bytes:
+    """The vendor id in the header of a message. Raises RtpsError if it is none."""
+    source_prefix(datagram)
+    return datagram[6:8]
+
+
+def destination(datagram: bytes) -> bytes | None:
+    """The GUID prefix of whom a message is for; None if it is for all. Raises RtpsError.
+
+    That of the first INFO_DST: what follows may be for others, who are then at the same locator.
+    """
+    for kind, _, body in submessages(datagram):
+        if kind == _INFO_DST:
+            prefix = datagram[body.start : body.start + PREFIX]
+            return prefix if any(prefix) else None
+    return None
+
+
+def for_all(datagram: bytes) -> bytes:
+    """The message without the names of whom it is for: everybody takes it. Raises RtpsError."""
+    named = [body for kind, _, body in submessages(datagram) if kind == _INFO_DST]
+    return apply(datagram, [Overwrite(body.start, bytes(PREFIX)) for body in named])
+
+
+def of_built_in_writer(datagram: bytes) -> bool | None:
+    """Whether a message is from or to a built-in writer, as discovery is; None if to no writer.
+
+    That of the first submessage that names one. Raises RtpsError.
+    """
+    for kind, _, body in submessages(datagram):
+        at = _WRITER_AT.get(kind)
+        if at is not None:
+            _need(body, at + 4)
+            return bool(datagram[body.start + at + 3] & _BUILT_IN == _BUILT_IN)
+    return None
+
+
+def samples(datagram: bytes) -> list[Sample]:
+    """All samples in a message, in their order. Raises RtpsError if a length leads outside."""
+    found, prefix = list[Sample](), source_prefix(datagram)
+    for kind, flags, body in submessages(datagram):
+        if kind == _INFO_SRC:
+            _need(body, 20)
+            prefix = datagram[body.start + 8 : body.start + 20]
+        elif kind in _WITH_SAMPLE:
+            found.append(_sample(datagram, prefix, flags, body, kind == _DATA_FRAG))
+    return found
+
+
+def by_source(datagram: bytes) -> list[bytes]:
+    """The message as one for each participant that speaks in it, in their order.
+
+    Cyclone DDS has the participants of a program share a message (INFO_SRC, 8.3.8.9). Whom it is
+    meant for stays so until another is named. Raises RtpsError if a length leads outside.
+    """
+    source_prefix(datagram)
+    head, at, meant = datagram[:HEADER], HEADER, b""
+    found = list[bytes]()
+    for kind, _, body in submessages(datagram):
+        if kind == _INFO_SRC:
+            _need(body, 4 + VERSION_TO_PREFIX)
+            if body.start - 4 > at:
+                found.append(head + datagram[at : body.start - 4])
+            source = body.start + 4
+            head = MAGIC + datagram[source : source + VERSION_TO_PREFIX] + meant
+            at = body.end
+        elif kind == _INFO_DST:
+            meant = datagram[body.start - 4 : body.end]
+    if not found and at == HEADER:
+        return [datagram]
+    return [*found, head + datagram[at:]] if at < len(datagram) else found
+
+
+def apply(datagram: bytes, edits: Iterable[Overwrite]) -> bytes:
+    """The datagram with all edits made. Raises ValueError if one leads outside of it."""
+    changed = bytearray(datagram)
+    for edit in edits:
+        end = edit.at + len(edit.after)
+        if not 0 <= edit.at <= end <= len(changed):
+            raise ValueError(f"an edit of bytes {edit.at} to {end} of {len(changed)}")
+        changed[edit.at : end] = edit.after
+    return bytes(changed)
+
+
+def submessages(datagram: bytes) -> Iterator[tuple[int, int, Span]]:
+    """Each submessage's id, flags and body.
+
+    Raises RtpsError if a length leads outside, or one that says for whom the next are is too short:
+    what is kept of a message can be read again later.
+    """
+    at, count, size = HEADER, 0, len(datagram)
+    while at < size:
+        body = at + 4
+        if body > size:
+            raise RtpsError("the message ends inside a submessage's header")
+        if (count := count + 1) > MOST_SUBMESSAGES:
+            raise RtpsError(f"more than {MOST_SUBMESSAGES} submessages")
+        kind, flags, first, second = datagram[at:body]
+        length = first + (second << 8) if flags & _LITTLE else (first << 8) + second
+        at = body + length
+        if length == 0 and kind not in _MAY_BE_EMPTY:
+            at = size  # the last one may say so (9.4.5.1.3)
+        if at > size:
+            raise RtpsError(f"submessage {kind:#x} is longer than the message")
+        if kind == _INFO_DST and at - body < PREFIX:
+            raise RtpsError(f"a destination of {at - body} bytes needs {PREFIX}")
+        yield kind, flags, Span(body, at)
+
+
+def walk_parameters(datagram: bytes, within: Span, little: bool) -> Iterator[tuple[int, int, int]]:
+    """Each parameter of a list: its id, where that stands, and where its value ends.
+
+    The last is the sentinel, which ends with its header. Raises RtpsError if there is none, a
+    length leads outside, or there are too many.
+    """
+    unpack = (_LITTLE_HEADER if little else _BIG_HEADER).unpack_from
+    at, last = within.start, within.end - 4
+    for _ in range(MOST_PARAMETERS):
+        if at > last:
+            raise RtpsError("a parameter list without an end")
+        pid, length = unpack(datagram, at)
+        if pid == SENTINEL:
+            yield pid, at, at + 4
+            return
+        end = at + 4 + length
+        if end > within.end:
+            raise RtpsError(f"parameter {pid:#x} is longer than its list")
+        yield pid, at, end
+        at = end
+    raise RtpsError(f"a list of more than {MOST_PARAMETERS} parameters")
+
+
+def _sample(datagram: bytes, prefix: bytes, flags: int, body: Span, is_fragment: bool) -> Sample:
+    fixed = 32 if is_fragment else 20
+    _need(body, fixed)
+    start, little = body.start, bool(flags & _LITTLE)
+    to_qos = _unpack("H", datagram, start + 2, flags)
+    high, low = _unpack("i", datagram, start + 12, flags), _unpack("I", datagram, start + 16, flags)
+    sequence = (high << 32) + low
+    if not 0 < sequence <= LAST_NUMBER:
+        raise RtpsError(f"a sample with the number {sequence}")
+    at = start + 4 + to_qos
+    if not start + fixed <= at <= body.end:
+        raise RtpsError(f"inline QoS {to_qos} octets on, which is outside of the submessage")
+    qos = None
+    if flags & _QOS:
+        *_, (_, _, end) = walk_parameters(datagram, Span(at, body.end), little)
+        qos, at = Span(at, end), end
+    key = bool(flags & (_FRAGMENT_KEY if is_fragment else _KEY))
+    has_payload = is_fragment or bool(flags & (_DATA | _KEY))
+    return Sample(
+        prefix=prefix,
+        reader=int.from_bytes(datagram[start + 4 : start + 8], "big"),
+        writer=int.from_bytes(datagram[start + 8 : start + 12], "big"),
+        sequence=sequence,
+        little=little,
+        body=body,
+        inline_qos=qos,
+        payload=Span(at, body.end) if has_payload and at < body.end else None,
+        key=key,
+        fragments=_fragments(datagram, start + 20, flags) if is_fragment else None,
+    )
+
+
+def _fragments(datagram: bytes, at: int, flags: int) -> Fragments:
+    return Fragments(
+        _unpack("I", datagram, at, flags),
+        _unpack("H", datagram, at + 4, flags),
+        _unpack("H", datagram, at + 6, flags),
+        _unpack("I", datagram, at + 8, flags),
+    )
+
+
+def _need(body: Span, size: int) -> None:
+    if body.end - body.start < size:
+        raise RtpsError(f"a submessage of {body.end - body.start} bytes needs {size}")
+
+
+def _unpack(form: str, datagram: bytes, at: int, flags: int) -> int:
+    found: int = struct.unpack_from(("<" if flags & _LITTLE else ">") + form, datagram, at)[0]
+    return found

@@ -1,0 +1,277 @@
+"""Participants: what the proxy knows of those inside and of those outside.
+
+A participant is known by its GUID prefix, and only together with the address that it was found at:
+anybody may write any prefix into a datagram.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Generic, TypeVar
+
+import msgspec
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.qos import EndpointQos
+from rosproxy.ros2.protocol.rtps import destination
+
+VENDORS = {
+    b"\x00\x00": "rosproxy",
+    b"\x01\x01": "RTI Connext",
+    b"\x01\x02": "OpenSplice",
+    b"\x01\x03": "OpenDDS",
+    b"\x01\x0f": "Fast DDS",
+    b"\x01\x10": "Cyclone DDS",
+    b"\x01\x12": "RustDDS",
+    b"\x01\x14": "Dust DDS",
+}
+"""Names of implementations, by the vendor id in each message's header (OMG's list). Zero stands for
+none; the participants that proxies have themselves say so."""
+MOST_ENDPOINTS, MOST_ENDPOINTS_HERE, MOST_ENDPOINTS_IN_ALL = 2048, 8192, 65_536
+"""Readers and writers that are remembered, which is for the status alone: of a participant, at an
+address, on a side."""
+
+
+class LeaseKind(StrEnum):
+    """What arrives at a lease. ``METATRAFFIC`` is read and rewritten, ``DATA`` passes unread."""
+
+    METATRAFFIC = "metatraffic"
+    DATA = "data"
+
+
+class EndpointKind(StrEnum):
+    """What a participant has announced."""
+
+    READER = "reader"
+    WRITER = "writer"
+
+
+class DdsEndpoint(msgspec.Struct, frozen=True):
+    """A reader or writer of a participant, as its SEDP tells."""
+
+    kind: EndpointKind
+    topic: str
+    type_name: str
+    qos: EndpointQos = EndpointQos()
+
+
+class DdsSecurity(StrEnum):
+    """What a participant says of DDS Security. ``PROTECTED``: its discovery is, too."""
+
+    NONE = ""
+    AUTHENTICATED = "authenticated"
+    PROTECTED = "protected"
+
+
+class LocatorFault(StrEnum):
+    """Why the proxy can't pass anything on to a participant, as its locators tell.
+
+    ``TCP``: it has no UDP; ``LOOPBACK``: only addresses that mean its own machine; ``ELSEWHERE``:
+    addresses, but not the one that it sends from; ``MISSING``: none at all.
+    """
+
+    NO = ""
+    TCP = "tcp"
+    LOOPBACK = "loopback"
+    ELSEWHERE = "elsewhere"
+    MISSING = "missing"
+
+
+class ParticipantTraits(msgspec.Struct, frozen=True):
+    """What a participant says of itself that may keep others from meeting it.
+
+    ``domain`` is its domain's id, None if it does not say.
+    """
+
+    domain: int | None = None
+    security: DdsSecurity = DdsSecurity.NONE
+    locator_fault: LocatorFault = LocatorFault.NO
+
+
+UNKNOWN_TRAITS = ParticipantTraits()
+"""Of a participant that has said nothing yet."""
+
+
+@dataclass(slots=True)
+class Lease:
+    """A port that leads to one locator of a participant.
+
+    Of one inside it is a port of the range; of one outside its *stand-in*, a port that those inside
+    reach. ``bytes`` and ``datagrams`` are those that were passed on; ``rate`` is in bytes per
+    second, as of the last `sample`.
+    """
+
+    port: int
+    where: HostPort
+    kind: LeaseKind
+    datagrams: int = 0
+    bytes: int = 0
+    rate: float = 0.0
+    _sampled: tuple[float, int] = (0.0, 0)
+
+    def sample(self, now: float) -> None:
+        """Compute the rate since the last sample; ``now`` is in seconds."""
+        before, passed = self._sampled
+        self._sampled = now, self.bytes
+        if before and now > before:
+            self.rate = round((self.bytes - passed) / (now - before), 1)
+
+    def note_passed(self, size: int) -> None:
+        """Count a datagram of so many bytes that is passed on."""
+        self.datagrams += 1
+        self.bytes += size
+
+
+@dataclass(slots=True)
+class Participant:
+    """What is known of a participant on either side.
+
+    ``address`` is where it was found, ``until`` when it counts as gone unless it is heard again.
+    ``announcement`` is its last SPDP datagram: of one inside as outside gets it, of one outside as
+    it came. ``endpoints`` are by their entity ids, ``leases`` by its locators.
+    """
+
+    prefix: bytes
+    address: str
+    vendor: bytes
+    until: float
+    announcement: bytes = b""
+    metatraffic: HostPort | None = None
+    traits: ParticipantTraits = UNKNOWN_TRAITS
+    endpoints: dict[bytes, DdsEndpoint] = field(default_factory=dict)
+    leases: dict[HostPort, Lease] = field(default_factory=dict)
+
+    @property
+    def guid_prefix(self) -> str:
+        """The GUID prefix as tools of DDS print it."""
+        return ".".join(f"{one:02x}" for one in self.prefix)
+
+    @property
+    def vendor_name(self) -> str:
+        """The implementation's name, or its id."""
+        return VENDORS.get(self.vendor, self.vendor.hex())
+
+
+@dataclass(slots=True)
+class EndpointNotes:
+    """Notes the readers and writers of participants, within bounds; ``here`` counts by address."""
+
+    here: Counter[str] = field(default_factory=Counter)
+    total: int = 0
+
+    def note(self, of: Participant, entity: bytes, endpoint: DdsEndpoint | None) -> None:
+        """Remember a reader or writer; with None, that it has ended."""
+        if of.endpoints.pop(entity, None) is not None:
+            self._count(of.address, -1)
+        if endpoint is not None and self._has_room(of):
+            of.endpoints[entity] = endpoint
+            self._count(of.address, 1)
+
+    def forget(self, of: Participant) -> None:
+        """Forget those of a participant that has gone."""
+        self._count(of.address, -len(of.endpoints))
+        of.endpoints.clear()
+
+    def _has_room(self, of: Participant) -> bool:
+        return (
+            len(of.endpoints) < MOST_ENDPOINTS
+            and self.here[of.address] < MOST_ENDPOINTS_HERE
+            and self.total < MOST_ENDPOINTS_IN_ALL
+        )
+
+    def _count(self, address: str, more: int) -> None:
+        self.total += more
+        self.here[address] += more
+        if not self.here[address]:
+            del self.here[address]
+
+
+@dataclass(slots=True)
+class InsideParticipant(Participant):
+    """A participant inside, with a port of the range for each of its locators.
+
+    ``verdicts`` are what the policy has said, of topics and services of its own and of others' that
+    it was to be told of: whether they are allowed. ``near`` is the proxy's address on its network;
+    ``is_in_group``: it was heard there by multicast. ``announced`` is when outside was told of it
+    last. `Partings` has the rest: since when it is to be parted from all outside, or None; until
+    when it is, or None; and when it was last told to forget whom outside, None if it never was.
+    """
+
+    verdicts: dict[tuple[RuleKind, str], bool] = field(default_factory=dict)
+    near: str = ""
+    is_in_group: bool = False
+    announced: float = 0.0
+    parting_from: float | None = None
+    apart_until: float | None = None
+    parted: dict[bytes, float] | None = None
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether nothing of discovery passes between it and outside."""
+        return self.parting_from is not None or self.apart_until is not None
+
+    @property
+    def ports(self) -> list[int]:
+        """The ports that it has, in the order in which they were given."""
+        return [lease.port for lease in self.leases.values()]
+
+
+@dataclass(slots=True)
+class OutsideParticipant(Participant):
+    """A participant outside, with a stand-in for each locator that inside does not reach by itself.
+
+    Until it is ``proven`` that it gets what is sent to it, it is sent no more bytes than came from
+    it: ``credit`` are those that are left.
+    """
+
+    proven: bool = False
+    credit: int = 0
+
+    def note_sent(self, datagram: bytes, meant: bytes) -> None:
+        """Note that it has sent something; by naming whom it means it proves itself. RtpsError."""
+        self.credit += len(datagram)
+        if not self.proven and destination(datagram) == meant:
+            self.proven = True
+
+    def may_be_sent(self, size: int) -> bool:
+        """Whether so many bytes may go to it; if so, they are taken off its credit."""
+        if self.proven:
+            return True
+        if self.credit < size:
+            return False
+        self.credit -= size
+        return True
+
+
+Someone = TypeVar("Someone", bound=Participant)
+
+
+@dataclass(slots=True, kw_only=True)
+class ParticipantTable(Generic[Someone]):
+    """The participants of one side by GUID prefix, and how many there are at each address.
+
+    ``notes`` holds how many readers and writers of theirs are remembered.
+    """
+
+    by_prefix: dict[bytes, Someone] = field(default_factory=dict)
+    here: Counter[str] = field(default_factory=Counter)
+    notes: EndpointNotes = field(default_factory=EndpointNotes)
+
+    def at(self, prefix: bytes, source: str) -> Someone | None:
+        """The participant with a prefix, if it is at the address that a datagram came from."""
+        known = self.by_prefix.get(prefix)
+        return known if known is not None and known.address == source else None
+
+    def add(self, participant: Someone) -> None:
+        """Take in one that has come."""
+        self.by_prefix[participant.prefix] = participant
+        self.here[participant.address] += 1
+
+    def remove(self, participant: Someone) -> None:
+        """Forget one that has gone."""
+        del self.by_prefix[participant.prefix]
+        self.notes.forget(participant)
+        self.here[participant.address] -= 1
+        if not self.here[participant.address]:
+            del self.here[participant.address]

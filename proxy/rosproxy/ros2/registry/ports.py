@@ -1,0 +1,120 @@
+"""Which port stands for a locator: found anew after a restart, with nothing kept on disk.
+
+The order in which ports are tried follows from the participant's GUID prefix and from the locator.
+So a proxy that has lost all memory gives the same ports again, unless two participants want the
+same one first: then it counts who came first, which a new process can't know. But outside goes on
+sending to the ports that it was told, and names whom it means (INFO_DST). So no port is given in
+the first second, and then first to those who are meant there; next to who says himself that he had
+it (`rosproxy.ros2.discovery.keeper`), which is anybody's word.
+What the kernel forwards does not come here; but its table is what a former process has left there,
+and tells which port led to which locator.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from hashlib import blake2b
+from itertools import islice
+
+from rosproxy.leases.ports import PortPool, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.rtps import destination, of_built_in_writer
+from rosproxy.ros2.registry.participants import LeaseKind
+
+STAND_INS = PortRange(20_000, 32_767)
+"""Where ports for participants outside are chosen from: below those that Linux gives away."""
+TRIES = 32
+"""How many ports are tried for a locator outside."""
+MOST_SHARING = 4
+"""Locators outside that one port may stand for."""
+SETTLING = 1.0
+"""Seconds from the start in which no port is given, to hear first who is meant where."""
+REMEMBERED = 30.0
+"""Seconds from the start in which a port is rather given to who had it before."""
+
+
+def order_for(key: str, ports: PortRange) -> Iterator[int]:
+    """All ports of a range, in the order in which they are tried for a key."""
+    start = int.from_bytes(blake2b(key.encode(), digest_size=8).digest(), "big")
+    for number in range(len(ports)):
+        yield ports.first + (start + number) % len(ports)
+
+
+class LocatorPorts:
+    """Lends the ports of the range to locators; ``started`` is when the proxy did, in seconds."""
+
+    def __init__(self, pool: PortPool, started: float) -> None:
+        self.pool, self._started = pool, started
+        self._meant: dict[int, tuple[bytes, LeaseKind]] = {}
+        self._forwarded: dict[int, HostPort] = {}
+
+    def settled(self, now: float) -> bool:
+        """Whether ports may be given."""
+        return now - self._started >= SETTLING
+
+    def remembers(self, now: float) -> bool:
+        """Whether somebody may be there who had ports before the start."""
+        return now - self._started < REMEMBERED
+
+    def note_use(self, port: int, datagram: bytes, now: float) -> None:
+        """Note whom outside means by what it sends to a port that nobody has. Raises RtpsError."""
+        meant, built_in = destination(datagram), of_built_in_writer(datagram)
+        if meant is not None and built_in is not None:
+            kind = LeaseKind.METATRAFFIC if built_in else LeaseKind.DATA
+            self.note_meant(port, meant, kind, now)
+
+    def note_meant(self, port: int, prefix: bytes, kind: LeaseKind, now: float) -> None:
+        """Note that a participant had a port."""
+        if self.remembers(now) and port in self.pool.range:
+            self._meant[port] = prefix, kind
+
+    def note_forwarded(self, forwards: Mapping[int, HostPort]) -> None:
+        """Note what the kernel was told to forward before the start, by port."""
+        self._forwarded = {p: where for p, where in forwards.items() if p in self.pool.range}
+
+    def take(
+        self,
+        prefix: bytes,
+        where: HostPort,
+        kind: LeaseKind,
+        now: float,
+        had: int | None = None,
+    ) -> int | None:
+        """A port for a locator of a participant; None if all are taken.
+
+        ``had`` is the one that the participant itself says that it had.
+        """
+        if not self.remembers(now):
+            self._meant.clear()
+            self._forwarded.clear()
+        if not self.pool.free:
+            return None
+        mine = prefix, kind
+
+        def merit(port: int) -> int:
+            if (former := self._forwarded.get(port)) is not None:
+                return 0 if former == where and kind is LeaseKind.DATA else 3
+            meant = self._meant.get(port)
+            if meant is None:
+                return 1 if port == had else 2
+            return 0 if meant == mine else 3
+
+        order = sorted(order_for(f"{prefix.hex()} {where}", self.pool.range), key=merit)
+        port = next(filter(self.pool.claim, order), None)
+        self._meant.pop(port or 0, None)
+        self._forwarded.pop(port or 0, None)
+        return port
+
+    def give_back(self, port: int) -> None:
+        """Take a port back."""
+        self.pool.give_back(port)
+
+
+def stand_in_port(key: str, users: Callable[[int], int], held: Callable[[int], bool]) -> int | None:
+    """A port for a locator outside; None if there are too many of them.
+
+    ``users`` tells how many a port stands for already. It may be several: so the port follows from
+    the locator alone, whoever else there is, and a proxy that starts again has the same for it.
+    Each of them gets what is meant for the others as well, and skips it, as with multicast.
+    ``held`` tells which ports can't be had; they are no tries, as a range of them may be long.
+    """
+    order = (port for port in order_for(key, STAND_INS) if not held(port))
+    return next((port for port in islice(order, TRIES) if users(port) < MOST_SHARING), None)

@@ -1,0 +1,27 @@
+"""Which rule of the policy a reader or writer of DDS is a case of (`rosproxy.access.rules`).
+
+The rules speak of topics and services as seen from inside. In DDS a service has two topics, and
+either end of each is a reader or a writer: so it follows from the topic's name, and from whether
+what is written there goes outwards or inwards.
+"""
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.ros2.protocol.names import is_of_requests, is_of_service, ros_name
+from rosproxy.ros2.registry.participants import EndpointKind
+
+GRAPH_TOPIC = "ros_discovery_info"
+"""By it participants tell which nodes they have; without it `ros2 node list` is empty."""
+
+
+def rule_about(kind: EndpointKind, dds_topic: str, is_inside: bool) -> tuple[RuleKind, str] | None:
+    """What kind of rule a reader or writer is a case of, and by which name; None: of none.
+
+    ``is_inside`` tells the side of its participant.
+    """
+    if dds_topic == GRAPH_TOPIC:
+        return None
+    name = ros_name(dds_topic)
+    outwards = (kind is EndpointKind.WRITER) is is_inside
+    if not is_of_service(dds_topic):
+        return (RuleKind.PUBLISH if outwards else RuleKind.SUBSCRIBE), name
+    return (RuleKind.CALL if is_of_requests(dds_topic) is outwards else RuleKind.SERVE), name

@@ -1,0 +1,309 @@
+"""The sockets of one domain: what they hear goes to `Domain`, what that says is sent.
+
+    the groups       at the domain's multicast port, on every inside network
+    well-known port  where those inside announce themselves that know the proxy as a peer
+    the range        all its ports, from the start: also one that nobody has tells something
+    stand-ins        for the locators of participants outside, opened when they are first heard
+
+Everything is sent from one socket: RTPS answers to locators, not to where a datagram came from.
+"""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import socket
+import time
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+
+from rosproxy.forwarding import datagrams
+from rosproxy.forwarding.datagrams import LARGEST
+from rosproxy.leases.ports import PortPool
+from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import (
+    PARTICIPANTS_TRIED,
+    DomainSettings,
+    Outgoing,
+)
+from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, by_source
+from rosproxy.ros2.registry.selected import SelectedAddresses
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
+
+log = logging.getLogger(__name__)
+
+EXPIRY_INTERVAL = 0.5
+PER_TURN = 16
+"""Datagrams of one socket before the others have their turn."""
+
+Take = Callable[[bytes, str, float], list[Outgoing]]
+"""Takes a datagram, the address it came from and the time; gives what is to be sent."""
+
+
+class DomainServer:
+    """Serves one domain. ``now`` is the clock; ``is_inside`` tells an address's side.
+
+    ``changed`` is called when a lease was given or has ended.
+    For ``awaited`` seconds nobody is let in unless an operator has told who is.
+    """
+
+    def __init__(
+        self,
+        settings: DomainSettings,
+        bind: str,
+        now: Callable[[], float],
+        is_inside: Callable[[str], bool],
+        changed: Callable[[], None],
+        awaited: float = 0.0,
+    ) -> None:
+        self._bind, self._now, self._is_inside = bind, now, is_inside
+        self._changed, self._told = changed, 0
+        pool = PortPool(settings.ports.listen)
+        self.domain = Domain.starting(settings, pool, os.urandom(PREFIX), now(), time.time())
+        self._selected = SelectedAddresses(now() + awaited)
+        self._loop = asyncio.get_running_loop()
+        self._sockets: list[socket.socket] = []
+        self._stand_ins: dict[int, socket.socket] = {}
+        self._synced = 0
+        self._groups = GroupEars(settings.multicast_port, self._read_group, self._stop_reading)
+        self._secret, self._heard = b"", asyncio.Event()
+        self._out = {family: _sending(family) for family in (socket.AF_INET, socket.AF_INET6)}
+        self.lost = 0
+        """Datagrams that the kernel did not take."""
+
+    def start(self) -> list[int]:
+        """Open all sockets but the stand-ins'; the ports of the range that others hold.
+
+        Raises OSError if the group's port or the well-known one is taken.
+        """
+        settings, domain = self.domain.settings, self.domain
+        self._groups.open(_families(self._bind))
+        known = datagrams.bind(self._bind, settings.unicast_port)
+        self._read(known, self._from_inside(domain.heard_inside))
+        taken = []
+        for port in settings.ports.listen.ports():
+            try:
+                sock = datagrams.bind(self._bind, port)
+            except OSError as error:
+                log.debug("port %d: %s", port, error)
+                self.domain.ports.pool.block(port)
+                taken.append(port)
+                continue
+            is_discovery = port == settings.discovery_port
+            self._read(sock, self._at_discovery if is_discovery else self._at_lease(port))
+        return taken
+
+    async def hears(self, secret: bytes, trial: Callable[[asyncio.Event], Awaitable[str]]) -> str:
+        """What a trial finds out; it is told when a secret comes in where the domain is found."""
+        self._secret, self._heard = secret, asyncio.Event()
+        return await trial(self._heard)
+
+    def join(self, addresses: Iterable[str]) -> None:
+        """Hear the group on the inside networks where the proxy has these addresses, and no others.
+
+        On a network that it has left and joined again it has to join the group again, too.
+        """
+        for address in self._groups.join(addresses):
+            self._observe(address)
+
+    def ask_outside(self, peers: tuple[HostPort, ...]) -> None:
+        """Use these peers from now on; those that are new are asked to announce themselves."""
+        if peers != self.domain.settings.peers:
+            self.domain.settings.peers = peers
+            self._send(self.domain.own.announced_outside())
+
+    def apply_policy(self) -> None:
+        """Have those meet anew of whom the policy says something else than before."""
+        self._send(self.domain.apply_policy(self._now()))
+
+    def select(self, addresses: Iterable[str]) -> None:
+        """Let in participants at these addresses alone, from now on."""
+        before = self._selected.told or frozenset()
+        self._selected.select(addresses)
+        self._release()
+        self._ask((self._selected.told or frozenset()) - before)
+
+    def note_former(self, former: Mapping[bytes, Sequence[int]]) -> None:
+        """Take in which ports participants had at a proxy with another address."""
+        self.domain.returning.note_former(former, self.domain.inside.by_prefix)
+
+    def end(self, addresses: Collection[str]) -> int:
+        """End the participants at addresses where nobody is any more; how many there were."""
+        before = len(self.domain.inside.by_prefix)
+        self._send(self.domain.gone(addresses))
+        return before - len(self.domain.inside.by_prefix)
+
+    async def expire(self) -> None:
+        """Take in who has waited, and forget whoever has gone."""
+        self._release()
+        self._send(self.domain.settle(self._now()))
+        self.domain.expire(self._now())
+        self._sync_stand_ins()
+        self._tell_changes()
+
+    async def observe(self) -> None:
+        """Announce the observer, by multicast and to those who may not hear that; keep ports."""
+        for address in self._groups.joined:
+            self._observe(address)
+        settings, inside = self.domain.settings, list(self.domain.inside.by_prefix.values())
+        self._send(
+            Outgoing(one.metatraffic, self.domain.own.announced_inside(settings.near(one.address)))
+            for one in inside
+            if one.metatraffic
+        )
+        self._ask(self._selected.told or ())
+        self._send(self.domain.own.announced_outside())
+        self._send(self.domain.own.keeping())
+
+    def close(self) -> None:
+        """Close all sockets."""
+        end = self.domain.own.observer.farewell()
+        for address in self._groups.joined:
+            self._multicast(address, end)
+        self._send(self.domain.settings.to_outside(end))
+        self._groups.close()
+        for sock in [*self._sockets, *self._stand_ins.values()]:
+            self._stop_reading(sock)
+        for sock in self._out.values():
+            sock.close()
+
+    def _release(self) -> None:
+        """Take in what those have announced who are let in now."""
+        now = self._now()
+        for source, datagram in self._selected.released(now):
+            self._send(self.domain.heard_inside(datagram, source, now))
+
+    def _ask(self, addresses: Iterable[str]) -> None:
+        """Announce the observer to addresses inside whose network may not pass on multicast.
+
+        Docker's internal networks do not, where bridged packets are filtered (br_netfilter).
+        """
+        settings, here = self.domain.settings, self.domain.inside.here
+        for address in addresses:
+            told = self.domain.own.announced_inside(settings.near(address))
+            known = here.get(address, 0)
+            ports = settings.well_known(address, known + 2 if known else PARTICIPANTS_TRIED)
+            self._send(Outgoing(to, told) for to in ports)
+
+    def _observe(self, near: str) -> None:
+        self._multicast(near, self.domain.own.announced_inside(near))
+
+    def _multicast(self, near: str, datagram: bytes) -> None:
+        """Send to the group on the network where the proxy has an address, if it still has it."""
+        try:
+            send_through(self._out[family_of(near)], near, loop=False)
+        except OSError as error:
+            log.debug("the network of %s has gone: %s", near, error)
+            return
+        port = self.domain.settings.multicast_port
+        self._send(Outgoing(HostPort(group, port), datagram) for group in groups_of(near))
+
+    def _read_group(self, sock: socket.socket) -> None:
+        take = self._from_inside(self._heard_in_group)
+        self._loop.add_reader(sock, self._take_in, sock, take)
+
+    def _stop_reading(self, sock: socket.socket) -> None:
+        self._loop.remove_reader(sock)
+        sock.close()
+
+    def _read(self, sock: socket.socket, take: Take) -> None:
+        self._sockets.append(sock)
+        self._loop.add_reader(sock, self._take_in, sock, take)
+
+    def _from_inside(self, take: Take) -> Take:
+        def taking(datagram: bytes, source: str, now: float) -> list[Outgoing]:
+            if not self._is_inside(source):
+                return []
+            if self._selected.admits(source, now):
+                return take(datagram, source, now)
+            with contextlib.suppress(RtpsError):
+                for message in map(read_discovery, by_source(datagram)):
+                    if message.of_participant is not None:
+                        self._selected.hold(source, message.datagram)
+            return []
+
+        return taking
+
+    def _heard_in_group(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        sent = self.domain.heard_inside(datagram, source, now)
+        self.domain.inside.note_in_group(datagram, source)
+        return sent
+
+    def _at_discovery(self, datagram: bytes, source: str, now: float) -> list[Outgoing]:
+        if self._secret and datagram == self._secret:
+            self._heard.set()
+            return []
+        return self.domain.heard_outside(datagram, source, now)
+
+    def _at_lease(self, port: int) -> Take:
+        return lambda datagram, source, now: self.domain.at_lease(port, datagram, source, now)
+
+    def _at_stand_in(self, port: int) -> Take:
+        return lambda datagram, source, now: self.domain.at_stand_in(port, datagram, source, now)
+
+    def _take_in(self, sock: socket.socket, take: Take) -> None:
+        """Take in what waits at a socket, and send what follows from it.
+
+        Before others have their turn it is so many datagrams, or one of the longest.
+        """
+        taken = count = 0
+        with contextlib.suppress(BlockingIOError):
+            while count < PER_TURN and taken < LARGEST // 2:
+                count += 1
+                try:
+                    datagram, sender = sock.recvfrom(LARGEST)
+                except ConnectionRefusedError:
+                    continue
+                taken += len(datagram)
+                outgoing = take(datagram, plain_address(sender[0]), self._now())
+                self._sync_stand_ins()
+                self._tell_changes()
+                self._send(outgoing)
+
+    def _send(self, outgoing: Iterable[Outgoing]) -> None:
+        for one in outgoing:
+            try:
+                self._out[family_of(one.to.host)].sendto(one.datagram, (one.to.host, one.to.port))
+            except OSError as error:
+                self.lost += 1
+                log.debug("a datagram to %s: %s", one.to, error)
+
+    def _tell_changes(self) -> None:
+        """Tell that leases have changed, if they have."""
+        changes = self.domain.inside.changes
+        if changes != self._told:
+            self._told = changes
+            self._changed()
+
+    def _sync_stand_ins(self) -> None:
+        """Open and close the ports for participants outside."""
+        outside = self.domain.outside
+        if outside.changes == self._synced:
+            return
+        self._synced, wanted = outside.changes, outside.stand_ins
+        for port in self._stand_ins.keys() - wanted.keys():
+            self._stop_reading(self._stand_ins.pop(port))
+        for port in wanted.keys() - self._stand_ins.keys():
+            try:
+                sock = datagrams.bind(self._bind, port)
+            except OSError as error:
+                log.debug("port %d can't stand in for somebody outside: %s", port, error)
+                outside.block(port, error.errno == errno.EADDRINUSE)
+                continue
+            self._stand_ins[port] = sock
+            self._loop.add_reader(sock, self._take_in, sock, self._at_stand_in(port))
+
+
+def _families(bind: str) -> list[socket.AddressFamily]:
+    """The families of what comes to sockets that are bound to an address."""
+    return [socket.AF_INET, socket.AF_INET6] if bind == "::" else [family_of(bind)]
+
+
+def _sending(family: socket.AddressFamily) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, datagrams.RECEIVE_BUFFER)
+    return sock

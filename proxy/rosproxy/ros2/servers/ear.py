@@ -1,0 +1,133 @@
+"""The ear: carries announcements of participants between a LAN's multicast and the proxy.
+
+Multicast ends at the bridge of a container network. This program runs in the host's network, hears
+there what participants announce to the group (SPDP), and tells the proxy, with the address that it
+came from; what the proxy announces it tells the LAN. It carries nothing else: no discovery of
+readers and writers, no user's data. It needs no right but to be in that network, and knows nothing
+by itself, so that it may be killed and started at any time.
+"""
+
+import asyncio
+import contextlib
+import errno
+import logging
+import socket
+from dataclasses import dataclass
+
+from rosproxy.forwarding import datagrams
+from rosproxy.forwarding.datagrams import DATAGRAMS_PER_TURN, LARGEST
+from rosproxy.net.addresses import HostPort, plain_address
+from rosproxy.ros2.discovery.domain_settings import (
+    PORTS_PER_DOMAIN,
+    SPDP_MULTICAST,
+)
+from rosproxy.ros2.discovery.rates import DiscoveryRates
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.rtps import RtpsError, by_source
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from rosproxy.ros2.servers.groups import GroupEars, family_of, groups_of, send_through
+
+log = logging.getLogger(__name__)
+
+PER_SECOND, BURST = 500.0, 2000.0
+"""Datagrams of one source that are read in a second, and at once, each of 256 bytes; a participant
+makes one in three seconds, the proxy those of all inside."""
+
+
+@dataclass(frozen=True, slots=True)
+class EarSettings:
+    """What an ear is told.
+
+    ``lan`` is this host's address on the LAN, ``bind`` where the proxy's announcements come in,
+    ``proxy`` the address and port of the proxy that hears the LAN's.
+    """
+
+    domain: int
+    lan: str
+    bind: HostPort
+    proxy: HostPort
+
+
+class Ear:
+    """Carries announcements from `start` on, until it is closed; needs a running event loop."""
+
+    def __init__(self, settings: EarSettings) -> None:
+        self._settings, self._loop = settings, asyncio.get_running_loop()
+        self._sockets: list[socket.socket] = []
+        self._port = SPDP_MULTICAST + PORTS_PER_DOMAIN * settings.domain
+        self._groups = GroupEars(self._port, self._begin, self._end)
+        self._rates = DiscoveryRates(PER_SECOND, BURST)
+        self.heard = self.told = self.dropped = 0
+
+    def start(self) -> None:
+        """Bind all sockets. Raises OSError."""
+        settings = self._settings
+        self._own = datagrams.bind(settings.bind.host, settings.bind.port)
+        self._sockets.append(self._own)
+        self._lan = datagrams.bind(settings.lan, 0)
+        self._sockets.append(self._lan)
+        send_through(self._lan, settings.lan, loop=True)  # for participants on this very host, too
+        self._groups.open([family_of(settings.lan)])
+        if not self._groups.join([settings.lan]):
+            text = f"the group can't be heard where this host has {settings.lan}"
+            raise OSError(errno.EADDRNOTAVAIL, text)
+        self._loop.add_reader(self._own, self._tell)
+
+    def close(self) -> None:
+        """End."""
+        self._groups.close()
+        for sock in self._sockets:
+            self._end(sock)
+
+    def _begin(self, sock: socket.socket) -> None:
+        self._loop.add_reader(sock, self._hear, sock)
+
+    def _end(self, sock: socket.socket) -> None:
+        self._loop.remove_reader(sock)
+        sock.close()
+
+    def _hear(self, lan: socket.socket) -> None:
+        """Tell the proxy what the LAN announces."""
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(DATAGRAMS_PER_TURN):
+                datagram, sender = lan.recvfrom(LARGEST)
+                source = plain_address(sender[0])
+                for one in self._announcements(datagram, source):
+                    self.heard += 1
+                    self._send(self._own, wrapped(source, one), self._settings.proxy)
+
+    def _tell(self) -> None:
+        """Tell the LAN what the proxy announces."""
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(DATAGRAMS_PER_TURN):
+                try:
+                    datagram, sender = self._own.recvfrom(LARGEST)
+                except ConnectionRefusedError:  # the proxy is away
+                    continue
+                source = plain_address(sender[0])
+                if source != self._settings.proxy.host:
+                    self.dropped += 1
+                    continue
+                for one in self._announcements(datagram, source):
+                    self.told += 1
+                    for group in groups_of(self._settings.lan):
+                        self._send(self._lan, one, HostPort(group, self._port))
+
+    def _announcements(self, datagram: bytes, source: str) -> list[bytes]:
+        """The announcements of participants in a datagram, if it is not one too many of its source.
+
+        Several participants of a program may share it.
+        """
+        found = list[bytes]()
+        if self._rates.take(source, len(datagram), self._loop.time()):
+            with contextlib.suppress(RtpsError):
+                messages = map(read_discovery, by_source(datagram))
+                found = [one.datagram for one in messages if one.of_participant is not None]
+        self.dropped += not found
+        return found
+
+    def _send(self, sock: socket.socket, data: bytes, to: HostPort) -> None:
+        try:
+            sock.sendto(data, (to.host, to.port))
+        except OSError as error:
+            log.debug("an announcement to %s: %s", to, error)

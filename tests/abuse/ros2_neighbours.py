@@ -1,0 +1,171 @@
+"""Neighbours of a ROS 2 proxy, made of sockets: one that is to be served, and those that flood.
+
+A `Participant` announces itself as DDS does, and gets what is sent to it. A `Flood` sends from a
+thread as fast as it may, from addresses that it has or, in packets made by hand, from any.
+"""
+
+import itertools
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from time import monotonic
+from types import TracebackType
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from tests.unit.ros2.discovery.domains import spdp
+
+WELL_KNOWN = 7410
+AGAIN = 0.1
+"""Seconds after which an announcement is repeated that may be lost."""
+PATIENCE = 60.0
+
+Where = tuple[str, int]
+
+
+def udp(address: str, port: int = 0) -> socket.socket:
+    """A socket at an address of this machine."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024 * 1024)
+    sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
+    sock.bind((address, port))
+    return sock
+
+
+class Participant:
+    """A participant at an address, with a socket for metatraffic and one for data."""
+
+    def __init__(self, prefix: bytes, address: str, port: int) -> None:
+        self.prefix, self.address, self.port = prefix, address, port
+        self.meta, self.data = udp(address, port), udp(address, port + 1)
+
+    def close(self) -> None:
+        """End, without a word."""
+        self.meta.close()
+        self.data.close()
+
+    def announce(self, *to: Where) -> None:
+        """Announce itself."""
+        for where in to:
+            self.meta.sendto(spdp(self.prefix, self.address, self.port), where)
+
+    def hears(self, prefix: bytes, asked: Callable[[], object]) -> list[HostPort]:
+        """The locators in another's announcement, once that comes; ``asked`` is done meanwhile."""
+        datagram = self._wait(self.meta, asked, lambda found: _announces(found, prefix))
+        (told,) = read_discovery(datagram).announcements
+        return [where for _, where in told.reached_at(datagram)]
+
+    def gets(self, content: bytes, asked: Callable[[], object]) -> None:
+        """Wait for user's data; ``asked`` is done meanwhile."""
+        self._wait(self.data, asked, lambda found: found == content)
+
+    def _wait(
+        self, sock: socket.socket, asked: Callable[[], object], wanted: Callable[[bytes], bool]
+    ) -> bytes:
+        sock.settimeout(AGAIN)
+        end = monotonic() + PATIENCE
+        while monotonic() < end:
+            asked()
+            again = monotonic() + AGAIN
+            while monotonic() < again:
+                try:
+                    found = sock.recv(65536)
+                except TimeoutError:
+                    break
+                if wanted(found):
+                    return found
+        raise AssertionError(f"{self.address} did not get what it waited for")
+
+
+def _announces(datagram: bytes, prefix: bytes) -> bool:
+    told = read_discovery(datagram).of_participant
+    return source_prefix(datagram) == prefix and told is not None and not told.ended
+
+
+def packet(source: str, to: Where, datagram: bytes) -> bytes:
+    """An IPv4 packet with a datagram from any address; the kernel adds what is zero here."""
+    length = 8 + len(datagram)
+    head = struct.pack(">BBHHHBBH", 0x45, 0, 20 + length, 0, 0, 64, socket.IPPROTO_UDP, 0)
+    head += socket.inet_aton(source) + socket.inet_aton(to[0])
+    return head + struct.pack(">HHHH", WELL_KNOWN, to[1], length, 0) + datagram
+
+
+def forge(source: str, to: Where, datagram: bytes) -> None:
+    """Send a datagram from an address that is another's."""
+    with socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW) as raw:
+        raw.sendto(packet(source, to, datagram), (to[0], 0))
+
+
+class Flood:
+    """Sends datagrams over and over while the context lasts; ``sent`` counts them.
+
+    Each comes with where it is from, an address of this machine's, and where it goes.
+    """
+
+    def __init__(self, datagrams: Iterable[tuple[str, Where, bytes]], is_forged: bool) -> None:
+        self._datagrams, self._is_forged = list(datagrams), is_forged
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.sent = 0
+
+    def __enter__(self) -> "Flood":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def wait(self, count: int) -> None:
+        """Wait until so many have been sent."""
+        end = monotonic() + PATIENCE
+        while self.sent < count and self._thread.is_alive():
+            assert monotonic() < end, f"only {self.sent} of {count} datagrams were sent"
+            self._ended.wait(0.05)
+        assert self.sent >= count
+
+    def _run(self) -> None:
+        sources = {source for source, _, _ in self._datagrams}
+        raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+        own = {} if self._is_forged else {source: udp(source) for source in sources}
+        for source, to, datagram in itertools.cycle(self._datagrams):
+            if self._ended.is_set():
+                break
+            if self._is_forged:
+                raw.sendto(packet(source, to, datagram), (to[0], 0))
+            else:
+                own[source].sendto(datagram, to)
+            self.sent += 1
+        for sock in (raw, *own.values()):
+            sock.close()
+
+
+class Counted:
+    """All bytes of datagrams that come to an address of this machine, at whatever port."""
+
+    def __init__(self, address: str) -> None:
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_UDP)
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 * 1024 * 1024)
+        self._sock.bind((address, 0))
+        self._sock.setblocking(False)
+
+    def bytes_from(self, sources: Sequence[str]) -> int:
+        """Those that have come from some addresses since it was asked last."""
+        found = 0
+        while True:
+            try:
+                data, (source, _) = self._sock.recvfrom(65536)
+            except BlockingIOError:
+                return found
+            found += len(data) - 28 if source in sources else 0
+
+    def close(self) -> None:
+        """End."""
+        self._sock.close()

@@ -1,0 +1,258 @@
+"""ROS 2: whoever sends datagrams, and however many; others are served, and nobody is flooded."""
+
+import itertools
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from subprocess import PIPE, Popen
+
+import pytest
+
+from examples.demo.fake_http import free_ports
+from examples.demo.proxy_process import clean_environment
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.servers.groups import group_socket, join
+from tests.abuse.apart import APART, APART_HOST, INSIDE, NODES, STRANGERS
+from tests.abuse.conftest import Abused
+from tests.abuse.ros2_neighbours import WELL_KNOWN, Counted, Flood, Participant, Where, forge
+from tests.integration.net import until
+from tests.unit.ros2.discovery.domains import SEDP_WRITERS, farewell, sedp, spdp
+from tests.unit.ros2.protocol.messages import (
+    data,
+    fragment,
+    message,
+    parameter_list,
+    payload,
+    submessage,
+)
+
+GOOD, ROBOT = bytes([1, 15, 1]) + bytes(9), bytes([1, 15, 2]) + bytes(9)
+EVIL, EAR, VICTIM = NODES[1], NODES[19], STRANGERS[9]
+PORTS = 64
+MORE = 20_000_000
+"""Bytes that a second flood may take more than the first."""
+AMONG = 20_000
+"""Datagrams of a flood in which everybody else is served."""
+ANNOUNCED = APART, WELL_KNOWN
+"""Where those inside announce themselves."""
+GROUP = "239.255.0.1", 7400
+"""Where those on the LAN do."""
+
+
+@pytest.fixture
+def first() -> int:
+    """The first port of the proxy's range."""
+    return free_ports(PORTS)
+
+
+@pytest.fixture
+def abused(start_abused, _apart, first) -> Abused:
+    """A proxy for ROS 2 that is a machine of its own."""
+    return start_abused(
+        ros=2,
+        prefix=_apart.prefix,
+        advertise_host=APART_HOST,
+        inside_network=INSIDE,
+        admin_bind=f"{APART}:{free_ports(1)}",
+        port_range=f"{first}-{first + PORTS - 1}",
+        ros2_peer=f"{STRANGERS[0]}:{WELL_KNOWN}",
+        ros2_ear=f"{EAR}:{WELL_KNOWN}",
+    )
+
+
+@pytest.fixture
+def good(abused) -> Iterator[Participant]:
+    """A participant inside."""
+    with closing(Participant(GOOD, NODES[0], WELL_KNOWN)) as made:
+        yield made
+
+
+@pytest.fixture
+def robot(abused) -> Iterator[Participant]:
+    """A participant at the proxy's peer."""
+    with closing(Participant(ROBOT, STRANGERS[0], WELL_KNOWN)) as made:
+        yield made
+
+
+def served(good: Participant, robot: Participant, word: bytes) -> list[Where]:
+    """Hold that both find each other, and that data comes in; where the one inside is reached."""
+    found = robot.hears(GOOD, lambda: good.announce(ANNOUNCED))
+    assert [where.host for where in found] == [APART_HOST] * 2
+    meta, user = ((where.host, where.port) for where in found)
+    (stand_in, _) = good.hears(ROBOT, lambda: robot.announce(meta))
+    assert stand_in.host == APART
+    content = message(submessage(0x07, 0, bytes(24) + word), prefix=ROBOT)
+    good.gets(content, lambda: robot.data.sendto(content, user))
+    return [meta, user]
+
+
+def prefix(number: int) -> bytes:
+    return bytes([1, 15, 9, 9]) + number.to_bytes(8, "big")
+
+
+def described(number: int, count: int) -> bytes:
+    """A topic's description with many locators and parameters."""
+    name = b"rt/%06d\0" % number * 20
+    locators = [pack_locator(HostPort(EVIL, 1024 + one), "<") for one in range(count)]
+    held = [(Pid.UNICAST_LOCATOR, one) for one in locators] + [(0x1234, b"")] * count
+    return payload([(Pid.TOPIC_NAME, struct.pack("<I", len(name)) + name), *held])
+
+
+def heavy(number: int) -> list[bytes]:
+    """Datagrams of a participant that are made to take time and memory."""
+    own, sequences = prefix(number % 60), range(number * 256 + 1, number * 256 + 257)
+    qos = parameter_list([(0x1234, b"")] * 40)
+    kinds = [
+        [data(described(one, 200), writer=SEDP_WRITERS, sequence=one) for one in sequences[:8]],
+        [data(payload([]), qos=qos, writer=SEDP_WRITERS, sequence=one) for one in sequences],
+        [fragment(b"x", 1, 128, 300, writer=SEDP_WRITERS, sequence=one) for one in sequences[:60]],
+        [data(described(one, 1), writer=SEDP_WRITERS, sequence=one) for one in sequences[:150]],
+        [submessage(0x07, 0, bytes(4) + SEDP_WRITERS.to_bytes(4, "big") + b"\1" * 20)] * 256,
+    ]
+    kinds[2] += kinds[0][:7]
+    return [message(*one, prefix=own)[:65_000] for one in kinds]
+
+
+def announced() -> list[tuple[str, Where, bytes]]:
+    """Participants that come, speak at length, go, and are too many."""
+    said = [[spdp(prefix(one), EVIL, 9000 + one), *heavy(one)] for one in range(100)]
+    said += [[spdp(prefix(one), EVIL), farewell(prefix(one))] for one in range(40, 400)]
+    return [(EVIL, ANNOUNCED, one) for one in itertools.chain(*said)]
+
+
+async def test_one_address_inside_floods(abused, good, robot):
+    """Thirty long datagrams a second kept /healthz from answering; fragments took 600 MB."""
+    served(good, robot, b"before")
+
+    def known() -> int:
+        return sum(one["address"] == EVIL for one in abused.status()["domains"][0]["inside"])
+
+    with abused.watched():
+        arrived = [(EVIL, ANNOUNCED, spdp(prefix(one), EVIL, 9000 + one)) for one in range(60)]
+        with Flood(arrived, is_forged=False):
+            await until(lambda: known() == 60, "they have been taken in")
+        with Flood(announced(), is_forged=False) as flood:
+            served(good, robot, b"amid")
+            await until(lambda: "rate" in abused.refused(), "it makes more than it may")
+            flood.wait(AMONG)
+        served(good, robot, b"after")
+        most = abused.most_memory()
+        with Flood(announced(), is_forged=False) as flood:
+            flood.wait(AMONG)
+        served(good, robot, b"again")
+        goodbyes = [(EVIL, ANNOUNCED, farewell(prefix(one))) for one in range(400)]
+        with Flood(goodbyes, is_forged=False):
+            await until(lambda: known() == 0, "they have gone")
+    assert abused.most_memory() - most < MORE
+
+
+def test_strangers_flood(abused, good, robot, first):
+    """At all ports, from addresses of their own and from forged ones."""
+    leases = served(good, robot, b"before")
+    ports = [(APART, port) for port in range(first, first + PORTS)]
+    said = [spdp(prefix(1), STRANGERS[3]), *heavy(1), farewell(GOOD), b"\0" * 999]
+    said += [sedp(ROBOT, STRANGERS[0], 4000, to=GOOD)]
+    own = [(STRANGERS[3], to, one) for to in ports for one in said if to not in leases[1:]]
+    forged = [
+        (f"198.18.{3 + number % 200}.{number % 250 + 1}", to, one[:1400])
+        for number, (_, to, one) in enumerate(own * 4)
+    ]
+    with closing(Counted(STRANGERS[3])) as counted, abused.watched():
+        for kind in (own, forged):
+            with Flood(kind, is_forged=kind is forged) as flood:
+                flood.wait(AMONG // 2)
+                assert served(good, robot, b"amid") == leases
+                flood.wait(AMONG)
+        assert served(good, robot, b"after") == leases
+        assert counted.bytes_from([APART, APART_HOST]) == 0
+    (domain,) = abused.status()["domains"]
+    assert [one["address"] for one in domain["outside"]] == [robot.address]
+
+
+def test_nobody_takes_or_ends_what_is_anothers(abused, good, robot, first):
+    """By its prefix, from inside and outside; nor gets a way to where it is not itself."""
+    leases = served(good, robot, b"before")
+    for number, source in enumerate((EVIL, STRANGERS[3])):
+        said = [
+            farewell(GOOD),
+            farewell(ROBOT),
+            spdp(GOOD, source, 9000),
+            spdp(ROBOT, source, 9000),
+            spdp(GOOD, good.address, 9000),
+            spdp(prefix(number), good.address, WELL_KNOWN),
+            message(submessage(0x0C, 0, bytes(8) + GOOD), farewell(GOOD)[20:], prefix=prefix(8)),
+        ]
+        to = [ANNOUNCED, (APART, first), (APART, leases[0][1])]
+        with Flood([(source, at, one) for at in to for one in said], is_forged=False) as flood:
+            flood.wait(2000)
+            assert served(good, robot, b"amid") == leases
+    (domain,) = abused.status()["domains"]
+    led = {lease["where"] for one in domain["inside"] for lease in one["leases"]}
+    assert led == {f"{good.address}:{WELL_KNOWN}", f"{good.address}:{WELL_KNOWN + 1}"}
+    assert {one["address"] for one in domain["outside"]} == {robot.address}
+
+
+def test_nobody_is_sent_more_than_came_from_him(abused, good, robot, first):
+    """A victim is named by a forger, and inside has much to say to all that it hears of."""
+    served(good, robot, b"before")
+    heard = [wrapped(VICTIM, spdp(prefix(one), VICTIM, 4000 + one)) for one in range(50)]
+    with closing(Counted(VICTIM)) as counted, abused.watched():
+        came = got = 0
+        for datagram in heard:
+            forge(EAR, (APART, first), datagram)
+            came += len(datagram) - 16
+            (stand_in, _) = good.hears(datagram[24:36], lambda sent=datagram: None)
+            for _ in range(100):
+                good.meta.sendto(sedp(GOOD, good.address, 4000), (stand_in.host, stand_in.port))
+            forge(VICTIM, (APART, first), farewell(prefix(999)))
+            served(good, robot, b"amid")
+            got += counted.bytes_from([APART, APART_HOST])
+            assert got <= came
+    assert got > 0
+    assert "unproven" in abused.refused()
+
+
+@pytest.fixture
+def ear(abused, first) -> Iterator[Popen[str]]:
+    """The ear, on the LAN of the strangers."""
+    command = [sys.executable, "-m", "rosproxy", "ear", "--lan", STRANGERS[1]]
+    command += ["--bind", f"{EAR}:{WELL_KNOWN}", "--proxy", f"{APART}:{first}"]
+    with Popen(command, stderr=PIPE, text=True, env=clean_environment()) as made:
+        assert made.stderr
+        assert "ready: " in made.stderr.readline()
+        yield made
+        made.terminate()
+        assert "Traceback" not in made.stderr.read()
+
+
+async def test_somebody_floods_the_lan(abused, good, ear):
+    """Others are heard meanwhile, and the LAN hears of inside."""
+    said = [message(prefix=prefix(1)), *heavy(1), *(spdp(prefix(n), EVIL) for n in range(30))]
+    laptop = Participant(ROBOT, STRANGERS[2], WELL_KNOWN)
+    listening = group_socket(HostPort(*GROUP))
+    join(listening, STRANGERS[2])
+
+    def is_known() -> bool:
+        laptop.announce(GROUP)
+        return STRANGERS[2] in {one["address"] for one in abused.status()["domains"][0]["outside"]}
+
+    def is_announced() -> bool:
+        good.announce(ANNOUNCED)
+        with suppress(BlockingIOError):
+            while True:
+                datagram = listening.recv(65536)
+                if datagram[8:20] == GOOD:
+                    return True
+        return False
+
+    flood = Flood([(STRANGERS[4], GROUP, one) for one in said], is_forged=False)
+    with closing(laptop), closing(listening), abused.watched(), flood:
+        flood.wait(AMONG // 10)
+        await until(is_known, "a participant on the LAN is met")
+        await until(is_announced, "the LAN hears of the one inside")
+        flood.wait(AMONG)
+    assert ear.poll() is None

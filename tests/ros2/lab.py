@@ -1,0 +1,192 @@
+"""What a test drives: machines, a proxy, an ear, and the participants that it starts."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+from rosproxy.admin.status_document import DomainStatus, ProxyStatus, parse_status
+from rosproxy.net.addresses import HostPort
+from tests.ros.processes import Process, stop_all, wait_until
+from tests.ros.topology import Place, Topology, run_command
+from tests.ros2.machines import PORTS
+
+ENVIRONMENTS = (
+    Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rosproxy" / "ros2"
+)
+NODES = Path(__file__).parent / "nodes"
+PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
+"""The program that stands for a node, by the implementation of DDS that it has."""
+EAR_PORT = 47090
+ADMIN_PORT = 11312
+
+
+def numbers(reader: Process) -> list[int]:
+    """The numbers of the messages that a subscriber has got, in their order."""
+    return [int(line.split()[2]) for line in reader.output().splitlines() if "got " in line]
+
+
+def is_whole(reader: Process) -> bool:
+    """Whether a subscriber has got each message once and in order, from its first one on."""
+    got = numbers(reader)
+    return got == list(range(got[0], got[0] + len(got)))
+
+
+class Lab:
+    """A robot outside, containers inside, and the proxy at the boundary."""
+
+    def __init__(self, topology: Topology, folder: Path) -> None:
+        self.topology, self.folder = topology, folder
+        self.proxy_prefix: tuple[str, ...] = ()
+        self.host = topology.plan.host
+        self.gateway = "172.30.1.1"
+        self.options: tuple[str, ...] = ("--ros2-peer", topology.plan.robot)
+        self.proxy: Process | None = None
+        self.ear: Process | None = None
+        self.nodes: list[Process] = []
+        self._numbers = itertools.count(1)
+
+    def place(self, role: str) -> Place:
+        return self.topology.places[role]
+
+    def unique(self, word: str) -> str:
+        """A name that nobody else has."""
+        return f"{word}_{next(self._numbers)}"
+
+    def start_proxy(self) -> None:
+        """Start the proxy and wait until it listens."""
+        argv = [*self.proxy_prefix, sys.executable, "-m", "rosproxy", "run", "--ros", "2"]
+        argv += ["--advertise-host", self.host, "--port-range", PORTS.bound, *self.options]
+        self.proxy = self._spawn("rosproxy", "px", argv, self._own_environment())
+        self.proxy.wait_for("ready: ")
+
+    def start_ear(self) -> None:
+        """Start the ear on the host."""
+        argv = [sys.executable, "-m", "rosproxy", "ear", "--lan", self.place("host").address]
+        argv += ["--bind", str(HostPort(self.gateway, EAR_PORT))]
+        argv += ["--proxy", str(HostPort(self.place("px").address, PORTS.first))]
+        self.ear = self._spawn("ear", "host", argv, self._own_environment())
+        self.ear.wait_for("ready: ")
+
+    def restart_proxy(self) -> None:
+        """Kill it and start it again."""
+        assert self.proxy is not None
+        self.proxy.kill()
+        self.start_proxy()
+
+    def node(
+        self,
+        vendor: str,
+        role: str,
+        kind: str,
+        name: str = "",
+        env: Mapping[str, str] | None = None,
+        **options: object,
+    ) -> Process:
+        """Start a node on a machine; options are those of its program."""
+        name = name or self.unique(kind.replace(",", "_"))
+        words = [str(ENVIRONMENTS / vendor / "bin/python"), str(NODES / PROGRAMS[vendor]), kind]
+        words += ["--name", name]
+        for option, value in options.items():
+            words.append(f"--{option.replace('_', '-')}")
+            words += [] if value is True else [str(value)]
+        usual = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": str(self.folder)}
+        node = self._spawn(
+            f"{vendor} {kind} {name} ({role})", role, words, {**usual, **(env or {})}
+        )
+        self.nodes.append(node)
+        return node
+
+    def status(self) -> ProxyStatus:
+        """What the proxy tells of itself."""
+        return parse_status(self._get("/status"))
+
+    def page(self) -> dict[str, Any]:
+        """What its live page shows."""
+        document: dict[str, Any] = json.loads(self._get("/graph"))
+        return document
+
+    def _get(self, path: str) -> bytes:
+        with self.place("px").entered():
+            asking = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            with closing(asking):
+                asking.request("GET", path)
+                return asking.getresponse().read()
+
+    def tool(self, command: str, *names: str, fails: bool = False) -> str:
+        """What a command prints that looks at the proxy, where that runs."""
+        argv = [sys.executable, "-m", "rosproxy", command, *names]
+        process = self._spawn(command, "px", argv, self._own_environment())
+        assert process.wait() == int(fails), process.output()
+        return process.output()
+
+    def domain(self) -> DomainStatus:
+        """What it tells of its domain."""
+        (domain,) = self.status().domains
+        return domain
+
+    def in_proxy(self, *argv: str) -> str:
+        """What a program prints on the proxy's machine."""
+        return run_command("ip", "netns", "exec", self.place("px").namespace, *argv)
+
+    def ports(self) -> dict[str, list[tuple[int, str]]]:
+        """The ports of the range with their locators, by participant inside."""
+        return {
+            one.guid_prefix: sorted((lease.port, lease.where) for lease in one.leases)
+            for one in self.domain().inside
+        }
+
+    def wait_for_participants(self, inside: int, outside: int, timeout: float = 60.0) -> None:
+        """Wait until the proxy knows so many on each side."""
+
+        def there() -> bool:
+            domain = self.domain()
+            return (len(domain.inside), len(domain.outside)) == (inside, outside)
+
+        wait_until(f"{inside} participants inside and {outside} outside", there, timeout)
+
+    def stop_nodes(self) -> None:
+        """End all nodes."""
+        stop_all(self.nodes)
+        self.nodes.clear()
+
+    def stop(self) -> None:
+        """End everything."""
+        stop_all([one for one in (self.proxy, self.ear) if one])
+
+    @contextmanager
+    def used(self) -> Iterator[None]:
+        """Check what was started, and end it, when it is not used any more."""
+        try:
+            yield
+            self.check()
+        finally:
+            self.stop_nodes()
+            self.stop()
+
+    def check(self) -> None:
+        """Raises AssertionError if the proxy or the ear has ended, or has failed inside."""
+        for one in (self.proxy, self.ear):
+            if one is not None:
+                assert one.returncode is None, one.output()
+                assert "Traceback" not in one.output(), one.output()
+
+    def transcripts(self) -> list[tuple[str, str]]:
+        """What everybody has printed."""
+        found = [*self.nodes, *(one for one in (self.proxy, self.ear) if one)]
+        return [(one.title, one.output()[-3000:]) for one in found]
+
+    def _own_environment(self) -> dict[str, str]:
+        env = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONUNBUFFERED": "1"}
+        return env | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+
+    def _spawn(self, title: str, role: str, argv: list[str], env: Mapping[str, str]) -> Process:
+        log = self.folder / f"{next(self._numbers):04d}.log"
+        return Process(title, self.place(role), argv, env, log)

@@ -1,0 +1,88 @@
+"""The machines of this layer: those of the real-ROS layer, with a /dev/shm of each one's own.
+
+    out (robot) -- host (NAT, published ports, the ear) -- bridge -- px (the proxy), c1, c2
+
+Participants compare machines to choose shared memory: two containers may look like one machine and
+yet have nothing in common. Here all do look like one.
+
+Where two hosts are wanted, there is all of this once more, with the same addresses inside, and the
+two LANs are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from tests.ros.processes import wait_until
+from tests.ros.topology import Place, Plan, PortMap, Topology, run_command
+
+PORTS = PortMap(47100, 47163, 47100)
+PLAN = Plan("r", (("c1", "c2"),), PORTS)
+ISOLATED = Plan("q", (("c1", "c2"),), PORTS, isolated=True)
+OTHER_PLAN = replace(PLAN, name="o", host="10.77.0.11", robot="10.77.0.12")
+
+
+class Machines(Protocol):
+    """What has machines: a topology, or the world of a benchmark."""
+
+    places: dict[str, Place]
+
+
+@dataclass
+class Machine(Place):
+    """A place with a /dev/shm of its own, which is a folder."""
+
+    shared_memory: Path = Path("/dev/shm")
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """The command line that runs `argv` there, as the same single process."""
+        mount = f'mount --bind {self.shared_memory} /dev/shm && exec "$@"'
+        return super().command(["unshare", "--mount", "sh", "-c", mount, "sh", *argv])
+
+
+@contextmanager
+def built(plan: Plan, folder: Path) -> Iterator[Topology]:
+    """The machines of a plan, whose links are up; they go at the end."""
+    topology = Topology(plan)
+    try:
+        topology.build()
+        with_shared_memory(topology, folder)
+        wait_for_links(topology)
+        yield topology
+    finally:
+        topology.remove()
+
+
+def with_shared_memory(topology: Topology, folder: Path) -> None:
+    """Give each machine of a topology a /dev/shm of its own."""
+    for role, place in topology.places.items():
+        own = folder / f"shm-{role}"
+        own.mkdir()
+        topology.places[role] = Machine(
+            place.role, place.namespace, place.hostname, place.addresses, own
+        )
+
+
+def join_lans(one: Topology, other: Topology) -> None:
+    """Make the LANs of two topologies one."""
+    here, there = (topology.places["host"].namespace for topology in (one, other))
+    peer = ("peer", "name", "lan9", "netns", there)
+    run_command("ip", "-n", here, "link", "add", "lan9", "type", "veth", *peer)
+    for namespace in (here, there):
+        run_command("ip", "-n", namespace, "link", "set", "lan9", "master", "out0", "up")
+
+
+def wait_for_links(topology: Machines) -> None:
+    """Wait until all interfaces run: a participant that starts earlier knows loopback alone."""
+    for place in topology.places.values():
+        wait_until(f"the links of {place.role} are up", lambda place=place: _runs(place), 20)
+
+
+def _runs(place: Place) -> bool:
+    found = run_command("ip", "-n", place.namespace, "-o", "addr", "show")
+    links = run_command("ip", "-n", place.namespace, "-o", "link", "show", "up")
+    return "tentative" not in found and "NO-CARRIER" not in links

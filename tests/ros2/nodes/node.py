@@ -1,0 +1,271 @@
+"""A ROS 2 node as tests need one. It runs under the Python of a ROS 2 distribution, by itself.
+
+It is of one kind, or of several at once (``pub,serve``), and with ``--contexts`` there are several
+such nodes in the process, each with a participant of its own. Prints a line for each thing that
+happens, and ends by SIGINT.
+"""
+
+import argparse
+import sys
+import threading
+import time
+
+import rclpy
+from rclpy.action import ActionClient, ActionServer
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+)
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+# An action that is over in a millisecond ends before its feedback's publisher and the client's
+# subscription have found each other; feedback is volatile, so that is lost without a proxy as well.
+FEEDBACK_PAUSE = 0.2
+# A server drops a response whose client's reader it does not know after a tenth of a second
+# (rmw_fastrtps, `check_for_subscription`), though the client knows the server already. So on a busy
+# machine a first goal's result may be lost without a proxy as well; clients ask again.
+GOAL_PATIENCE = 15.0
+
+
+def say(*words: object) -> None:
+    print(*words, flush=True)
+
+
+def profile(options: argparse.Namespace) -> QoSProfile:
+    found = QoSProfile(depth=options.depth)
+    if options.best_effort:
+        found.reliability = ReliabilityPolicy.BEST_EFFORT
+    if options.latched:
+        found.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    if options.deadline:
+        found.deadline = Duration(seconds=options.deadline)
+    if options.liveliness:
+        found.liveliness = LivelinessPolicy[options.liveliness]
+        found.liveliness_lease_duration = Duration(seconds=options.lease)
+    return found
+
+
+def incompatible(event: object) -> None:
+    say("incompatible", qos_policy_name_from_kind(event.last_policy_kind).lower())
+
+
+def publish(node: Node, options: argparse.Namespace) -> None:
+    events = PublisherEventCallbacks(
+        deadline=lambda event: say("offered deadline missed", event.total_count),
+        liveliness=lambda event: say("liveliness lost", event.total_count),
+        incompatible_qos=incompatible,
+    )
+    publisher = node.create_publisher(
+        String, options.topic, profile(options), event_callbacks=events
+    )
+    number = 0
+
+    def send() -> None:
+        nonlocal number
+        if options.matched and not publisher.get_subscription_count():
+            return
+        text = f"{options.word} {number}".ljust(options.size, ".")
+        publisher.publish(String(data=text))
+        say("sent", number)
+        number += 1
+        if number == options.count:
+            timer.cancel()
+
+    timer = node.create_timer(options.period, send)
+
+
+def subscribe(node: Node, options: argparse.Namespace) -> None:
+    def take(message: String) -> None:
+        text = message.data.rstrip(".")
+        say("got", text, "size", len(message.data), "at", f"{time.time():.3f}")
+
+    events = SubscriptionEventCallbacks(
+        deadline=lambda event: say("deadline missed", event.total_count),
+        liveliness=lambda event: say("alive", event.alive_count, "not", event.not_alive_count),
+        incompatible_qos=incompatible,
+    )
+    node.create_subscription(String, options.topic, take, profile(options), event_callbacks=events)
+    say("ready")
+
+
+def serve(node: Node, options: argparse.Namespace) -> None:
+    def answer(_: Trigger.Request, reply: Trigger.Response) -> Trigger.Response:
+        reply.success, reply.message = True, options.word
+        return reply
+
+    node.create_service(Trigger, options.topic, answer)
+    say("ready")
+
+
+def call(node: Node, options: argparse.Namespace) -> None:
+    client = node.create_client(Trigger, options.topic)
+    number = answered = 0
+
+    def ask() -> None:
+        nonlocal number
+        if not client.service_is_ready() or (options.in_turn and answered < number):
+            return
+        asked, started = number, time.monotonic()
+        number += 1
+        if number == options.count:
+            timer.cancel()
+
+        def done(future: object) -> None:
+            nonlocal answered
+            answered += 1
+            took = time.monotonic() - started
+            say("reply", asked, future.result().message, f"{took * 1000:.1f}", "ms")
+
+        client.call_async(Trigger.Request()).add_done_callback(done)
+
+    timer = node.create_timer(options.period, ask)
+
+
+def act(node: Node, options: argparse.Namespace) -> None:
+    def execute(goal: object) -> Fibonacci.Result:
+        sequence = [0, 1]
+        for _ in range(goal.request.order - 1):
+            sequence.append(sequence[-1] + sequence[-2])
+            goal.publish_feedback(Fibonacci.Feedback(sequence=sequence))
+            time.sleep(FEEDBACK_PAUSE)
+        goal.succeed()
+        return Fibonacci.Result(sequence=sequence)
+
+    node.kept = ActionServer(node, Fibonacci, options.topic, execute)
+    say("ready")
+
+
+def pursue(node: Node, options: argparse.Namespace) -> None:
+    client = node.kept = ActionClient(node, Fibonacci, options.topic)
+    asked = -GOAL_PATIENCE
+
+    def feedback(message: object) -> None:
+        say("feedback", len(message.feedback.sequence))
+
+    def accepted(future: object) -> None:
+        future.result().get_result_async().add_done_callback(done)
+
+    def done(future: object) -> None:
+        timer.cancel()
+        say("result", *future.result().result.sequence)
+
+    def ask() -> None:
+        nonlocal asked
+        now = time.monotonic()
+        if client.server_is_ready() and now - asked >= GOAL_PATIENCE:
+            asked = now
+            goal = Fibonacci.Goal(order=8)
+            client.send_goal_async(goal, feedback_callback=feedback).add_done_callback(accepted)
+
+    timer = node.create_timer(options.period, ask)
+
+
+def hold(node: Node, options: argparse.Namespace) -> None:
+    node.declare_parameter("speed", 1)
+    node.add_post_set_parameters_callback(
+        lambda changed: say("changed", *(f"{one.name}={one.value}" for one in changed))
+    )
+    say("ready")
+
+
+def tune(node: Node, options: argparse.Namespace) -> None:
+    client = node.kept = AsyncParameterClient(node, options.of)
+
+    def listed(future: object) -> None:
+        say("listed", *sorted(future.result().result.names))
+        asked = [Parameter("speed", Parameter.Type.INTEGER, 7)]
+        client.set_parameters(asked).add_done_callback(was_set)
+
+    def was_set(future: object) -> None:
+        say("set", *(result.successful for result in future.result().results))
+        client.get_parameters(["speed"]).add_done_callback(got)
+
+    def got(future: object) -> None:
+        say("parameter", *(value.integer_value for value in future.result().values))
+
+    def ask() -> None:
+        if client.services_are_ready():
+            timer.cancel()
+            client.list_parameters().add_done_callback(listed)
+
+    timer = node.create_timer(options.period, ask)
+
+
+def list_names(node: Node, options: argparse.Namespace) -> None:
+    node.create_timer(
+        options.period, lambda: say("nodes", *sorted(n for n in node.get_node_names()), "end")
+    )
+
+
+KINDS = {
+    "pub": publish,
+    "sub": subscribe,
+    "serve": serve,
+    "call": call,
+    "act": act,
+    "pursue": pursue,
+    "hold": hold,
+    "tune": tune,
+    "names": list_names,
+}
+
+
+def read_options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("kinds", type=lambda text: [KINDS[kind] for kind in text.split(",")])
+    parser.add_argument("--name", required=True)
+    parser.add_argument("--topic", default="/topic")
+    parser.add_argument("--word", default="hello")
+    parser.add_argument("--size", type=int, default=0)
+    parser.add_argument("--count", type=int, default=0)
+    parser.add_argument("--depth", type=int, default=10)
+    parser.add_argument("--period", type=float, default=0.1)
+    parser.add_argument("--matched", action="store_true", help="publish when somebody subscribes")
+    parser.add_argument("--best-effort", action="store_true")
+    parser.add_argument("--latched", action="store_true")
+    parser.add_argument("--deadline", type=float, default=0, help="seconds")
+    parser.add_argument("--liveliness", choices=LivelinessPolicy.__members__)
+    parser.add_argument("--lease", type=float, default=0, help="of liveliness, in seconds")
+    parser.add_argument("--in-turn", action="store_true", help="call when the last is answered")
+    parser.add_argument("--of", default="", help="the node whose parameters are asked for")
+    parser.add_argument("--contexts", type=int, default=1)
+    return parser.parse_args(sys.argv[1:])
+
+
+def run(name: str, options: argparse.Namespace) -> None:
+    context = Context()
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.ALL)
+    node = Node(name, context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    try:
+        for begin in options.kinds:
+            begin(node, options)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+
+
+def main() -> None:
+    options = read_options()
+    for number in range(1, options.contexts):
+        words = f"{options.name}_{number}", options
+        threading.Thread(target=run, args=words, daemon=True).start()
+    run(options.name, options)
+
+
+if __name__ == "__main__":
+    main()

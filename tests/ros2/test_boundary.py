@@ -1,0 +1,62 @@
+"""The boundary is one: without the proxy nothing passes, and all of it does once that has started.
+
+So what the other tests see pass is the proxy's doing. A listener on the near side shows that there
+was something to hear.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.ros2.lab import Lab
+
+PROXY = False
+EAR = True
+OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
+OFFERS = {"jazzy": "pub,serve,act,hold", "cyclone": "pub"}
+USES = {"jazzy": "sub,call,pursue,tune,names", "cyclone": "sub"}
+GOT = {
+    "jazzy": [
+        "^got hello ",
+        "^reply .* hello",
+        "^result 0 1 1 ",
+        "^parameter 7$",
+        "^nodes far near source end$",
+    ],
+    "cyclone": ["^got hello "],
+}
+
+
+OUTWARD, INWARD = ("c1", "c2", "out"), ("out", "out", "c1")
+
+
+@pytest.mark.parametrize(
+    ("vendor", "here", "near", "far"),
+    [
+        pytest.param("jazzy", *OUTWARD, marks=pytest.mark.smoke),
+        ("jazzy", *INWARD),
+        ("cyclone", *OUTWARD),
+        ("cyclone", *INWARD),
+    ],
+    ids=["jazzy-outward", "jazzy-inward", "cyclone-outward", "cyclone-inward"],
+)
+def test_nothing_passes_without_the_proxy(
+    lab: Lab, vendor: str, here: str, near: str, far: str
+) -> None:
+    words = {"topic": "/all", "of": "source"} if vendor == "jazzy" else {"topic": "/all"}
+    there = lab.node(vendor, far, USES[vendor], name="far", **words)
+    there.wait_for("^ready")
+    source = lab.node(vendor, here, OFFERS[vendor], name="source", topic="/all")
+    listener = lab.node(vendor, near, USES[vendor], name="near", **words)
+    for pattern in GOT[vendor][:4]:
+        listener.wait_for(pattern)
+    listener.wait_for_count("^got hello ", 15)
+    assert source.returncode is None
+    heard = {line.split()[0] for line in there.output().splitlines()}
+    assert heard <= {"ready", "nodes"}, there.output()
+    assert "source" not in there.output()
+
+    lab.start_proxy()
+
+    for pattern in GOT[vendor]:
+        there.wait_for(pattern)

@@ -1,0 +1,134 @@
+"""What can't work is told: by `rosproxy doctor`, with who is concerned and what mends it."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosproxy.doctor.rules.ros2 import SETTLED
+from tests.ros.processes import wait_until
+from tests.ros2.lab import Lab
+
+BAD_QOS = pytest.mark.parametrize(
+    ("policy", "offer", "request_"),
+    [
+        ("reliability", {"best_effort": True}, {}),
+        ("durability", {}, {"latched": True}),
+    ],
+    ids=["reliability", "durability"],
+)
+
+
+def wait_for_problem(lab: Lab, subject: str, there: bool = True) -> None:
+    """Wait until the proxy tells of a problem by itself, or no more."""
+
+    def told() -> bool:
+        return any(one.subject == subject for one in lab.status().problems) is there
+
+    wait_until(f"a problem of {subject}: {there}", told, 60)
+
+
+def wait_shown(lab: Lab, topic: str, state: str, text: str = "") -> None:
+    """Wait until the live page has a link so, and why."""
+
+    def is_shown() -> bool:
+        shown = [one for one in lab.page()["links"].values() if one["name"] == topic]
+        return any(one["state"] == state and text in one.get("text", "") for one in shown)
+
+    wait_until(f"the page shows {topic}: {state}", is_shown)
+
+
+def doctor_of_networks(lab: Lab) -> str:
+    """What the doctor says once the proxy has settled: before, it says nothing of who is there."""
+    wait_until("the proxy has settled", lambda: lab.status().uptime > SETTLED, 30)
+    return lab.tool("doctor")
+
+
+def line(text: str, start: str) -> str:
+    """The finding that begins so, in one line, with what mends it."""
+    shown = " ".join(text.split())
+    found = [part for part in shown.split("ERROR ") if part.startswith(start)]
+    assert found, text
+    return found[0]
+
+
+@BAD_QOS
+@pytest.mark.parametrize(
+    ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
+)
+def test_qos_that_does_not_match(
+    lab: Lab,
+    policy: str,
+    offer: dict[str, object],
+    request_: dict[str, object],
+    source: str,
+    sink: str,
+) -> None:
+    lab.node("jazzy", source, "pub", topic="/scan", **offer)
+    reader = lab.node("jazzy", sink, "sub", topic="/scan", **request_)
+    wait_for_problem(lab, "topic /scan")
+    told = line(lab.tool("doctor", fails=True), f"topic /scan: {policy} differs")
+    domain = lab.domain()
+    for one in (*domain.inside, *domain.outside):
+        assert f"{one.guid_prefix} at {one.address} (Fast DDS," in told
+    assert "> " in told
+    assert "got hello" not in reader.output()
+    wait_shown(lab, "/scan", "broken", policy)
+
+    reader.stop()
+    wait_for_problem(lab, "topic /scan", there=False)
+    lab.node("jazzy", sink, "sub", topic="/scan", **offer).wait_for_count("^got hello ", 5)
+    assert "Nothing wrong was found." in lab.tool("doctor")
+    wait_shown(lab, "/scan", "ok")
+
+
+def test_types_that_differ(lab: Lab) -> None:
+    lab.node("jazzy", "out", "pub", topic="/chatter")
+    lab.node("cyclone", "c1", "sub", topic="/rosout")
+    wait_for_problem(lab, "topic /rosout")
+    told = line(lab.tool("doctor", "/rosout", fails=True), "topic /rosout: type differs")
+    assert "offers rcl_interfaces/msg/Log" in told
+    assert "requests std_msgs/msg/String" in told
+
+
+def test_who_matches_is_told_of_a_topic(lab: Lab) -> None:
+    lab.node("jazzy", "c1", "pub", topic="/chatter")
+    lab.node("jazzy", "out", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+    told = lab.tool("doctor", "chatter")
+    assert "they match" in told
+    assert "Nothing wrong was found." in told
+    assert "no participant has" in lab.tool("doctor", "/chater", fails=True)
+
+
+@pytest.mark.parametrize("vendor", ["jazzy", "kilted"])
+def test_a_discovery_range_of_one_machine(lab: Lab, vendor: str) -> None:
+    env = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    lab.node(vendor, "c1", "pub", topic="/chatter", env=env).wait_for("^sent")
+    told = doctor_of_networks(lab)
+    assert f"at {lab.place('c1').address} (Fast DDS, inside): it answers, but does not" in told
+    assert "ROS_STATIC_PEERS" in told
+
+    # As it says: the range stays, and the proxy is a peer.
+    env["ROS_STATIC_PEERS"] = lab.place("px").address
+    lab.node(vendor, "c2", "pub", topic="/chatter", env=env)
+    lab.node(vendor, "out", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+    assert lab.place("c2").address in {one.address for one in lab.domain().inside}
+
+
+def test_another_domain(lab: Lab) -> None:
+    lab.node("jazzy", "c1", "pub", topic="/chatter", env={"ROS_DOMAIN_ID": "5"}).wait_for("^sent")
+    lab.node("kilted", "c2", "pub", topic="/chatter", env={"ROS_DOMAIN_ID": "7"}).wait_for("^sent")
+    told = doctor_of_networks(lab)
+    for role, domain in (("c1", 5), ("c2", 7)):
+        assert f"at {lab.place(role).address} (Fast DDS, inside): it is in domain {domain};" in told
+    assert "ROS_DOMAIN_ID=0 for it, or --ros2-domain 5" in told
+
+
+def test_tcp(lab: Lab) -> None:
+    env = {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA"}
+    lab.node("jazzy", "c1", "pub", topic="/chatter", env=env).wait_for("^sent")
+    lab.wait_for_participants(1, 0)
+    (one,) = lab.domain().inside
+    wait_for_problem(lab, one.guid_prefix)
+    told = line(lab.tool("doctor", fails=True), one.guid_prefix)
+    assert f"at {one.address} (Fast DDS, inside): it is reached by TCP alone" in told
+    assert "unset FASTDDS_BUILTIN_TRANSPORTS" in told

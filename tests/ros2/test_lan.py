@@ -1,0 +1,57 @@
+"""No peer is known by name: the ear carries announcements between the LAN and the proxy.
+
+So Cyclone DDS is found outside as well: unless told otherwise it has no well-known ports.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.ros2.lab import Lab
+
+OPTIONS = ("--ros2-ear", "172.30.1.1:47090")
+EAR = True
+PAIRS = [
+    ("jazzy", "jazzy"),
+    ("kilted", "kilted"),
+    ("jazzy", "cyclone"),
+    ("cyclone", "jazzy"),
+    ("cyclone", "cyclone"),
+    ("cyclone", "kilted"),
+    ("kilted", "cyclone"),
+]
+ways = pytest.mark.parametrize(
+    ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
+)
+
+
+@ways
+@pytest.mark.parametrize(("one", "other"), PAIRS, ids=[f"{one}-to-{other}" for one, other in PAIRS])
+def test_topics(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
+    lab.node(one, source, "pub", topic="/chatter")
+    lab.node(other, sink, "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+
+
+@ways
+@pytest.mark.parametrize(("one", "other"), PAIRS[2:4], ids=["jazzy-to-cyclone", "cyclone-to-jazzy"])
+def test_messages_in_fragments(lab: Lab, one: str, other: str, source: str, sink: str) -> None:
+    lab.node(one, source, "pub", topic="/image", size=1_000_000, period=0.5)
+    reader = lab.node(other, sink, "sub", topic="/image")
+    reader.wait_for_count("^got hello .* size 1000000", 5)
+
+
+def test_a_participant_on_the_host_itself_is_met(lab: Lab) -> None:
+    lab.node("jazzy", "c1", "pub", topic="/chatter")
+    lab.node("jazzy", "host", "sub", topic="/chatter").wait_for_count("^got hello ", 5)
+
+
+def test_the_ear_may_be_killed(lab: Lab) -> None:
+    lab.node("jazzy", "c1", "pub", topic="/chatter")
+    reader = lab.node("jazzy", "out", "sub", topic="/chatter")
+    reader.wait_for_count("^got hello ", 5)
+    assert lab.ear is not None
+    lab.ear.kill()
+    lab.start_ear()
+    later = lab.node("jazzy", "out", "sub", topic="/chatter")
+    for one in (reader, later):
+        one.wait_for_count("^got hello ", 5, since=one.mark())

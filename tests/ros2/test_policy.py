@@ -1,0 +1,91 @@
+"""Policy: what is denied is not there for the other side; a change needs no restart of anybody."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.ros.processes import Process, wait_until
+from tests.ros2.lab import Lab
+
+
+def rules(lab: Lab, *texts: str) -> None:
+    """Write the policy's file, which the proxy reads again by itself."""
+    (lab.folder / "rules").write_text("\n".join(texts) + "\n")
+
+
+@pytest.fixture
+def lab(lab: Lab) -> Lab:
+    """A proxy with a file of rules that is empty so far."""
+    lab.stop()
+    rules(lab, "# nothing yet")
+    lab.options = (*lab.options, "--policy-file", str(lab.folder / "rules"))
+    lab.start_proxy()
+    return lab
+
+
+def gets(reader: Process, count: int = 5) -> None:
+    """Wait until it gets so many from now on."""
+    reader.wait_for_count("^(got|reply)", count, since=reader.mark())
+
+
+def gets_nothing(reader: Process, meanwhile: Process) -> None:
+    """While another gets messages, this one does not."""
+    gets(meanwhile, 3)  # what was on its way
+    mark = reader.mark()
+    gets(meanwhile, 20)
+    assert not [line for line in reader.output()[mark:].splitlines() if line.startswith("got")]
+
+
+def hidden(lab: Lab) -> set[tuple[str, str]]:
+    policy = lab.status().policy
+    assert policy is not None
+    return {(one.kind, one.name) for one in policy.hidden}
+
+
+@pytest.mark.parametrize(
+    ("source", "sink", "kind"), [("c1", "out", "publish"), ("out", "c1", "subscribe")]
+)
+@pytest.mark.parametrize(("inside", "outside"), [("jazzy", "kilted"), ("cyclone", "jazzy")])
+def test_a_topic_is_denied_and_allowed_again(
+    lab: Lab, inside: str, outside: str, source: str, sink: str, kind: str
+) -> None:
+    vendors = {"c1": inside, "out": outside}
+    for topic in ("/secret", "/open"):
+        lab.node(vendors[source], source, "pub", topic=topic)
+    secret = lab.node(vendors[sink], sink, "sub", topic="/secret")
+    public = lab.node(vendors[sink], sink, "sub", topic="/open")
+    gets(secret)
+    gets(public)
+    rules(lab, f"deny {kind} /secret")
+    wait_until("it is hidden", lambda: (kind, "/secret") in hidden(lab), 10)
+    gets_nothing(secret, public)
+    rules(lab, "# allowed again")
+    gets(secret)
+    gets(public)
+
+
+def test_a_service_is_denied_from_the_start(lab: Lab) -> None:
+    rules(lab, "deny serve /secret")
+    lab.node("jazzy", "c1", "serve", topic="/secret")
+    lab.node("jazzy", "c1", "serve", topic="/open")
+    asking = lab.node("jazzy", "out", "call", topic="/secret")
+    gets(lab.node("jazzy", "out", "call", topic="/open"))
+    gets(lab.node("jazzy", "c2", "call", topic="/secret"))
+    assert "reply" not in asking.output()
+
+
+@pytest.mark.parametrize(("source", "sink"), [("c1", "out"), ("out", "c1")])
+def test_announcements_in_fragments_are_read(lab: Lab, source: str, sink: str) -> None:
+    """Cyclone DDS sends what is longer than 1,344 bytes in several datagrams."""
+    kind = "publish" if source == "c1" else "subscribe"
+    rules(lab, f"deny {kind} /secret")
+    vendors = {"c1": "cyclone", "out": "jazzy"}
+    long = {"user_data": 6000}
+    for topic in ("/secret", "/open"):
+        lab.node(vendors[source], source, "pub", topic=topic, **(long if source == "c1" else {}))
+    secret = lab.node(vendors[sink], sink, "sub", topic="/secret", **(long if sink == "c1" else {}))
+    public = lab.node(vendors[sink], sink, "sub", topic="/open", **(long if sink == "c1" else {}))
+    gets(public, 20)
+    assert "got" not in secret.output()
+    told = {name for one in lab.domain().inside for name in (*one.publishes, *one.subscribes)}
+    assert told >= {"/secret", "/open"}

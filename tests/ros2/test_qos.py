@@ -1,0 +1,47 @@
+"""What readers and writers promise each other holds across the boundary, and who breaks it is told.
+
+Deadlines are the reader's own clock; liveliness is told by messages of discovery.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.ros2.lab import Lab
+
+ways = pytest.mark.parametrize(
+    ("source", "sink"), [("c1", "out"), ("out", "c1")], ids=["outward", "inward"]
+)
+LEASE = 3.0
+
+
+@ways
+def test_deadline(lab: Lab, source: str, sink: str) -> None:
+    writer = lab.node("jazzy", source, "pub", topic="/imu", deadline=2, count=30)
+    reader = lab.node("jazzy", sink, "sub", topic="/imu", deadline=2)
+    strict = lab.node("jazzy", sink, "sub", topic="/imu", deadline=0.01)
+    reader.wait_for("^deadline missed 1")
+    assert "got hello 29 " in reader.output(), "it was missed before the last message"
+    writer.wait_for("^offered deadline missed 1")
+    for one in (writer, strict):
+        one.wait_for("^incompatible deadline")
+    assert "got" not in strict.output()
+
+
+@ways
+def test_liveliness(lab: Lab, source: str, sink: str) -> None:
+    words = {"topic": "/arm", "liveliness": "AUTOMATIC", "lease": LEASE}
+    writer = lab.node("jazzy", source, "pub", count=1, **words)
+    reader = lab.node("jazzy", sink, "sub", **words)
+    manual = {"topic": "/leg", "liveliness": "MANUAL_BY_TOPIC", "lease": LEASE}
+    silent = lab.node("jazzy", source, "pub", count=10, matched=True, **manual)
+    listener = lab.node("jazzy", sink, "sub", **manual)
+    for one in (reader, listener):
+        one.wait_for("^alive 1 not 0")
+    listener.wait_for("^alive 0 not 1")
+    silent.wait_for("^liveliness lost 1")
+    assert silent.returncode is None
+    # The other has published nothing for longer: its participant says by itself that it is there.
+    assert "alive 0" not in reader.output()
+    writer.kill()
+    reader.wait_for("^alive 0 not 1")

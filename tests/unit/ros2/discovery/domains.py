@@ -1,0 +1,86 @@
+"""A domain as tests need one, and datagrams of participants for it."""
+
+import struct
+from collections.abc import Sequence
+
+from rosproxy.leases.ports import PortMap, PortPool, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Judge, Outgoing
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.registry.ports import REMEMBERED
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from tests.unit.ros2.protocol.messages import data, message, parameter_list, payload, submessage
+
+INSIDE, OTHER, NEAR = "172.30.0.5", "172.30.0.6", "172.30.0.2"
+HOST, ROBOT, STRANGER = "10.0.0.1", "10.0.0.9", "10.0.0.66"
+EAR = HostPort("172.30.0.1", 7500)
+A, B = b"\x01\x0f" + bytes(10), b"\x01\x0f" + bytes(range(10))
+RANGE = PortMap(PortRange(45000, 45015), PortRange(46000, 46015))
+NOW = REMEMBERED + 1
+SEDP_WRITERS = 0x000003C2
+
+
+def everything(*_: object) -> bool:
+    return True
+
+
+def domain(
+    peers: Sequence[str] = (ROBOT,),
+    ear: HostPort | None = EAR,
+    judge: Judge = everything,
+    both_ways: bool = False,
+    ports: PortMap = RANGE,
+) -> Domain:
+    settings = DomainSettings(
+        number=0,
+        hosts=(HOST,),
+        ports=ports,
+        near=lambda _: NEAR,
+        note=lambda *_: None,
+        judge=judge,
+        both_ways=both_ways,
+        peers=tuple(HostPort(peer, 7410) for peer in peers),
+        ear=ear,
+    )
+    return Domain.starting(settings, PortPool(ports.listen), b"the observer", 0.0)
+
+
+def spdp(prefix: bytes, address: str, port: int = 7410, lease: float = 20) -> bytes:
+    held = [
+        (Pid.PARTICIPANT_GUID, prefix + bytes([0, 0, 1, 0xC1])),
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
+        (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(address, port + 1), "<")),
+        (Pid.PARTICIPANT_LEASE_DURATION, struct.pack("<iI", int(lease), 0)),
+    ]
+    return message(data(payload(held)), prefix=prefix)
+
+
+def farewell(prefix: bytes) -> bytes:
+    qos = parameter_list([(Pid.STATUS_INFO, bytes([0, 0, 0, 3]))])
+    return message(data(qos=qos), prefix=prefix)
+
+
+def sedp(prefix: bytes, address: str, port: int, to: bytes = b"") -> bytes:
+    held = [
+        (Pid.ENDPOINT_GUID, prefix + bytes([0, 0, 1, 3])),
+        (Pid.TOPIC_NAME, struct.pack("<I", 11) + b"rt/chatter\0\0"),
+        (Pid.TYPE_NAME, struct.pack("<I", 4) + b"Str\0"),
+        (Pid.UNICAST_LOCATOR, pack_locator(HostPort(address, port), "<")),
+    ]
+    meant = [submessage(0x0E, 0, to)] if to else []
+    return message(*meant, data(payload(held), writer=SEDP_WRITERS), prefix=prefix)
+
+
+def reached_at(datagram: bytes) -> list[HostPort]:
+    (found,) = read_discovery(datagram).announcements
+    return [where for _, where in found.reached_at(datagram)]
+
+
+def meet(one: Domain, prefix: bytes = A, address: str = INSIDE) -> list[Outgoing]:
+    return one.heard_inside(spdp(prefix, address), address, NOW)
+
+
+def to(outgoing: Sequence[Outgoing], host: str) -> list[bytes]:
+    return [sent.datagram for sent in outgoing if sent.to.host == host]

@@ -1,0 +1,126 @@
+"""Both directions by the proxy: stand-ins for what those outside have, and nothing else."""
+
+import pytest
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.registry.participants import LeaseKind
+from rosproxy.ros2.registry.ports import MOST_SHARING
+from tests.unit.ros2.discovery import domains
+from tests.unit.ros2.discovery.domains import (
+    INSIDE,
+    NEAR,
+    NOW,
+    OTHER,
+    ROBOT,
+    A,
+    B,
+    meet,
+    reached_at,
+    sedp,
+    spdp,
+    to,
+)
+from tests.unit.ros2.protocol.messages import message, submessage
+
+USER = message(submessage(0x07, 0, bytes(28)), prefix=A)
+
+
+def both_ways() -> Domain:
+    one = domains.domain(both_ways=True)
+    meet(one)
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return one
+
+
+def stand_in(one: Domain, kind: LeaseKind) -> int:
+    (found,) = [lease for lease in one.outside.by_prefix[B].leases.values() if lease.kind is kind]
+    return found.port
+
+
+def test_inside_is_told_of_stand_ins_alone() -> None:
+    one = both_ways()
+    (told,) = to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    meta, user = reached_at(told)
+    assert meta == HostPort(NEAR, stand_in(one, LeaseKind.METATRAFFIC))
+    assert user == HostPort(NEAR, stand_in(one, LeaseKind.DATA))
+
+
+def test_locators_of_readers_and_writers_get_one_too() -> None:
+    one = both_ways()
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    (sent,) = one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    (where,) = reached_at(sent.datagram)
+    assert where.host == NEAR
+    (passed,) = one.at_stand_in(where.port, USER, INSIDE, NOW)
+    assert passed.to == HostPort(ROBOT, 7000)
+
+
+def test_what_inside_sends_goes_on_as_it_is() -> None:
+    one = both_ways()
+    (sent,) = one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, INSIDE, NOW)
+    assert (sent.to, sent.datagram) == (HostPort(ROBOT, 7411), USER)
+    assert one.at_stand_in(stand_in(one, LeaseKind.DATA), USER, OTHER, NOW) == []
+
+
+def test_no_locator_leads_to_another_host() -> None:
+    one = domains.domain(both_ways=True)
+    meet(one)
+    datagram = spdp(B, ROBOT).replace(bytes([10, 0, 0, 9]), bytes([10, 0, 0, 8]))
+    one.heard_outside(datagram, ROBOT, NOW)
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (sent,) = one.at_lease(port, sedp(B, "10.0.0.8", 7000), ROBOT, NOW)
+    assert reached_at(sent.datagram) == []
+
+
+def test_after_a_restart_the_observer_learns_which_ones_there_are() -> None:
+    before, after = both_ways(), both_ways()
+    (port,) = [p for p, (_, lease) in before.inside.leases.items() if lease.where.port == 7410]
+    before.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+    after.heard_outside(sedp(B, ROBOT, 7000, to=after.own.observer.prefix), ROBOT, NOW)
+    assert after.outside.stand_ins.keys() == before.outside.stand_ins.keys()
+    (endpoint,) = after.outside.by_prefix[B].endpoints.values()
+    assert endpoint.topic == "rt/chatter"
+
+
+def test_ports_are_given_back() -> None:
+    one = both_ways()
+    one.expire(NOW + 21)
+    assert not one.outside.stand_ins
+
+
+def test_a_port_that_is_taken_is_left_alone() -> None:
+    one = both_ways()
+    port = stand_in(one, LeaseKind.DATA)
+    one.outside.block(port)
+    (told,) = to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW), INSIDE)
+    _, user = reached_at(told)
+    assert user.port not in (port, 0)
+    assert port not in one.outside.stand_ins
+
+
+def test_some_may_share_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rosproxy.ros2.registry.ports.order_for", lambda key, ports: iter([20_000]))
+    one = domains.domain(both_ways=True)
+    meet(one)
+    for number in range(MOST_SHARING + 1):
+        one.heard_outside(spdp(bytes([9, number]) + B[2:], ROBOT, 7410 + 10 * number), ROBOT, NOW)
+    assert {
+        sent.to.port for sent in one.at_stand_in(20_000, sedp(A, INSIDE, 7000), INSIDE, NOW)
+    } == {
+        7410,
+        7411,
+        7420,
+        7421,
+    }
+
+
+def test_a_port_that_can_not_be_had_now_may_be_had_later() -> None:
+    """Where there were no more sockets, the ports of that moment were never used again."""
+    one = both_ways()
+    port = stand_in(one, LeaseKind.DATA)
+    one.outside.block(port, for_good=False)
+    assert port not in one.outside.stand_ins
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    assert port in one.outside.stand_ins

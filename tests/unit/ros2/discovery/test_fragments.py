@@ -1,0 +1,186 @@
+"""Announcements in fragments: rewritten as whole ones are, whatever they were cut into."""
+
+import random
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery import fragments
+from rosproxy.ros2.discovery.fragments import OVERHEAD, FragmentStores
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import RtpsError, SubmessageId, destination, submessages
+from rosproxy.ros2.rewriting.discovery import DiscoveryMessage, read_discovery, rewritten
+from tests.unit.ros2.protocol.messages import PREFIX, data, fragment, message, payload, submessage
+
+HERE, THERE = HostPort("172.30.0.5", 7411), HostPort("10.0.0.1", 45001)
+PORT, READER = 45000, b"reader's pre"
+HEARTBEAT = submessage(0x07, 0, bytes(28))
+
+
+def described(padding: int) -> bytes:
+    """The payload of an announcement: a locator in front, one at the end, and much between."""
+    return payload(
+        [
+            (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HERE, "<")),
+            (0x8000, bytes(range(4)) * padding),
+            (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HERE, "<")),
+        ]
+    )
+
+
+def cut(whole: bytes, size: int, sequence: int = 1) -> list[bytes]:
+    """A datagram for each fragment, each with something else behind it."""
+    parts = [whole[at : at + size] for at in range(0, len(whole), size)]
+    return [
+        message(fragment(part, number, size, len(whole), sequence=sequence), HEARTBEAT)
+        for number, part in enumerate(parts, 1)
+    ]
+
+
+def led(told: DiscoveryMessage) -> bytes:
+    return rewritten(told, lambda pid, where: THERE, lambda _: False)
+
+
+def hidden(told: DiscoveryMessage) -> bytes:
+    return rewritten(told, lambda pid, where: THERE, lambda _: True)
+
+
+def through(
+    store: FragmentStores, datagram: bytes, rewrite: fragments.Rewrite = led
+) -> list[bytes]:
+    return store.rewritten(PORT, read_discovery(datagram), READER, rewrite).on
+
+
+@given(
+    st.integers(0, 400),
+    st.integers(fragments.SHORTEST, 700),
+    st.randoms(use_true_random=False),
+    st.booleans(),
+)
+def test_fragments_carry_what_the_whole_would(
+    padding: int, size: int, dice: random.Random, twice: bool
+) -> None:
+    """In any order, some of them twice, and again after all is there."""
+    whole = described(padding)
+    (expected,) = through(FragmentStores(), message(data(whole)))
+    after = expected[-len(whole) :]
+    sent = cut(whole, size)
+    order = sent * (1 + twice)
+    dice.shuffle(order)
+    store = FragmentStores()
+    got = [one for datagram in order for one in through(store, datagram)]
+    assert sorted(got) == sorted(cut(after, size) * (1 + twice))
+    again = dice.choice(range(len(sent)))
+    assert through(store, sent[again]) == [cut(after, size)[again]]
+
+
+def test_nothing_goes_on_before_all_is_there() -> None:
+    store, sent = FragmentStores(), cut(described(300), 128)
+    assert [through(store, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)
+    assert len(through(store, sent[-1])) == len(sent)
+
+
+def test_what_is_hidden_is_a_gap_in_each_datagram() -> None:
+    store, sent = FragmentStores(), cut(described(300), 128)
+    got = [one for datagram in sent for one in through(store, datagram, hidden)]
+    for before, after in zip(sent, got, strict=True):
+        kinds = [kind for kind, _, _ in submessages(after)]
+        assert kinds == [SubmessageId.GAP, SubmessageId.PAD, SubmessageId.HEARTBEAT]
+        assert len(after) == len(before)
+        assert before[24 + 32 : -32] not in after
+
+
+def test_each_way_has_its_own_fragments() -> None:
+    store, (first, *rest) = FragmentStores(), cut(described(100), 128)
+    through(store, first)
+    for datagram in rest:
+        assert store.rewritten(PORT + 1, read_discovery(datagram), READER, led) == ([], [])
+
+
+def test_who_sends_a_fragment_again_is_asked_for_the_others() -> None:
+    """As Cyclone DDS does: it sends the first alone to who asks for a sample."""
+    store, sent = FragmentStores(), cut(described(100), 128, sequence=7)
+    first, third = read_discovery(sent[0]), read_discovery(sent[2])
+    assert store.rewritten(PORT, first, READER, led) == ([], [])
+    assert store.rewritten(PORT, third, READER, led) == ([], [])
+    _, (asked,) = store.rewritten(PORT, first, READER, led)
+    assert asked[8:20] == READER
+    assert destination(asked) == first.prefix
+    (body,) = [body for kind, _, body in submessages(asked) if kind == SubmessageId.NACK_FRAG]
+    reader, writer = struct.unpack_from(">II", asked, body.start)
+    assert (reader, writer) == (0x000100C7, 0x000100C2)
+    assert struct.unpack_from("<iIIII", asked, body.start + 8) == (0, 7, 2, 3, 0b101 << 29)
+
+
+@pytest.mark.parametrize(
+    ("first", "size", "total", "length"),
+    [
+        (0, 100, 200, 100),
+        (3, 100, 200, 100),
+        (1, 0, 200, 1),
+        (1, 100, 70_000, 100),
+        (1, 100, 99, 9),
+    ],
+)
+def test_fragments_that_can_not_be_are_refused(
+    first: int, size: int, total: int, length: int
+) -> None:
+    body = struct.pack("<HH", 0, 28) + bytes(4) + 0x000003C2.to_bytes(4, "big")
+    body += struct.pack("<iIIHHI", 0, 1, first, 1, size, total) + bytes(length)
+    with pytest.raises(RtpsError):
+        through(FragmentStores(), message(submessage(0x16, 0, body)))
+
+
+def test_an_announcement_can_not_change_its_size() -> None:
+    store = FragmentStores()
+    through(store, cut(described(100), 128)[0])
+    with pytest.raises(RtpsError):
+        through(store, cut(described(101), 128)[0])
+
+
+def test_so_much_is_remembered_of_a_participant_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Datagrams that wait took 600 MB with all that was read of them; small samples were free."""
+    monkeypatch.setattr(fragments, "MOST_BYTES", 4 * OVERHEAD)
+    stores = FragmentStores()
+    for sequence in range(1, 30):
+        through(stores, cut(described(100), 128, sequence)[0])
+    assert stores.size == sum(one.size for one in stores.by_prefix.values())
+    (store,) = stores.by_prefix.values()
+    assert len(store._samples) <= 3
+    assert len(store._held) <= 3
+    stores.forget(PREFIX)
+    assert (stores.size, stores.by_prefix) == (0, {})
+
+
+def test_nobody_pushes_out_what_others_have_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fragments, "MOST_OF_ALL", 100 * OVERHEAD)
+    stores, sent = FragmentStores(), cut(described(100), 128)
+    assert [through(stores, datagram) for datagram in sent[:-1]] == [[]] * (len(sent) - 1)
+    for number in range(1, 400):
+        prefix = bytes([9, 9, number % 2]) + bytes(9)
+        other = cut(described(100), 128, number)[0]
+        through(stores, other.replace(PREFIX, prefix, 1))
+        assert stores.size <= 100 * OVERHEAD
+    assert len(through(stores, sent[-1])) == len(sent)
+
+
+def test_a_datagram_has_so_many_fragments_and_no_more() -> None:
+    part = fragment(bytes(128), 1, 128, 300)
+    with pytest.raises(RtpsError):
+        through(FragmentStores(), message(*[part] * (fragments.MOST_FRAGMENTS + 1)))
+
+
+@given(st.binary(max_size=200))
+def test_nothing_that_is_sent_breaks_it(rest: bytes) -> None:
+    store = FragmentStores()
+    for start in (cut(described(100), 128)[0][:56], message()):
+        try:
+            through(store, start + rest)
+        except RtpsError:
+            continue

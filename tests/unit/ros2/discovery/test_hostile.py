@@ -1,0 +1,229 @@
+"""Datagrams that are made to hurt a domain: none breaks it, costs much, or passes the policy."""
+
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery import domain as discovery_domain
+from rosproxy.ros2.discovery.domain_settings import MOST_INSIDE, MOST_PER_ADDRESS, MOST_PER_HOST
+from rosproxy.ros2.discovery.partings import APART
+from rosproxy.ros2.discovery.returning import ANSWER_TIME
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import LAST_NUMBER
+from rosproxy.ros2.registry import participants
+from rosproxy.ros2.registry import ports as registry_ports
+from rosproxy.ros2.registry.participants import (
+    DdsEndpoint,
+    EndpointKind,
+    EndpointNotes,
+    Participant,
+)
+from tests.unit.ros2.discovery.domains import (
+    EAR,
+    INSIDE,
+    NOW,
+    OTHER,
+    ROBOT,
+    SEDP_WRITERS,
+    STRANGER,
+    A,
+    B,
+    domain,
+    farewell,
+    meet,
+    sedp,
+    spdp,
+    to,
+)
+from tests.unit.ros2.protocol.messages import data, fragment, message, payload, submessage
+
+TOPIC = (Pid.TOPIC_NAME, struct.pack("<I", 11) + b"rt/chatter\0\0")
+
+
+def heartbeat(first: int, last: int) -> bytes:
+    body = struct.pack(">II", 0, SEDP_WRITERS)
+    for number in (first, last):
+        body += struct.pack("<iI", number >> 32, number & 0xFFFFFFFF)
+    return submessage(0x07, 0, body + bytes(4))
+
+
+def test_a_number_that_has_no_next_one_is_malformed() -> None:
+    """It broke the writing of a GAP, an answer or a farewell, and kept a policy from others."""
+    one = domain(judge=lambda kind, *_: kind is not RuleKind.PUBLISH)
+    meet(one)
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = one.outside.stand_ins
+    last = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER)
+    over = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=LAST_NUMBER + 1)
+    below = data(payload([TOPIC]), writer=SEDP_WRITERS, sequence=-1)
+    assert one.at_stand_in(stand_in, message(last, prefix=A), INSIDE, NOW)
+    for bad in (over, below, heartbeat(1, LAST_NUMBER + 1)):
+        before = one.refused.count
+        assert one.heard_inside(message(bad, prefix=A), INSIDE, NOW) == []
+        assert one.refused.count == before + 1
+    assert one.heard_inside(message(heartbeat(1, LAST_NUMBER), prefix=A), INSIDE, NOW)
+    assert to(one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW), ROBOT)
+
+
+def test_what_stands_behind_an_announcement_is_judged_as_well() -> None:
+    """An end went on as it came, and what outside announced was not judged."""
+    one = domain(judge=lambda *_: False)
+    meet(one)
+    behind = data(payload([TOPIC]), writer=SEDP_WRITERS)
+    (told,) = to(one.heard_outside(spdp(B, ROBOT) + behind, ROBOT, NOW), INSIDE)
+    assert len(told) == len(spdp(B, ROBOT) + behind)
+    (ended,) = to(one.heard_inside(farewell(A) + behind, INSIDE, NOW), ROBOT)
+    for sent in (told, ended):
+        assert b"chatter" not in sent
+    assert not one.inside.by_prefix
+
+
+def test_fragments_are_judged_anew_by_another_policy() -> None:
+    allowed = True
+    one = domain(judge=lambda *_: allowed)
+    meet(one)
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    (stand_in,) = one.outside.stand_ins
+    whole = payload([TOPIC, (0x8000, bytes(100))])
+    part = fragment(whole, 1, 200, len(whole), writer=SEDP_WRITERS)
+    datagram = message(part, prefix=A)
+    (sent,) = one.at_stand_in(stand_in, datagram, INSIDE, NOW)
+    assert b"chatter" in sent.datagram
+    allowed = False
+    one.apply_policy(NOW)
+    one.settle(NOW + APART)
+    (sent,) = one.at_stand_in(stand_in, datagram, INSIDE, NOW)
+    assert b"chatter" not in sent.datagram
+
+
+def test_an_exhausted_range_is_not_sorted_for_each_locator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A datagram with two thousand locators took 140 ms, by which nobody else was served."""
+    one, ordered = domain(), list[str]()
+
+    def order_for(key: str, ports: PortRange) -> Iterator[int]:
+        ordered.append(key)
+        return iter(ports.ports())
+
+    monkeypatch.setattr(registry_ports, "order_for", order_for)
+    locators = [
+        (Pid.UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 1000 + number), "<"))
+        for number in range(400)
+    ]
+    meet(one)
+    long = message(data(payload(locators), writer=SEDP_WRITERS), prefix=A)
+    one.heard_inside(long, INSIDE, NOW)
+    assert len(ordered) == 15  # the ports that there are
+
+
+def test_announcements_and_topics_have_a_length() -> None:
+    """They are kept: of 64 kB each, those of one address could take gigabytes."""
+    one = domain()
+    meet(one)
+    long = message(data(payload([(Pid.TOPIC_NAME, bytes(2000))])), prefix=B)
+    filled = message(submessage(0x01, 0, bytes(9000)), prefix=B) + spdp(B, INSIDE)[20:]
+    named = payload([(Pid.TOPIC_NAME, struct.pack("<I", 2000) + b"a" * 2000)])
+    for bad in (long, filled, message(data(named, writer=SEDP_WRITERS), prefix=A)):
+        before = one.refused.count
+        assert one.heard_inside(bad, INSIDE, NOW) == []
+        assert one.refused.count == before + 1
+    assert one.inside.by_prefix.keys() == {A}
+
+
+def test_readers_and_writers_of_an_address_have_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(participants, "MOST_ENDPOINTS_HERE", 5)
+    notes, many = EndpointNotes(), [Participant(bytes([n]) * 12, INSIDE, b"", 0) for n in range(9)]
+    end = DdsEndpoint(EndpointKind.READER, "t", "T")
+    for one in many:
+        notes.note(one, b"0001", end)
+        notes.note(one, b"0001", end)
+    assert [len(one.endpoints) for one in many] == [1] * 5 + [0] * 4
+    notes.note(many[0], b"0001", None)
+    notes.note(many[8], b"0001", end)
+    assert notes.total == notes.here[INSIDE] == sum(len(one.endpoints) for one in many) == 5
+    for one in many:
+        notes.forget(one)
+    assert (notes.total, notes.here) == (0, {})
+
+
+def test_one_address_does_not_keep_others_from_waiting_after_a_start() -> None:
+    one = domain()
+    for number in range(MOST_INSIDE + 1):
+        one.heard_inside(spdp(number.to_bytes(12, "big"), INSIDE), INSIDE, 0.1)
+    assert len(one.returning.waiting) == MOST_PER_ADDRESS
+    assert one.heard_inside(spdp(A, OTHER), OTHER, 0.2)
+    assert A in one.returning.waiting
+    one.settle(0.2 + ANSWER_TIME)
+    assert not one.returning.waiting
+    assert one.heard_inside(spdp(B, INSIDE), INSIDE, 6.0)
+
+
+def test_one_host_outside_does_not_keep_others_from_being_met() -> None:
+    one = domain(peers=(ROBOT, STRANGER))
+    for number in range(MOST_PER_HOST + 9):
+        one.heard_outside(spdp(number.to_bytes(12, "big"), ROBOT), ROBOT, NOW)
+    assert len(one.outside.by_prefix) == MOST_PER_HOST
+    one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
+    assert B in one.outside.by_prefix
+    one.expire(NOW + 21)
+    assert not one.outside.here
+
+
+def test_nobody_proves_anything_by_the_ear() -> None:
+    """Whoever can send as the ear's host could have the proxy send to any address."""
+    one = domain(peers=())
+    one.own.observer.prefix = bytes([7]) * 12
+    meet(one)
+    one.heard_outside(wrapped(ROBOT, spdp(B, ROBOT)), EAR.host, NOW)
+    answer = sedp(B, ROBOT, 7411, to=one.own.observer.prefix)
+    one.heard_outside(wrapped(ROBOT, answer), EAR.host, NOW)
+    assert not one.outside.by_prefix[B].proven
+    one.heard_outside(answer, ROBOT, NOW)
+    assert one.outside.by_prefix[B].proven
+
+
+def test_who_waits_does_not_take_the_prefix_of_somebody_met_meanwhile() -> None:
+    one = domain()
+    one.heard_inside(spdp(B, INSIDE), INSIDE, 0.1)
+    one.heard_outside(spdp(B, ROBOT), ROBOT, 0.2)
+    one.settle(0.1 + ANSWER_TIME)
+    assert B in one.outside.by_prefix
+    assert B not in one.inside.by_prefix
+
+
+def test_an_announcement_that_names_half_a_destination_hinders_no_policy() -> None:
+    """It was kept without its message, and every later look at all participants failed by it."""
+    denied: list[str] = []
+    d = domain(judge=lambda _kind, name, _address: name not in denied)
+    d.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    d.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    evil = b"\x01\x0f" + bytes([0x5A] * 10)
+    told = payload(
+        [
+            (Pid.PARTICIPANT_GUID, evil + bytes([0, 0, 1, 0xC1])),
+            (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(STRANGER, 7410), "<")),
+        ]
+    )
+    for size in (0, 4, 11):
+        half = message(submessage(0x0E, 0, bytes(size)), data(told), prefix=evil)
+        d.heard_outside(wrapped(STRANGER, half), EAR.host, NOW)
+        d.heard_inside(half, OTHER, NOW)
+    assert evil not in {*d.outside.by_prefix, *d.inside.by_prefix}
+    denied.append("/chatter")
+    d.apply_policy(NOW)
+
+
+def test_of_strangers_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forged sources have an allowance each."""
+    one = domain()
+    meet(one)
+    monkeypatch.setattr(discovery_domain, "read_discovery", None)
+    one.heard_outside(spdp(B, STRANGER), STRANGER, NOW)
+    for port in one.inside.leases:
+        one.at_lease(port, message(prefix=B), STRANGER, NOW)
+    assert STRANGER not in one.rates._left

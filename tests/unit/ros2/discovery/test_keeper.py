@@ -1,0 +1,64 @@
+"""What a participant keeps for the proxy: its ports, in one number."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.protocol.reliable import heartbeats
+from rosproxy.ros2.protocol.rtps import destination, source_prefix
+
+RANGE = PortRange(11400, 11463)
+PEER, BACK = bytes(range(12)), HostPort("172.30.0.2", 7410)
+some_ports = st.lists(st.integers(RANGE.first, RANGE.last), max_size=8, unique=True)
+
+
+def keeper(started: float = 0.0) -> Keeper:
+    return Keeper.of("10.0.0.1", RANGE, 0, started)
+
+
+@given(some_ports)
+def test_a_number_holds_ports(ports: list[int]) -> None:
+    one = keeper()
+    one.kept[PEER] = one.number(ports)
+    assert one.had(PEER) == ports
+
+
+@given(some_ports)
+def test_a_port_more_is_a_greater_number(ports: list[int]) -> None:
+    numbers = [keeper().number(ports[:count]) for count in range(len(ports) + 1)]
+    assert numbers == sorted(set(numbers))
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(1, 3000))
+def test_no_number_names_a_port_outside_of_the_range(number: int, size: int) -> None:
+    one = Keeper.of("10.0.0.1", PortRange(11400, 11399 + size), 0, 0.0)
+    one.kept[PEER] = number
+    assert all(port in one.ports for port in one.had(PEER))
+
+
+def test_the_next_process_is_the_same_keeper_and_counts_on() -> None:
+    first, later = keeper(1000.0), keeper(2000.0)
+    assert first.prefix == later.prefix
+    assert first.prefix != Keeper.of("10.0.0.1", RANGE, 1, 0.0).prefix
+    asked = [one.questions(PEER, BACK)[-1] for one in (first, later)]
+    assert int.from_bytes(asked[0][-4:], "little") < int.from_bytes(asked[1][-4:], "little")
+
+
+@given(some_ports, st.integers(0, 63))
+def test_a_longer_range_has_the_same_keeper(ports: list[int], more: int) -> None:
+    one, longer = keeper(), Keeper.of("10.0.0.1", PortRange(11400, 11463 + more), 0, 0.0)
+    assert one.prefix == longer.prefix
+    longer.kept[PEER] = one.number(ports)
+    assert longer.had(PEER) == ports
+
+
+def test_it_asks_and_reminds_by_heartbeats() -> None:
+    one = keeper()
+    _, question = one.questions(PEER, BACK)
+    _, reminder = one.reminders(PEER, [11405], BACK)
+    for sent, first in ((question, 1), (reminder, one.number([11405]))):
+        (told,) = heartbeats(sent)
+        assert (told.first, told.last) == (first, first - 1)
+        assert (source_prefix(sent), destination(sent)) == (one.prefix, PEER)

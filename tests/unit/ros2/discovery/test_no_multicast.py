@@ -1,0 +1,206 @@
+"""Networks without multicast, and a proxy that has another address than the one before it."""
+
+import pytest
+
+from rosproxy.admin.requests import BodyError, ContainerNews, read_body
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.outside import PARTED_AGAIN
+from rosproxy.ros2.discovery.partings import APART, EAR_TIME
+from rosproxy.ros2.protocol.envelope import wrapped
+from rosproxy.ros2.protocol.rtps import source_prefix
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from tests.unit.ros2.discovery.domains import (
+    EAR,
+    INSIDE,
+    NOW,
+    OTHER,
+    RANGE,
+    ROBOT,
+    A,
+    B,
+    domain,
+    farewell,
+    meet,
+    sedp,
+    spdp,
+    to,
+)
+
+C = b"\x01\x0f" + bytes(9) + b"\x07"
+PORTS = (RANGE.listen.last, RANGE.listen.last - 1)
+
+
+def by(prefix: bytes, datagrams: list[bytes]) -> list[bytes]:
+    return [one for one in datagrams if source_prefix(one) == prefix]
+
+
+def is_farewell(datagram: bytes) -> bool:
+    told = read_discovery(datagram).of_participant
+    return told is not None and told.ended
+
+
+def test_those_inside_are_introduced_to_each_other_as_they_are() -> None:
+    one = domain()
+    meet(one, A, INSIDE)
+
+    sent = one.heard_inside(spdp(B, OTHER), OTHER, NOW)
+
+    assert by(B, to(sent, INSIDE)) == [spdp(B, OTHER)]
+    again = one.heard_inside(spdp(A, INSIDE), INSIDE, NOW)
+    assert by(A, to(again, OTHER)) == [spdp(A, INSIDE)]
+
+
+def test_who_is_heard_by_multicast_needs_no_introduction() -> None:
+    one = domain()
+    meet(one, A, INSIDE)
+    meet(one, B, OTHER)
+    one.inside.note_in_group(spdp(B, OTHER), OTHER)
+
+    assert by(B, to(one.heard_inside(spdp(B, OTHER), OTHER, NOW), INSIDE)) == []
+    one.inside.note_in_group(b"no RTPS message", OTHER)
+
+
+def test_those_on_other_networks_are_not_introduced() -> None:
+    one = domain()
+    one.settings.near = lambda address: address
+    meet(one, A, INSIDE)
+    assert by(B, to(meet(one, B, OTHER), INSIDE)) == []
+
+
+def moved(ear: HostPort | None = None) -> Domain:
+    """One whose participant has known the proxy at another address; the robot is there."""
+    one = domain(peers=(ROBOT,), ear=ear)
+    one.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
+    one.returning.note_former({A: PORTS}, one.inside.by_prefix)
+    return one
+
+
+def test_ports_are_those_at_the_proxy_before() -> None:
+    one = moved()
+    meet(one)
+    assert tuple(one.inside.by_prefix[A].ports) == PORTS
+
+
+def test_who_knew_the_proxy_elsewhere_meets_everybody_anew() -> None:
+    one = moved()
+
+    sent = meet(one)
+    assert is_farewell(by(one.own.keeper.prefix, to(sent, INSIDE))[0])
+    assert by(C, to(sent, INSIDE)) == []
+    parting, meeting = one.settle(NOW), one.settle(NOW + APART)
+
+    for told in (by(C, to(parting, INSIDE)), by(A, to(parting, ROBOT))):
+        assert [is_farewell(each) for each in told] == [True]
+    for told in (by(C, to(meeting, INSIDE)), by(A, to(meeting, ROBOT))):
+        assert [is_farewell(each) for each in told] == [False]
+    assert not one.is_kept(one.inside.by_prefix[A])
+    again = one.heard_outside(spdp(C, ROBOT), ROBOT, NOW)
+    assert [is_farewell(each) for each in by(C, to(again, INSIDE))] == [False]
+
+
+def test_they_meet_anew_once_the_ear_is_heard() -> None:
+    """It starts after the proxy. What outside is not told it does not forget."""
+    one = moved(EAR)
+    meet(one)
+    assert one.settle(NOW) == one.settle(NOW + 1) == []
+
+    carried = wrapped(ROBOT, spdp(C, ROBOT))
+    assert by(C, to(one.heard_outside(carried, EAR.host, NOW + 1), INSIDE)) == []
+
+    parting = one.settle(NOW + 1)
+    assert [is_farewell(each) for each in by(A, to(parting, EAR.host))] == [True]
+    assert [is_farewell(each) for each in by(C, to(parting, INSIDE))] == [True]
+
+
+def test_they_meet_anew_though_nobody_is_on_the_ears_lan() -> None:
+    one = moved(EAR)
+    meet(one)
+    assert by(A, to(one.settle(NOW + EAR_TIME), ROBOT))
+
+
+def test_who_comes_later_is_forgotten_before_he_is_met() -> None:
+    one = moved()
+    meet(one)
+    one.settle(NOW)
+    one.settle(NOW + APART)
+    later = by(B, to(one.heard_outside(spdp(B, ROBOT), ROBOT, NOW + 1), INSIDE))
+    assert [is_farewell(each) for each in later] == [True, False]
+    one.heard_outside(farewell(B), ROBOT, NOW + 1)
+    assert one.inside.by_prefix[A].parted == {C: NOW}
+
+
+def test_who_does_not_take_it_in_is_told_again() -> None:
+    """Datagrams get lost where dozens meet at once."""
+    one = moved()
+    meet(one)
+    one.settle(NOW)
+    one.settle(NOW + APART)
+
+    def told(later: float) -> list[bool]:
+        sent = one.heard_outside(spdp(C, ROBOT), ROBOT, NOW + later)
+        return [is_farewell(each) for each in by(C, to(sent, INSIDE))]
+
+    assert told(PARTED_AGAIN - 0.1) == [False]
+    assert told(PARTED_AGAIN) == [True, False]
+    (stand_in,) = one.outside.stand_ins
+    one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW + PARTED_AGAIN)
+    assert told(3 * PARTED_AGAIN) == [False]
+
+
+def test_ports_of_locators_that_are_told_later_are_those_before() -> None:
+    one, port = moved(), RANGE.listen.last - 2
+    one.returning.note_former({A: (*PORTS, port)}, {})
+    meet(one)
+    one.settle(NOW)
+    one.heard_inside(sedp(A, INSIDE, 7000, to=one.own.observer.prefix), INSIDE, NOW)
+    assert tuple(one.inside.by_prefix[A].ports) == (*PORTS, port)
+
+
+@pytest.mark.parametrize("ports", [(80,), (RANGE.listen.last + 1,), (*PORTS, 80)])
+def test_who_had_ports_of_another_range_gets_others_and_meets_everybody_anew(
+    ports: tuple[int, ...],
+) -> None:
+    """Outside heeds no other locators of whom it knows."""
+    one = domain(peers=(ROBOT,), ear=None)
+    one.returning.note_former({A: ports}, one.inside.by_prefix)
+    meet(one)
+    assert not set(one.inside.by_prefix[A].ports) & set(ports)
+    parting, meeting = one.settle(NOW), one.settle(NOW + APART)
+    assert [is_farewell(each) for each in by(A, to(parting, ROBOT))] == [True]
+    assert [is_farewell(each) for each in by(A, to(meeting, ROBOT))] == [False]
+
+
+def test_who_had_no_ports_was_not_there() -> None:
+    one = domain(ear=EAR)
+    one.returning.note_former({A: ()}, one.inside.by_prefix)
+    sent = meet(one)
+    assert one.inside.by_prefix[A].ports
+    assert by(one.own.keeper.prefix, to(sent, INSIDE)) == []
+
+
+def test_who_is_there_already_keeps_what_he_has() -> None:
+    one = domain()
+    meet(one)
+    before = one.inside.by_prefix[A].ports
+    one.returning.note_former({A: PORTS}, one.inside.by_prefix)
+    meet(one)
+    assert one.inside.by_prefix[A].ports == before
+
+
+def test_news_of_peers_and_former_ports_are_read() -> None:
+    text = ".".join(f"{byte:02x}" for byte in A)
+    news = read_body({"peers": ["robot", "192.0.2.1:11400"], "former": {text: [1]}}, ContainerNews)
+    assert news.ros2_peers is not None
+    assert [str(peer.port) for peer in news.ros2_peers] == ["0", "11400"]
+    assert news.former_ports == {A: (1,)}
+    assert read_body({}, ContainerNews).ros2_peers is None
+
+
+@pytest.mark.parametrize(
+    "body",
+    [{"peers": ["a b"]}, {"peers": ["a"] * 1025}, {"former": {"x": [1]}}, {"former": {"01": "a"}}],
+)
+def test_bad_news_are_refused(body: dict[str, object]) -> None:
+    with pytest.raises(BodyError):
+        read_body(body, ContainerNews)

@@ -1,0 +1,62 @@
+"""The proxy's own participant: it asks for what it lacks, and for nothing else."""
+
+import struct
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.ros2.discovery.observer import Observer
+from rosproxy.ros2.protocol.rtps import destination, source_prefix, submessages
+from tests.unit.ros2.protocol.messages import data, message, submessage
+
+OWN, PEER = bytes(range(12)), b"\x01\x0f" + bytes(10)
+WRITERS = 0x000003C2
+
+
+def heartbeat(first: int, last: int) -> bytes:
+    body = struct.pack(">II", 0, WRITERS) + struct.pack("<iIiIi", 0, first, 0, last, 1)
+    return submessage(0x07, 0, body)
+
+
+def asked(answer: bytes) -> tuple[int, list[int], bool]:
+    """The base of an ACKNACK, the numbers that it asks for, and whether it is final."""
+    *_, (kind, flags, body) = submessages(answer)
+    assert (kind, source_prefix(answer), destination(answer)) == (0x06, OWN, PEER)
+    high, low, bits = struct.unpack_from("<iII", answer, body.start + 8)
+    words = struct.unpack_from(f"<{-(-bits // 32)}I", answer, body.start + 20)
+    base = (high << 32) + low
+    found = [base + bit for bit in range(bits) if words[bit // 32] >> (31 - bit % 32) & 1]
+    return base, found, bool(flags & 0x02)
+
+
+def test_it_asks_first_what_there_is() -> None:
+    observer = Observer(OWN)
+    assert [asked(one) for one in observer.first_question(PEER)] == [(1, [], False)] * 2
+
+
+def test_who_has_nothing_gets_no_answer() -> None:
+    observer = Observer(OWN)
+    assert observer.take(PEER, message(heartbeat(1, 0), prefix=PEER)) == []
+    assert len(observer.first_question(PEER)) == 1  # the other writer has not been heard
+
+
+@given(st.sets(st.integers(1, 40)), st.integers(1, 40))
+def test_it_asks_for_what_it_lacks(got: set[int], last: int) -> None:
+    observer = Observer(OWN)
+    for number in got:
+        sample = data(b"\0\3\0\0", writer=WRITERS, sequence=number)
+        assert observer.take(PEER, message(sample, prefix=PEER)) == []
+    (answer,) = observer.take(PEER, message(heartbeat(1, last), prefix=PEER))
+    base, missing, final = asked(answer)
+    lacking = [number for number in range(1, last + 1) if number not in got]
+    assert (missing, final) == (lacking, True)
+    assert base == (lacking[0] if lacking else last + 1)
+
+
+def test_a_participant_that_has_gone_is_forgotten() -> None:
+    observer = Observer(OWN)
+    sample = data(b"\0\3\0\0", writer=WRITERS, sequence=1)
+    observer.take(PEER, message(sample, prefix=PEER))
+    observer.forget(PEER)
+    (answer,) = observer.take(PEER, message(heartbeat(1, 1), prefix=PEER))
+    assert asked(answer)[1] == [1]

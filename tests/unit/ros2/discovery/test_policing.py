@@ -1,0 +1,103 @@
+"""Policy: what is denied is told to neither side, and a change has the two meet again."""
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain import Domain
+from rosproxy.ros2.discovery.domain_settings import Outgoing
+from rosproxy.ros2.discovery.partings import APART
+from rosproxy.ros2.protocol.rtps import SubmessageId, submessages
+from rosproxy.ros2.rewriting.discovery import read_discovery
+from tests.unit.ros2.discovery import domains
+from tests.unit.ros2.discovery.domains import INSIDE, NOW, ROBOT, A, B, meet, sedp, spdp, to
+
+
+class Rules:
+    """A policy: what it denies may change; ``asked`` is what it was asked."""
+
+    def __init__(self, *denied: RuleKind) -> None:
+        self.denied = set(denied)
+        self.asked: list[tuple[RuleKind, str, str]] = []
+
+    def __call__(self, kind: RuleKind, name: str, address: str) -> bool:
+        self.asked.append((kind, name, address))
+        return kind not in self.denied
+
+
+def met(rules: Rules) -> Domain:
+    one = domains.domain(judge=rules)
+    meet(one)
+    one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
+    return one
+
+
+def outwards(one: Domain) -> list[Outgoing]:
+    (stand_in,) = one.outside.stand_ins
+    return one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
+
+
+def inwards(one: Domain) -> list[Outgoing]:
+    (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
+    return one.at_lease(port, sedp(B, ROBOT, 7000), ROBOT, NOW)
+
+
+def kinds(sent: list[Outgoing]) -> list[int]:
+    return [kind for kind, _, _ in submessages(sent[0].datagram)]
+
+
+def test_what_is_denied_goes_on_as_a_gap() -> None:
+    one = met(Rules(RuleKind.PUBLISH))
+    (sent,) = outwards(one)
+    assert kinds([sent]) == [SubmessageId.GAP, SubmessageId.PAD]
+    assert b"chatter" not in sent.datagram
+    assert len(sent.datagram) == len(sedp(A, INSIDE, 7000))
+    assert kinds(inwards(one)) == [SubmessageId.DATA]
+
+
+def test_it_holds_for_what_outside_announces() -> None:
+    rules = Rules(RuleKind.SUBSCRIBE)
+    one = met(rules)
+    assert kinds(inwards(one)) == [SubmessageId.GAP, SubmessageId.PAD]
+    assert kinds(outwards(one)) == [SubmessageId.DATA]
+    assert rules.asked == [
+        (RuleKind.SUBSCRIBE, "/chatter", INSIDE),
+        (RuleKind.PUBLISH, "/chatter", INSIDE),
+    ]
+
+
+def test_the_policy_is_asked_once() -> None:
+    rules = Rules()
+    one = met(rules)
+    outwards(one)
+    outwards(one)
+    assert len(rules.asked) == 1
+
+
+def test_a_change_has_those_meet_again_whom_it_concerns() -> None:
+    rules = Rules()
+    one = met(rules)
+    outwards(one)
+    assert one.apply_policy(NOW) == []
+    rules.denied = {RuleKind.PUBLISH}
+    parting = one.apply_policy(NOW)
+    assert outwards(one) == inwards(one) == []
+    assert one.settle(NOW + APART / 2) == []
+    meeting = one.settle(NOW + APART)
+    for host in (ROBOT, INSIDE):
+        told = [
+            (announced.ended, announced.sample.sequence)
+            for sent in (parting, meeting)
+            for datagram in to(sent, host)
+            for announced in read_discovery(datagram).announcements
+        ]
+        assert told == [(True, 2), (False, 1)]
+    assert kinds(outwards(one)) == [SubmessageId.GAP, SubmessageId.PAD]
+    assert one.apply_policy(NOW) == []
+
+
+def test_the_proxy_itself_is_told_of_what_is_denied() -> None:
+    """Its observer would ask for it again and again."""
+    one = met(Rules(RuleKind.PUBLISH))
+    told = sedp(A, INSIDE, 7000, to=one.own.observer.prefix)
+    one.heard_inside(told, INSIDE, NOW)
+    assert len(one.inside.by_prefix[A].endpoints) == 1
+    assert HostPort(INSIDE, 7000) in one.inside.by_prefix[A].leases

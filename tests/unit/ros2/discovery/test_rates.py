@@ -1,0 +1,48 @@
+"""The allowance of each source."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.ros2.discovery.rates import (
+    BURST,
+    MOST_SOURCES,
+    PER_SECOND,
+    STEP,
+    DiscoveryRates,
+)
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.01), st.integers(0, 2000)), max_size=60))
+def test_no_source_gets_more_than_its_allowance(heard: list[tuple[float, int]]) -> None:
+    rates, now, used, last = DiscoveryRates(), 0.0, 0, 0
+    for pause, led_to in heard:
+        now += pause
+        if rates.take("a", 100, now):
+            rates.charge("a", led_to)
+            used, last = used + 1 + led_to, led_to
+    assert used - last <= BURST + now * PER_SECOND + 1
+    assert rates.take("b", 100, now)
+
+
+def test_a_source_that_was_quiet_may_go_on() -> None:
+    rates = DiscoveryRates()
+    assert rates.take("a", 100, 0.0)
+    rates.charge("a", int(BURST))
+    assert not rates.take("a", 100, 0.0)
+    assert rates.take("a", 100, 1.0)
+
+
+def test_so_many_sources_are_remembered_and_no_more() -> None:
+    rates = DiscoveryRates()
+    rates.take("first", 100, 0.0)
+    rates.charge("first", int(BURST))
+    for number in range(MOST_SOURCES):
+        rates.take(str(number), 100, 0.0)
+    assert rates.take("first", 100, 0.0)
+
+
+def test_a_long_datagram_is_charged_as_several() -> None:
+    rates = DiscoveryRates()
+    longest = sum(rates.take("a", 64_000, 0.0) for _ in range(1000))
+    assert longest == pytest.approx(BURST * STEP / 64_000, abs=1)

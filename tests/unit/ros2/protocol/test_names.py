@@ -1,0 +1,50 @@
+"""Names of ROS 2 in DDS."""
+
+import pytest
+
+from rosproxy.ros2.protocol.names import is_of_service, ros_name, ros_service, ros_topic, ros_type
+
+
+@pytest.mark.parametrize(
+    ("dds", "topic", "service"),
+    [
+        ("rt/chatter", "/chatter", None),
+        ("rt/robot/scan", "/robot/scan", None),
+        ("rq/addRequest", None, "/add"),
+        ("rr/addReply", None, None),
+        ("ros_discovery_info", "ros_discovery_info", None),
+    ],
+)
+def test_names(dds: str, topic: str | None, service: str | None) -> None:
+    assert (ros_topic(dds), ros_service(dds)) == (topic, service)
+
+
+@pytest.mark.parametrize(
+    ("dds", "name", "of_service"),
+    [
+        ("rt/chatter", "/chatter", False),
+        ("rq/addRequest", "/add", True),
+        ("rr/addReply", "/add", True),
+        ("ros_discovery_info", "ros_discovery_info", False),
+    ],
+)
+def test_what_a_topic_belongs_to(dds: str, name: str, of_service: bool) -> None:
+    assert (ros_name(dds), is_of_service(dds)) == (name, of_service)
+
+
+@pytest.mark.parametrize(
+    ("dds", "ros"),
+    [
+        ("std_msgs::msg::dds_::String_", "std_msgs/msg/String"),
+        ("some_msgs::msg::dds_::A_Request_", "some_msgs/msg/A_Request"),
+        ("std_srvs::srv::dds_::Trigger_Request_", "std_srvs/srv/Trigger"),
+        ("std_srvs::srv::dds_::Trigger_Response_", "std_srvs/srv/Trigger"),
+        (
+            "test_msgs::action::dds_::Fibonacci_SendGoal_Response_",
+            "test_msgs/action/Fibonacci_SendGoal",
+        ),
+        ("HelloWorld", "HelloWorld"),
+    ],
+)
+def test_types(dds: str, ros: str) -> None:
+    assert ros_type(dds) == ros

@@ -1,0 +1,142 @@
+"""Discovery: what participants announce, and their locators led elsewhere."""
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import RtpsError
+from rosproxy.ros2.rewriting.discovery import (
+    MULTICAST,
+    UNICAST,
+    Announcement,
+    BuiltinWriter,
+    read_discovery,
+    rewritten,
+)
+from tests.unit.ros2.protocol.messages import (
+    data,
+    fragment,
+    message,
+    order,
+    parameter_list,
+    payload,
+    submessage,
+)
+
+BOTH = pytest.mark.parametrize("little", [True, False], ids=["little", "big"])
+INSIDE, HOST = "172.30.0.5", "10.0.0.1"
+
+
+def nothing(told: Announcement) -> bool:
+    return False
+
+
+def participant(little: bool = True) -> bytes:
+    """As Fast DDS announces one: two addresses, multicast, shared memory."""
+    mark = order(little)
+    shared_memory = struct.pack(mark + "iI", 16, 7412) + bytes(16)
+    held = [
+        (Pid.PARTICIPANT_GUID, bytes(range(16))),
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 7412), mark)),
+        (Pid.METATRAFFIC_MULTICAST_LOCATOR, pack_locator(HostPort("239.255.0.1", 7400), mark)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort(INSIDE, 7413), mark)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, pack_locator(HostPort("127.0.0.1", 7413), mark)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, shared_memory),
+        (0x8007, b"vendor's"),
+    ]
+    return message(
+        submessage(0x09, 0, bytes(8), little), data(payload(held, little), little=little)
+    )
+
+
+@BOTH
+def test_a_participant_announces_where_it_is_reached(little: bool) -> None:
+    datagram = participant(little)
+    (found,) = read_discovery(datagram).announcements
+    assert (found.writer, found.ended) == (BuiltinWriter.PARTICIPANTS, False)
+    assert list(found.reached_at(datagram)) == [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(INSIDE, 7412)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(INSIDE, 7413)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, HostPort("127.0.0.1", 7413)),
+    ]
+
+
+@BOTH
+def test_each_locator_leads_to_a_lease_and_what_can_not_be_led_is_gone(little: bool) -> None:
+    leases = {7412: 45000, 7413: 45001}
+
+    def lead(pid: int, where: HostPort) -> HostPort | None:
+        return HostPort(HOST, leases[where.port]) if where.host == INSIDE else None
+
+    before = participant(little)
+    after = rewritten(read_discovery(before), lead, nothing)
+    assert len(after) == len(before)
+    (found,) = read_discovery(after).announcements
+    assert list(found.reached_at(after)) == [
+        (Pid.METATRAFFIC_UNICAST_LOCATOR, HostPort(HOST, 45000)),
+        (Pid.DEFAULT_UNICAST_LOCATOR, HostPort(HOST, 45001)),
+    ]
+    pids = [one.pid for one in found.held.parameters]
+    assert pids.count(Pid.PAD) == 3
+    assert not set(MULTICAST) & set(pids)
+    (vendor,) = found.held.all(0x8007)
+    assert after[vendor.value.start : vendor.value.end] == b"vendor's"
+
+
+@pytest.mark.parametrize(
+    ("status", "ended"),
+    [(0, False), (1, True), (2, True), (3, True), (4, False), (0x80000000, False)],
+)
+@BOTH
+def test_the_end_of_a_participant_is_told_by_its_status(
+    status: int, ended: bool, little: bool
+) -> None:
+    qos = parameter_list([(Pid.STATUS_INFO, status.to_bytes(4, "big"))], little)
+    datagram = message(data(payload([], little), qos=qos, little=little))
+    assert read_discovery(datagram).announcements[0].ended is ended
+
+
+def test_a_key_alone_tells_an_end_as_well() -> None:
+    datagram = message(data(payload([(Pid.PARTICIPANT_GUID, bytes(16))]), key=True))
+    assert read_discovery(datagram).announcements[0].ended
+
+
+def test_user_data_and_fragments_are_left_alone() -> None:
+    user = data(payload([(Pid.UNICAST_LOCATOR, bytes(24))]), writer=0x00001203)
+    part = fragment(payload([(Pid.UNICAST_LOCATOR, bytes(24))]), 1, 20, 90)
+    datagram = message(user, part)
+    assert read_discovery(datagram).announcements == ()
+    assert rewritten(read_discovery(datagram), lambda pid, where: None, nothing) == datagram
+
+
+def test_an_announcement_without_an_end_is_refused() -> None:
+    with pytest.raises(RtpsError):
+        read_discovery(message(data(b"\0\3\0\0\x32\0\x18\0")))
+
+
+LOCATORS = st.tuples(
+    st.sampled_from([*UNICAST, *MULTICAST, Pid.TYPE_NAME, Pid.KEY_HASH]),
+    st.binary(min_size=24, max_size=24),
+)
+
+
+@given(st.lists(LOCATORS, max_size=8), st.sampled_from(BuiltinWriter), st.booleans())
+def test_nothing_but_locators_changes(
+    held: list[tuple[Pid, bytes]], writer: BuiltinWriter, little: bool
+) -> None:
+    """Whatever they hold, all other bytes stay, and no locator leads where it led before."""
+    before = message(data(payload(held, little), writer=writer, little=little))
+    after = rewritten(read_discovery(before), lambda pid, where: HostPort(HOST, 45000), nothing)
+    (found,) = read_discovery(before).announcements
+    kept = bytearray(after)
+    for one in found.held.all(*UNICAST, *MULTICAST):
+        kept[one.at : one.value.end] = before[one.at : one.value.end]
+    assert bytes(kept) == before
+    (changed,) = read_discovery(after).announcements
+    assert {where for _, where in changed.reached_at(after)} <= {HostPort(HOST, 45000)}
+    assert not changed.held.all(*MULTICAST)
