@@ -1,0 +1,35 @@
+"""What is new in a document: only that is sent to those who have the former one."""
+
+from typing import Any
+
+Json = dict[str, Any]
+_TABLES = ("nodes", "links")
+
+
+def changes(before: Json, after: Json) -> Json:
+    """What makes ``after`` of ``before``; empty if nothing does.
+
+    Of nodes and links those that are new or others, and None for those that are gone; of the rest
+    all that differs.
+    """
+    found: Json = {}
+    for table in _TABLES:
+        old, new = before[table], after[table]
+        rows = {key: row for key, row in new.items() if old.get(key) != row}
+        rows |= dict.fromkeys(old.keys() - new.keys())
+        if rows:
+            found[table] = rows
+    rest = before.keys() | after.keys()
+    found |= {
+        key: after.get(key) for key in rest.difference(_TABLES) if before.get(key) != after.get(key)
+    }
+    return found
+
+
+def changed(before: Json, news: Json) -> Json:
+    """The document that has these changes."""
+    after = {**before, **news}
+    for table in _TABLES:
+        rows = {**before[table], **news.get(table, {})}
+        after[table] = {key: row for key, row in rows.items() if row is not None}
+    return after

@@ -1,0 +1,165 @@
+"""What the live page shows: nodes, the links between them, and findings, as one JSON document.
+
+Both versions of ROS and both operators make such a document; the page knows no other. Texts are
+what nodes call themselves and things, shortened, and harmless only as text.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+
+from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.telemetry.text import brief
+
+ROBOT, HOST, CONTAINER = "robot", "host", "container"
+"""The lanes: outside, the machine of the proxy, and inside."""
+OK, UNKNOWN, WARNING, BROKEN = "ok", "unknown", "warning", "broken"
+"""States of nodes and links."""
+MOST_NODES, MOST_LINKS, MOST_FINDINGS = 1500, 3000, 50
+"""How many are shown; the rest is counted."""
+LONGEST = 300
+"""Characters of a name."""
+LONGEST_TEXT = 1000
+"""Characters of what is wrong, and of its cure."""
+QUIET = frozenset({"/rosout", "/rosout_agg", "/tf", "/tf_static", "/parameter_events"})
+"""Topics that nearly every node has: hidden until they are asked for."""
+_QUIET_SERVICES = ("/get_loggers", "/set_logger_level")
+Json = dict[str, Any]
+
+
+class PageNode(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A node, participant, master or proxy in its lane.
+
+    ``label`` is shown where the key is no name. ``ports`` are those that stand for it outside,
+    ``rate`` what is forwarded for it where that is not known of each link, in bytes per second.
+    ``proxy``: whose it is, where there are several.
+    """
+
+    lane: str
+    kind: str = "node"
+    label: str = ""
+    state: str = OK
+    text: str = ""
+    fix: str = ""
+    address: str = ""
+    ports: str = ""
+    rate: float | None = None
+    proxy: str = ""
+
+
+class PageLink(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A topic from a publisher to a subscriber, or a service or parameter and who has it.
+
+    ``target`` is empty where there is none. ``carried``: kernel, splice, copy, UDPROS, or direct
+    where it does not pass the proxy; empty if that is not known. ``port``: the proxy's. ``rate`` is
+    in bytes and ``hz`` in messages per second, ``since`` when something came last that does not
+    come just now, in seconds since the epoch; None: not known.
+    """
+
+    kind: str
+    name: str
+    source: str
+    target: str = ""
+    carried: str = ""
+    port: int | None = None
+    rate: float | None = None
+    hz: float | None = None
+    since: float | None = None
+    flows: bool = False
+    state: str = UNKNOWN
+    text: str = ""
+    fix: str = ""
+    quiet: bool = False
+
+    @property
+    def key(self) -> str:
+        """What tells it from all others."""
+        return f"{self.kind} {self.name} {self.source} {self.target}"
+
+
+def document(
+    proxy: Json,
+    nodes: dict[str, PageNode],
+    links: Iterable[PageLink],
+    findings: Iterable[DoctorFinding],
+    left_out: int = 0,
+) -> Json:
+    """All of it within bounds; what is broken, and what is not quiet, comes first.
+
+    ``left_out``: how many links are not even among these.
+    """
+    order = sorted(links, key=lambda link: (link.state != BROKEN, link.quiet, link.key))
+    told = [one for one in findings if one.severity >= Severity.WARNING]
+    told.sort(key=lambda one: -one.severity)
+    shown_nodes = dict(list(nodes.items())[:MOST_NODES])
+    shown = [
+        link
+        for link in order
+        if link.source in shown_nodes and (not link.target or link.target in shown_nodes)
+    ][:MOST_LINKS]
+    return {
+        "proxy": proxy,
+        "nodes": {key: _plain(node) for key, node in shown_nodes.items()},
+        "links": {link.key: _plain(link) for link in shown},
+        "findings": [_finding(one) for one in told[:MOST_FINDINGS]],
+        "left_out": left_out + len(nodes) - len(shown_nodes) + len(order) - len(shown),
+    }
+
+
+class Told(msgspec.Struct, frozen=True):
+    """A finding, with its severity in words."""
+
+    severity: str = ""
+    subject: str = ""
+    text: str = ""
+    fix: str = ""
+
+
+class About(msgspec.Struct, frozen=True):
+    """What of a proxy's own is needed by who shows several."""
+
+    host: str = ""
+    master: str = ""
+
+
+class Document(msgspec.Struct, frozen=True):
+    """A document as its reader has it."""
+
+    nodes: dict[str, PageNode]
+    links: dict[str, PageLink]
+    findings: tuple[Told, ...] = ()
+    proxy: About = About()
+    left_out: int = 0
+
+
+def is_quiet_service(name: str) -> bool:
+    """Whether every node has such a service."""
+    return name.endswith(_QUIET_SERVICES)
+
+
+def rounded(value: float) -> float:
+    """A measure as it is shown: what changes in the third digit alone is no news."""
+    return float(f"{value:.2g}")
+
+
+def short(name: str) -> str:
+    """A name as it is shown."""
+    return brief(name, LONGEST)
+
+
+def told(text: str) -> str:
+    """What is wrong, or a cure, as it is shown."""
+    return brief(text, LONGEST_TEXT)
+
+
+def _plain(one: PageNode | PageLink) -> Json:
+    plain: Json = msgspec.to_builtins(one)
+    return plain
+
+
+def _finding(one: DoctorFinding) -> Json:
+    found: Json = msgspec.to_builtins(
+        Told(one.severity.name.lower(), short(one.subject), told(one.text), told(one.fix))
+    )
+    return found

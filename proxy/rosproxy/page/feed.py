@@ -1,0 +1,204 @@
+"""Keeps the document up to date for as long as somebody looks at it, and hands out what is new.
+
+While there is a watcher, two things go on. The status is read each `TICK` seconds, later where that
+takes long, so that the page never costs more than a share of the proxy's time. And the master and
+the nodes are asked (`rosproxy.doctor.collect.collect_running`), so many questions a second at most.
+Nobody looks: nobody is asked, and what was counted is forgotten.
+
+A watcher waits for another document than the one that it has. One that is slow thereby skips those
+between, and nothing queues up for it.
+"""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
+from functools import partial
+
+from rosproxy.admin.findings import DoctorFinding
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.doctor.collect import collect_running
+from rosproxy.net.tasks import Tasks
+from rosproxy.page.document import Json
+from rosproxy.page.graph import Judged, chosen, graph_document, judge, relayed
+from rosproxy.page.measures import Measures
+
+log = logging.getLogger(__name__)
+
+TICK = 1.0
+"""Seconds between two documents at least."""
+SHARE = 0.1
+"""Share of the time that is spent on making documents at most."""
+LOOK_AGAIN = 2.0
+"""Seconds between two rounds of questions at least."""
+PER_SECOND = 100.0
+"""Questions a second at most, over a round and the pause after it."""
+PER_NODE = 6
+"""Questions to each node in a round at most."""
+MOST_WATCHERS = 16
+"""Pages that are open at the same time."""
+LINGER = 10.0
+"""Seconds for which it goes on after the last watcher: pages are loaded again, operators poll."""
+
+
+class TooManyWatchers(Exception):
+    """Nobody more is served; the message says so."""
+
+
+class Ended(Exception):
+    """The server stops, and there are no more documents."""
+
+
+class Feed:
+    """The newest document, made by ``make`` while there is somebody who wants it.
+
+    ``make`` is started anew with the first watcher and cancelled after the last: it yields
+    documents.
+    """
+
+    def __init__(self, tasks: Tasks, make: Callable[[], AsyncGenerator[Json]]) -> None:
+        self._tasks, self._make = tasks, make
+        self.watchers = 0
+        self._newest: Json | None = None
+        self._made = asyncio.Condition()
+        self._making: asyncio.Task[None] | None = None
+        self._ending: asyncio.TimerHandle | None = None
+        self._closed = False
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is made, since nobody looks."""
+        return self._making is None
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        """As long as this lasts, documents are made. Raises TooManyWatchers, Ended."""
+        if self._closed:
+            raise Ended
+        if self.watchers >= MOST_WATCHERS:
+            raise TooManyWatchers(f"{MOST_WATCHERS} pages are open already; close one of them")
+        self._enter()
+        try:
+            yield
+        finally:
+            self._leave()
+
+    async def after(self, seen: Json | None, within: float) -> Json | None:
+        """Another document than the one ``seen``; None if none comes in so many seconds.
+
+        Raises Ended.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within), self._made:
+                await self._made.wait_for(lambda: self._closed or self._is_news(seen))
+        if self._closed:
+            raise Ended
+        return self._newest if self._is_news(seen) else None
+
+    async def close(self) -> None:
+        """Let everybody go."""
+        self._closed = True
+        if self._ending:
+            self._ending.cancel()
+        self._end()
+        async with self._made:
+            self._made.notify_all()
+
+    def _is_news(self, seen: Json | None) -> bool:
+        return self._newest is not None and self._newest is not seen
+
+    def _enter(self) -> None:
+        self.watchers += 1
+        if self._ending:
+            self._ending.cancel()
+            self._ending = None
+        if self._making is None or self._making.done():
+            self._making = self._tasks.spawn(self._keep_making(), "the live page")
+
+    def _leave(self) -> None:
+        self.watchers -= 1
+        if not self.watchers and not self._closed:
+            self._ending = asyncio.get_running_loop().call_later(LINGER, self._end)
+
+    def _end(self) -> None:
+        if self._making:
+            self._making.cancel()
+        self._making = self._newest = None
+
+    async def _keep_making(self) -> None:
+        while True:
+            try:
+                async with contextlib.aclosing(self._make()) as documents:
+                    async for made in documents:
+                        await self._publish(made)
+            except Exception:
+                log.exception("the live page failed; going on")
+            await asyncio.sleep(TICK)
+
+    async def _publish(self, made: Json) -> None:
+        if made != self._newest:
+            async with self._made:
+                self._newest = made
+                self._made.notify_all()
+
+
+class Look:
+    """One time of looking at a proxy: what was counted and found out since somebody looks."""
+
+    def __init__(
+        self,
+        status: Callable[[], ProxyStatus],
+        own: Callable[[], Sequence[DoctorFinding]],
+        admin: str,
+    ) -> None:
+        self._status, self._own, self._admin = status, own, admin
+        self._measures = Measures()
+        self._judged: Judged | None = None
+        self._epoch = time.time() - time.monotonic()
+        self._counting = asyncio.Lock()
+
+    async def documents(self) -> AsyncGenerator[Json]:
+        """A document each tick, without an end."""
+        asking = asyncio.create_task(_again_and_again(self._ask))
+        try:
+            while True:
+                began = time.monotonic()
+                yield await self._document(began)
+                took = time.monotonic() - began
+                await asyncio.sleep(max(TICK - took, took * (1 / SHARE - 1)))
+        finally:
+            asking.cancel()
+
+    async def _document(self, now: float) -> Json:
+        status, own, judged = self._status(), tuple(self._own()), self._judged
+        async with self._counting:
+            if judged:
+                self._measures.read_relays(relayed(status, judged.facts.system), now)
+            # In a thread, so that calls of nodes are not kept waiting by a large graph.
+            return await asyncio.to_thread(
+                graph_document, status, judged, self._measures, own, now, self._epoch
+            )
+
+    async def _ask(self) -> float:
+        """One round of questions; the seconds until the next."""
+        began, status = time.monotonic(), self._status()
+        facts = await collect_running(status, self._admin, partial(chosen, status))
+        judged = await asyncio.to_thread(judge, facts, self._judged)
+        async with self._counting:
+            also = relayed(status, facts.system)
+            self._measures.read_nodes(facts, judged.pairs.keys() | also.keys())
+            self._judged = judged
+        questions = PER_NODE * len(facts.nodes)
+        return max(LOOK_AGAIN, questions / PER_SECOND - (time.monotonic() - began))
+
+
+async def _again_and_again(ask: Callable[[], Awaitable[float]]) -> None:
+    """Ask without an end, whatever becomes of it."""
+    pause = LOOK_AGAIN
+    while True:
+        try:
+            pause = await ask()
+        except Exception:
+            log.exception("the live page: asking nodes failed; going on")
+        await asyncio.sleep(pause)

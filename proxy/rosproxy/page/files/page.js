@@ -1,0 +1,306 @@
+// The page: takes the document and its changes from /events, and shows it as a graph and a table.
+//
+// All that comes from nodes goes through textContent, or is painted on a canvas; nothing is parsed.
+// However many changes come, it is drawn twice a second at most, and only what differs is touched.
+
+import { age, apply, boxesOf, hertz, labelOf, linesOf, megabytes, positions, visibleLinks, WORDS }
+  from "./view.js";
+
+const AT_MOST_EVERY = 500;
+const MOST_ROWS = 400;
+const MOST_LABELS = 80;
+const AGAIN = 5000;
+
+const $ = (id) => document.getElementById(id);
+const state = { nodes: new Map(), links: new Map(), proxy: {}, findings: [], left_out: 0 };
+const chosen = { unfolded: new Set(), unfoldAll: false, quiet: false, filter: "" };
+const rows = new Map();
+let drawing = null;
+let clock = 0; // how many seconds the proxy's is ahead
+let selected = "";
+let fitted = 0;
+let cy = null;
+
+// Events
+
+function listen() {
+  const source = new EventSource("events");
+  source.addEventListener("clock", (event) => { clock = Number(event.data) - Date.now() / 1000; });
+  source.addEventListener("all", (event) => {
+    state.nodes.clear();
+    state.links.clear();
+    take(JSON.parse(event.data));
+    $("connection").textContent = "Live";
+  });
+  source.addEventListener("change", (event) => take(JSON.parse(event.data)));
+  source.addEventListener("error", () => {
+    $("connection").textContent = "Not connected; what is shown may be old. Trying again…";
+    if (source.readyState === EventSource.CLOSED) {
+      setTimeout(listen, AGAIN);
+      // Who is to give the token again sees nothing else than that here.
+      fetch("graph").then((answer) => { if (answer.status === 403) location.reload(); }, () => {});
+    }
+  });
+}
+
+function take(news) {
+  apply(state.nodes, news.nodes);
+  apply(state.links, news.links);
+  for (const key of ["proxy", "findings", "left_out"]) if (key in news) state[key] = news[key];
+  draw();
+}
+
+function draw() {
+  if (drawing === null) drawing = setTimeout(() => { drawing = null; requestAnimationFrame(show); }, AT_MOST_EVERY);
+}
+
+// Drawing
+
+function show() {
+  const found = visibleLinks(state.links, state.nodes, chosen);
+  showHead(found);
+  showFindings();
+  showTable(found);
+  showGraph(found);
+  showDetails();
+}
+
+function showHead(found) {
+  const { proxy } = state;
+  const broken = [...state.links.values()].filter((link) => link.state === "broken").length;
+  put($("host"), proxy.host || "");
+  const ports = proxy.ports ? `ports ${proxy.ports}: ${proxy.used} used, ${proxy.free} free` : "";
+  const parts = [`${state.nodes.size} nodes`, `${found.length} links`, ports,
+    proxy.plane ? `forwards by ${proxy.plane}` : "", proxy.version ? `version ${proxy.version}` : ""];
+  put($("summary"), parts.filter(Boolean).join(" · "));
+  const title = broken ? `(${broken} broken) rosproxy` : "rosproxy";
+  if (document.title !== title) document.title = title;
+}
+
+function showFindings() {
+  const told = new Map();
+  const tell = (what, kind, text, fix) => {
+    const key = JSON.stringify([kind, text, fix]);
+    const known = told.get(key);
+    if (known) known.what.push(what);
+    else told.set(key, { what: [what], kind, text, fix });
+  };
+  for (const one of state.findings) tell(one.subject, one.severity === "error" ? "broken" : "warning", one.text, one.fix);
+  for (const link of state.links.values()) {
+    if (link.state !== "broken" && link.state !== "warning") continue;
+    const ends = [link.source, link.target].filter(Boolean).map((id) => labelOf(id, state.nodes.get(id)));
+    tell(`${link.name} from ${ends.join(" to ")}`, link.state, link.text || "", link.fix || "");
+  }
+  for (const [id, node] of state.nodes) {
+    if (node.state === "broken" || node.state === "warning") tell(labelOf(id, node), node.state, node.text || "", node.fix || "");
+  }
+  const items = [...told.values()].sort((a, b) => (a.kind === "broken" ? 0 : 1) - (b.kind === "broken" ? 0 : 1));
+  const key = JSON.stringify(items);
+  if ($("findings").dataset.key === key) return; // a screen reader would say it again
+  $("findings").dataset.key = key;
+  const shown = items.slice(0, 30).map((item) => {
+    const more = item.what.length > 3 ? ` and ${item.what.length - 3} more` : "";
+    const li = make("li", "", item.kind);
+    li.append(make("div", `${WORDS[item.kind]}: ${item.what.slice(0, 3).join("; ")}${more}`, "what"));
+    li.append(make("div", item.text));
+    if (item.fix) li.append(make("code", item.fix, "fix"));
+    return li;
+  });
+  if (items.length > shown.length) shown.push(make("li", `and ${items.length - shown.length} more`));
+  $("findings").replaceChildren(...(shown.length ? shown : [make("li", "Nothing wrong was found.", "none")]));
+}
+
+const HEADS = ["State", "Name", "From", "To", "Carried by", "Port", "Hz", "MB/s", "Last message", "What is wrong"];
+const NUMBERS = new Set([5, 6, 7, 8]);
+
+function showTable(found) {
+  const now = Date.now() / 1000 + clock;
+  const listed = found.slice(0, MOST_ROWS);
+  const wanted = new Set(listed.map((one) => one.id));
+  for (const [id, row] of rows) if (!wanted.has(id)) { row.remove(); rows.delete(id); }
+  let before = null;
+  for (const { id, link, from, to } of listed) {
+    let row = rows.get(id);
+    if (!row) {
+      row = make("tr");
+      HEADS.forEach((head, index) => {
+        const cell = make("td", "", index === 0 ? "state" : NUMBERS.has(index) ? "number" : "");
+        cell.dataset.head = head;
+        row.append(cell);
+      });
+      row.lastChild.append(make("span"), make("code", "", "fix"));
+      rows.set(id, row);
+    }
+    const state = link.state || "unknown";
+    const kind = link.kind === "topic" ? "" : ` (${link.kind})`;
+    [WORDS[state], link.name + kind, from, to || "–", link.carried || "–", link.port || "–",
+      hertz(link), megabytes(link), age(link, now)].forEach((text, index) => put(row.cells[index], String(text)));
+    if (row.dataset.state !== state) {
+      row.dataset.state = state;
+      row.cells[0].className = `state ${state}`;
+    }
+    put(row.lastChild.firstChild, link.text || "");
+    put(row.lastChild.lastChild, link.fix || "");
+    const place = before ? before.nextSibling : $("rows").firstChild;
+    if (place !== row) $("rows").insertBefore(row, place);
+    before = row;
+  }
+  const hidden = found.length - listed.length;
+  const parts = [hidden > 0 ? `${hidden} more: narrow it down by a name.` : "",
+    state.left_out ? `${state.left_out} more are not sent to the page.` : ""];
+  put($("more"), parts.filter(Boolean).join(" "));
+}
+
+function showGraph(found) {
+  if (!cy) return;
+  const shown = new Set();
+  for (const [id, node] of state.nodes) if ((node.kind || "node") !== "node") shown.add(id);
+  for (const { link } of found) { shown.add(link.source); if (link.target) shown.add(link.target); }
+  if (!chosen.filter) for (const id of state.nodes.keys()) if (chosen.quiet || id !== "/rosout") shown.add(id);
+  const { boxOf, boxes, folds } = boxesOf(state.nodes, shown, chosen);
+  const lines = linesOf(found, boxOf);
+  const places = positions(boxes);
+  const wanted = new Map();
+  for (const box of boxes.values()) {
+    const count = box.fold ? ` (${box.count})` : "";
+    wanted.set(box.id, { group: "nodes", position: places.get(box.id),
+      data: { id: box.id, label: box.label + count, state: box.state, kind: box.fold ? "fold" : box.kind, fold: box.fold, node: box.node } });
+  }
+  for (const line of lines.values()) {
+    const same = boxes.get(line.from).lane === boxes.get(line.to).lane ? "yes" : "no";
+    const few = lines.size <= MOST_LABELS;
+    wanted.set(line.id, { group: "edges", data: { id: line.id, source: line.from, target: line.to, state: line.state,
+      same, flows: line.flows ? "yes" : "no", label: few ? lineLabel(line) : "" } });
+  }
+  cy.batch(() => {
+    cy.elements().forEach((one) => { if (!wanted.has(one.id())) one.remove(); });
+    const added = [];
+    for (const [id, one] of wanted) {
+      const known = cy.getElementById(id);
+      if (known.empty()) { added.push(one); continue; }
+      for (const [key, value] of Object.entries(one.data)) if (known.data(key) !== value) known.data(key, value);
+      if (one.position) {
+        const at = known.position();
+        if (at.x !== one.position.x || at.y !== one.position.y) known.position(one.position);
+      }
+    }
+    cy.add(added.filter((one) => one.group === "nodes"));
+    cy.add(added.filter((one) => one.group === "edges"));
+  });
+  if (fitted !== boxes.size && !selected) { fitted = boxes.size; cy.fit(undefined, 24); }
+  showFolds(folds);
+}
+
+function lineLabel(line) {
+  if (line.links.length > 1) return `${line.links.length} links`;
+  const { link } = line.links[0];
+  if (link.state === "broken") return `${link.name}\nbroken`;
+  const measures = [link.hz === undefined ? "" : `${hertz(link)} Hz`, link.rate === undefined ? "" : `${megabytes(link)} MB/s`,
+    link.carried || ""];
+  return [link.name, measures.filter(Boolean).join(", ")].filter(Boolean).join("\n");
+}
+
+function showFolds(folds) {
+  const key = JSON.stringify(folds);
+  if ($("folds").dataset.key === key) return;
+  $("folds").dataset.key = key;
+  $("namespaces").hidden = folds.length === 0;
+  $("folds").replaceChildren(...folds.map((fold) => {
+    const button = make("button", `${fold.label} (${fold.count})`);
+    button.type = "button";
+    button.setAttribute("aria-expanded", String(fold.open));
+    button.addEventListener("click", () => toggle(fold.key));
+    return button;
+  }));
+}
+
+function toggle(key) {
+  if (!chosen.unfolded.delete(key)) chosen.unfolded.add(key);
+  fitted = 0;
+  show();
+}
+
+function showDetails() {
+  const element = selected && cy ? cy.getElementById(selected) : null;
+  const parts = element && element.nonempty() ? details(element) : [];
+  const key = JSON.stringify(parts);
+  if ($("details").dataset.key === key) return;
+  $("details").dataset.key = key;
+  $("details").replaceChildren(...parts.map(([kind, text]) => make(kind, text)));
+}
+
+function details(element) {
+  if (element.isNode()) {
+    const node = state.nodes.get(element.data("node")) || {};
+    const ports = node.ports ? `ports ${node.ports}` : "";
+    const rate = node.rate === undefined ? "" : `${megabytes(node)} MB/s through it`;
+    return [["h3", element.data("label")], ["p", [node.address, ports, rate].filter(Boolean).join(" · ")],
+      ["p", node.text || ""], ["code", node.fix || ""]].filter(([, text]) => text);
+  }
+  const ends = [element.source().id(), element.target().id()];
+  const { boxOf } = boxesOf(state.nodes, new Set(state.nodes.keys()), chosen);
+  const line = linesOf(visibleLinks(state.links, state.nodes, chosen), boxOf).get(element.id());
+  const parts = [["h3", ends.map((id) => cy.getElementById(id).data("label")).join(" to ")]];
+  for (const { link } of (line ? line.links : []).slice(0, 20)) {
+    parts.push(["p", `${WORDS[link.state || "unknown"]}: ${link.name}, ${hertz(link)} Hz, ${megabytes(link)} MB/s, ` +
+      `carried by ${link.carried || "–"}, port ${link.port || "–"}`]);
+    if (link.text) parts.push(["p", link.text], ["code", link.fix || ""]);
+  }
+  return parts;
+}
+
+// The canvas
+
+function style() {
+  const own = getComputedStyle(document.documentElement);
+  const colour = (name) => own.getPropertyValue(`--${name}`).trim();
+  const states = ["ok", "unknown", "warning", "broken"];
+  return [
+    { selector: "node", style: { label: "data(label)", shape: "round-rectangle", width: 150, height: 30,
+      "background-color": colour("back"), "border-width": 1.5, color: colour("text"), "font-size": 11,
+      "text-valign": "center", "text-halign": "center", "text-wrap": "ellipsis", "text-max-width": 140,
+      "min-zoomed-font-size": 5 } },
+    { selector: "node[kind = 'fold']", style: { "border-style": "double", "border-width": 4 } },
+    { selector: "node[kind = 'proxy'], node[kind = 'master']", style: { shape: "hexagon" } },
+    { selector: "edge", style: { width: 2, "curve-style": "straight", "target-arrow-shape": "triangle", "arrow-scale": 0.8,
+      "source-label": "data(label)", "source-text-offset": 78, "source-text-rotation": "autorotate",
+      "font-size": 9, color: colour("text"), "text-wrap": "wrap", "text-background-color": colour("box"),
+      "text-background-opacity": 0.85, "text-background-padding": 2, "min-zoomed-font-size": 6 } },
+    { selector: "edge[same = 'yes']", style: { "curve-style": "unbundled-bezier", "control-point-distances": 110, "control-point-weights": 0.5 } },
+    { selector: "edge[flows = 'no']", style: { "line-style": "dashed" } },
+    ...states.map((name) => ({ selector: `node[state = '${name}']`, style: { "border-color": colour(name) } })),
+    ...states.map((name) => ({ selector: `edge[state = '${name}']`, style: { "line-color": colour(name), "target-arrow-color": colour(name) } })),
+    { selector: "edge[state = 'broken']", style: { width: 4 } },
+    { selector: ":selected", style: { "border-width": 4, "overlay-opacity": 0.12 } },
+  ];
+}
+
+function start() {
+  cy = window.cytoscape({ container: $("graph"), style: style(), layout: { name: "preset" }, minZoom: 0.05, maxZoom: 3,
+    autoungrabify: true, boxSelectionEnabled: false, hideEdgesOnViewport: true, textureOnViewport: true, pixelRatio: 1 });
+  cy.on("tap", "node", (event) => { const fold = event.target.data("fold"); if (fold) toggle(fold); });
+  cy.on("select unselect", () => { selected = cy.$(":selected").map((one) => one.id())[0] || ""; showDetails(); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => cy.style(style()));
+  addEventListener("resize", () => { fitted = 0; draw(); });
+  $("controls").addEventListener("submit", (event) => event.preventDefault());
+  $("filter").addEventListener("input", (event) => { chosen.filter = event.target.value; fitted = 0; draw(); });
+  $("quiet").addEventListener("change", (event) => { chosen.quiet = event.target.checked; fitted = 0; draw(); });
+  $("unfold").addEventListener("change", (event) => { chosen.unfoldAll = event.target.checked; fitted = 0; draw(); });
+  setInterval(draw, 1000); // ages grow
+  // For tests, and whoever looks into it: the graph itself.
+  window.rosproxyPage = { cy, state };
+  listen();
+}
+
+function make(tag, text = "", name = "") {
+  const element = document.createElement(tag);
+  if (text) element.textContent = text;
+  if (name) element.className = name;
+  return element;
+}
+
+function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+start();

@@ -1,0 +1,391 @@
+"""The document of one proxy: from its status, what the doctor has found out, and what was counted.
+
+A link has the first cause of what is wrong: a node at either end that is wrong, then what the
+doctor says of the pair, then that nothing arrives. Links between two nodes outside don't concern
+the proxy and are left out.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import msgspec
+
+from rosproxy.admin.findings import DoctorFinding, Severity, error
+from rosproxy.admin.status_document import EndpointStatus, ProxyStatus, StandInStatus
+from rosproxy.doctor.facts import DoctorFacts, NodeFacts, SystemState
+from rosproxy.doctor.rules import diagnose_running
+from rosproxy.doctor.rules.pair import judge_pair
+from rosproxy.net.addresses import is_loopback
+from rosproxy.page import domain_graph
+from rosproxy.page.document import (
+    BROKEN,
+    CONTAINER,
+    HOST,
+    MOST_LINKS,
+    OK,
+    QUIET,
+    ROBOT,
+    UNKNOWN,
+    WARNING,
+    Json,
+    PageLink,
+    PageNode,
+    document,
+    is_quiet_service,
+    rounded,
+    short,
+    told,
+)
+from rosproxy.page.measures import FLOWS, Key, Measures
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+
+MASTER, PROXY = "master", "rosproxy"
+"""Keys of what is no node: names of those begin with a slash."""
+_STATES = {Severity.ERROR: BROKEN, Severity.WARNING: WARNING}
+
+
+class Judged(msgspec.Struct, frozen=True):
+    """The ``facts`` with the doctor's word on them: of nodes, of pairs, and of the rest.
+
+    ``apart`` are all pairs that are not connected; ``pairs`` has those that were so before.
+    """
+
+    facts: DoctorFacts
+    nodes: dict[str, DoctorFinding] = {}
+    pairs: dict[Key, DoctorFinding] = {}
+    others: tuple[DoctorFinding, ...] = ()
+    apart: frozenset[Key] = frozenset()
+
+
+def chosen(status: ProxyStatus, graph: SystemState) -> tuple[str, ...]:
+    """The topics that nodes are asked about: those of nodes inside, as many as can be shown."""
+    inside = inside_nodes(status)
+    found, left = [], MOST_LINKS
+    for topic in sorted(graph.topics - QUIET):
+        if not inside.keys() & {*graph.sides(topic)}:
+            continue
+        left -= len(graph.publishers.get(topic, ())) * len(graph.subscribers.get(topic, ()))
+        if left < 0:
+            break
+        found.append(topic)
+    return tuple(found)
+
+
+def judge(facts: DoctorFacts, before: Judged | None = None) -> Judged:
+    """Have the doctor judge what was found out, ``before`` it as well.
+
+    A pair is said to be apart once it is found so twice: nodes that start need a moment to meet.
+    """
+    nodes: dict[str, DoctorFinding] = {}
+    others, inside = [], inside_nodes(facts.proxy)
+    for finding in diagnose_running(msgspec.structs.replace(facts, names=())):
+        if finding.severity < Severity.WARNING:
+            continue
+        if finding.subject not in facts.nodes and finding.subject not in inside:
+            others.append(finding)
+        elif finding.subject not in nodes or nodes[finding.subject].severity < finding.severity:
+            nodes[finding.subject] = finding
+    pairs = {
+        pair: judge_pair(facts, *pair)
+        for pair in facts.scope.pairs
+        if inside.keys() & {pair[1], pair[2]}
+    }
+    apart = frozenset(key for key, one in pairs.items() if one.severity is Severity.ERROR)
+    for key in apart - (before.apart if before else frozenset()):
+        del pairs[key]
+    return Judged(facts, nodes, pairs, tuple(others), apart)
+
+
+def inside_nodes(status: ProxyStatus) -> dict[str, EndpointStatus]:
+    """The nodes inside, by their names."""
+    return {name: one for one in status.nodes for name in one.nodes}
+
+
+def relayed(status: ProxyStatus, graph: SystemState) -> dict[Key, int]:
+    """The bytes that the proxy has relayed of each link of a topic."""
+    found: dict[Key, int] = {}
+    for endpoint in status.nodes:
+        for one in endpoint.connections:
+            if one.kind == "topic":
+                publisher = _owner(endpoint, graph.publishers.get(one.name, ()))
+                key = one.name, publisher, one.caller_id
+                found[key] = found.get(key, 0) + one.sent
+    return found
+
+
+def graph_document(
+    status: ProxyStatus,
+    judged: Judged | None,
+    measures: Measures,
+    own: Sequence[DoctorFinding],
+    now: float,
+    epoch: float,
+) -> Json:
+    """The document; ``own`` is what the proxy has found out about its own setting-up.
+
+    ``now`` is in monotonic seconds, as the counters' times, and ``epoch`` when those began, in
+    seconds since the epoch.
+    """
+    judged = judged or Judged(DoctorFacts(status=status))
+    nodes, links = domain_graph.graph(status)
+    left_out = 0
+    if status.settings.for_ros1:
+        nodes |= _Ros1Graph(status, judged).nodes()
+        ros1 = _Ros1Links(status, judged, measures, now, epoch)
+        links += ros1.all()
+        left_out = ros1.left_out
+    findings = [*own, *judged.others, *domain_graph.findings(status)]
+    nodes = {PROXY: _proxy_node(status), **nodes}
+    return document(_about(status), nodes, links, findings, left_out)
+
+
+def _about(status: ProxyStatus) -> Json:
+    return {
+        "version": status.version,
+        "instance": status.instance,
+        "ros": list(status.settings.ros),
+        "host": short(status.settings.advertise_host),
+        "ports": status.ports.advertise,
+        "used": status.ports.used,
+        "free": status.ports.free,
+        "plane": status.data_plane.plane if status.data_plane else "",
+        "master": short(status.master.uri),
+        "master_up": status.master.up,
+    }
+
+
+def _proxy_node(status: ProxyStatus) -> PageNode:
+    ports = f"{status.ports.advertise}, {status.ports.used} used, {status.ports.free} free"
+    return PageNode(
+        HOST, "proxy", "rosproxy", address=short(status.settings.advertise_host), ports=ports
+    )
+
+
+class _Ros1Graph:
+    """The nodes of ROS 1."""
+
+    def __init__(self, status: ProxyStatus, judged: Judged) -> None:
+        self._status, self._judged, self._facts = status, judged, judged.facts
+        self._inside = inside_nodes(status)
+
+    def nodes(self) -> dict[str, PageNode]:
+        master = self._status.master
+        state = OK if master.up else BROKEN if master.error else UNKNOWN
+        text = "" if master.up else told(master.error)
+        found = {MASTER: PageNode(ROBOT, "master", "master", state, text, "", short(master.uri))}
+        found |= {name: self._one_inside(name, one) for name, one in self._inside.items()}
+        # Who is connected though the master does not know it, or has not been asked yet.
+        found |= {
+            one.caller_id: PageNode(ROBOT, address=short(one.peer))
+            for endpoint in self._status.nodes
+            for one in endpoint.connections
+            # Whoever connects names himself; what is no node on this page has no slash.
+            if one.caller_id not in self._inside and one.caller_id.startswith("/")
+        }
+        return found | {
+            name: self._one_outside(name, one)
+            for name, one in self._facts.nodes.items()
+            if name not in self._inside
+        }
+
+    def _one_inside(self, name: str, one: EndpointStatus) -> PageNode:
+        plane = one.data_plane
+        advertised = parse_slave_uri(one.advertised_uri)
+        ports = [advertised.port if advertised else one.port, plane.port if plane else None]
+        rate = plane.sent_rate + plane.received_rate if plane and plane.connections else None
+        node = PageNode(
+            CONTAINER,
+            address=short(one.address),
+            ports=", ".join(str(port) for port in ports if port),
+            rate=None if rate is None else rounded(rate),
+        )
+        return self._marked(name, node)
+
+    def _one_outside(self, name: str, one: NodeFacts) -> PageNode:
+        own = {*self._facts.advertised_addresses}
+        here = any(address in own or is_loopback(address) for address in one.addresses)
+        return self._marked(name, PageNode(HOST if here else ROBOT, address=short(one.uri)))
+
+    def _marked(self, name: str, node: PageNode) -> PageNode:
+        finding = self._judged.nodes.get(name)
+        if finding is None:
+            return node
+        return msgspec.structs.replace(
+            node, state=_STATES[finding.severity], text=told(finding.text), fix=told(finding.fix)
+        )
+
+
+class _Ros1Links:
+    """The links of ROS 1."""
+
+    def __init__(
+        self, status: ProxyStatus, judged: Judged, measures: Measures, now: float, epoch: float
+    ) -> None:
+        self._status, self._judged, self._measures = status, judged, measures
+        self._now, self._epoch = now, epoch
+        self.left_out = 0
+        self._inside = inside_nodes(status)
+        self._graph = judged.facts.system
+        self._relayed = relayed(status, self._graph)
+        self._stand_ins = {one.uri: one for one in status.stand_ins}
+        self._udpros = {(one.topic, one.caller_id): one.port for one in status.udpros}
+        hidden = status.policy.hidden if status.policy else ()
+        self._hidden = {(one.name, one.node): one.reason for one in hidden}
+
+    def all(self) -> list[PageLink]:
+        return [*self._topics(), *self._services(), *self._parameters()]
+
+    def _topics(self) -> Iterator[PageLink]:
+        seen = self._pairs()
+        yield from (self._topic(key) for key in seen if key[1])
+        with_both = {(topic, name) for topic, *both in seen for name in both}
+        for name, one in self._inside.items():
+            for topic in {*one.publishes, *one.subscribes}:
+                if (topic, name) not in with_both and self._is_of(name, one, topic):
+                    yield self._alone(topic, name)
+
+    def _alone(self, topic: str, name: str) -> PageLink:
+        """A topic of a node with nobody on the other side; perhaps it is hidden from there."""
+        reason = self._hidden.get((topic, name))
+        text = "" if reason is None else told(f"hidden from outside by the policy: {reason}")
+        return PageLink("topic", short(topic), name, text=text, quiet=topic in QUIET)
+
+    def _pairs(self) -> set[Key]:
+        """Publishers and subscribers of which one is inside; of /tf there may be very many."""
+        found = {*self._relayed}
+        for topic in sorted(self._graph.topics, key=lambda topic: (topic in QUIET, topic)):
+            givers = self._graph.publishers.get(topic, ())
+            takers = self._graph.subscribers.get(topic, ())
+            if len(found) + len(givers) * len(takers) > 2 * MOST_LINKS:
+                self.left_out += len(givers) * len(takers)
+                continue
+            found |= {
+                (topic, giver, taker)
+                for giver in givers
+                for taker in takers
+                if giver in self._inside or taker in self._inside
+            }
+        return found
+
+    def _is_of(self, name: str, one: EndpointStatus, topic: str) -> bool:
+        """Whether a node has a topic, as far as is known where several share an address."""
+        return len(one.nodes) == 1 or name in self._graph.sides(topic)
+
+    def _topic(self, key: Key) -> PageLink:
+        topic, giver, taker = key
+        link = self._measures.get(key)
+        finding = self._problem(key)
+        carried, port = self._way(key)
+        judged = key in self._judged.pairs or key in self._relayed
+        state = _STATES[finding.severity] if finding else OK if judged else UNKNOWN
+        age = None if link.last is None else self._now - link.last
+        flows = age is not None and age < FLOWS and state != BROKEN
+        return PageLink(
+            "topic",
+            short(topic),
+            giver,
+            taker,
+            carried="" if state == BROKEN else carried,
+            port=port,
+            rate=None if link.rate is None else rounded(link.rate),
+            hz=None if link.hz is None else rounded(link.hz),
+            since=None if link.last is None or flows else round(self._epoch + link.last),
+            flows=flows,
+            state=state,
+            text=told(finding.text) if finding else "",
+            fix=told(finding.fix) if finding else "",
+            quiet=topic in QUIET,
+        )
+
+    def _problem(self, key: Key) -> DoctorFinding | None:
+        """What is wrong with a link, the first cause first."""
+        for name in key[1:]:
+            finding = self._judged.nodes.get(name)
+            if finding and finding.severity is Severity.ERROR:
+                text = f"{name}: {finding.text}"
+                return msgspec.structs.replace(finding, text=text)
+        finding = self._judged.pairs.get(key)
+        if finding and finding.severity is Severity.ERROR and key not in self._relayed:
+            return finding
+        if self._measures.get(key).stalled(self._now):
+            return self._stalled(key)
+        return None
+
+    def _stalled(self, key: Key) -> DoctorFinding:
+        topic, giver, taker = key
+        text = f"connected, but nothing of what {giver} publishes arrives at {taker}: packets are "
+        text += "dropped on the way"
+        _, port = self._way(key)
+        host = self._status.settings.advertise_host
+        fix = f"restart {taker}" if taker in self._inside else f"look at the network of {taker}"
+        if port and taker not in self._inside:
+            fix = f"on the machine of {taker}: nc -vz {host} {port}; a firewall or a broken network"
+        return error("pair", f"{topic} from {giver} to {taker}", text, fix)
+
+    def _way(self, key: Key) -> tuple[str, int | None]:
+        """How a link is carried, and by which port of the proxy."""
+        topic, giver, taker = key
+        if (topic, taker) in self._udpros:
+            return "UDPROS", self._udpros[topic, taker]
+        endpoint, is_relayed = self._inside.get(giver), key in self._relayed
+        if endpoint and taker in self._inside and not is_relayed:
+            return "direct", None
+        if endpoint:
+            where = parse_slave_uri(endpoint.advertised_uri)
+            return self._way_of(endpoint, where.port if where else endpoint.port, is_relayed)
+        outside = self._judged.facts.nodes.get(giver)
+        stand_in = self._stand_ins.get(outside.uri) if outside else None
+        if stand_in:
+            by_kernel = stand_in.data_plane.connections if stand_in.data_plane else 0
+            return self._way_of(stand_in, stand_in.port, stand_in.connections > by_kernel)
+        return ("" if self._status.settings.direction == "both" else "direct"), None
+
+    def _way_of(
+        self, holder: EndpointStatus | StandInStatus, port: int, is_relayed: bool
+    ) -> tuple[str, int | None]:
+        """The same for what goes by a port of the range, or by one that stands for outside."""
+        plane = holder.data_plane
+        if plane and plane.plane == "kernel" and plane.port and not is_relayed:
+            return "kernel", plane.port
+        return (self._user_plane() if is_relayed else ""), port
+
+    def _user_plane(self) -> str:
+        mode = self._status.data_plane.mode if self._status.data_plane else ""
+        return "copy" if mode == "copy" else "splice"
+
+    def _services(self) -> Iterator[PageLink]:
+        graph = self._graph
+        for endpoint in self._status.nodes:
+            for service in endpoint.services:
+                name = _owner(endpoint, graph.services.get(service, ()))
+                finding = self._judged.nodes.get(name)
+                state = _STATES[finding.severity] if finding else OK
+                where = parse_slave_uri(endpoint.advertised_uri)
+                clients = [
+                    one
+                    for one in endpoint.connections
+                    if (one.kind, one.name) == ("service", service)
+                ]
+                yield PageLink(
+                    "service",
+                    short(service),
+                    name,
+                    carried=self._user_plane() if clients else "",
+                    port=where.port if where else endpoint.port,
+                    rate=rounded(sum(c.sent_rate + c.received_rate for c in clients))
+                    if clients
+                    else None,
+                    state=state,
+                    quiet=is_quiet_service(service),
+                )
+
+    def _parameters(self) -> Iterator[PageLink]:
+        for endpoint in self._status.nodes:
+            for name in endpoint.parameters:
+                for node in endpoint.nodes[:1]:
+                    yield PageLink("parameter", short(name), MASTER, node, state=OK, quiet=True)
+
+
+def _owner(endpoint: EndpointStatus, named: Sequence[str]) -> str:
+    """Which node of an address has something, as the master tells; else the first."""
+    fitting = [name for name in endpoint.nodes if name in named]
+    return next(iter([*fitting, *endpoint.nodes]), "")

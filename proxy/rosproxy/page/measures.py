@@ -1,0 +1,158 @@
+"""What was counted of each link, and what follows from it.
+
+That are rates, the age of the last message, and whether a connection that seems well carries
+nothing. There are three counters: the publisher's and the subscriber's own of messages and bytes,
+which they are asked for now and then (``getBusStats``), and the proxy's of bytes, where it relays.
+What the subscriber has counted has arrived. The proxy's counter stops only once buffers are full;
+the publisher's tells what was to be sent.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from rosproxy.doctor.facts import DoctorFacts, SlaveReport
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.protocol.uris import parse_slave_uri
+
+STALLED = 5.0
+"""Seconds in which a subscriber has got nothing that was sent to it, until that is told."""
+MISSED = 2
+"""Messages that must have been sent meanwhile: one may be under way."""
+FLOWS = 3.0
+"""Seconds after a message in which one is said to come just now."""
+Key = tuple[str, str, str]
+"""Topic, publisher, subscriber."""
+
+
+@dataclass(slots=True)
+class Counter:
+    """Something that only grows: its ``value`` ``at`` a time, ``rate``, and when it last grew."""
+
+    value: int
+    at: float
+    rate: float | None = None
+    grew: float | None = None
+
+    def read(self, value: int, at: float) -> None:
+        """Take in another value; a smaller one is that of a new connection."""
+        if at <= self.at:
+            return
+        self.rate = (value - self.value) / (at - self.at) if value >= self.value else None
+        if value > self.value:
+            self.grew = at
+        self.value, self.at = value, at
+
+
+@dataclass(slots=True)
+class Link:
+    """The counters of a link, by ``messages``, ``bytes`` and side, and ``relayed`` bytes.
+
+    ``mark``: what the publisher had sent, and when, as the subscriber last got something.
+    """
+
+    counters: dict[str, Counter] = field(default_factory=dict)
+    mark: tuple[int, float] | None = None
+
+    def read(self, name: str, value: int, at: float) -> None:
+        """Take in what was counted."""
+        counter = self.counters.get(name)
+        if counter is None:
+            self.counters[name] = Counter(value, at)
+        else:
+            counter.read(value, at)
+
+    @property
+    def hz(self) -> float | None:
+        """Messages per second that arrive or, where that is not told, that are sent."""
+        return self._first("rate", "taken", "given")
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes per second: those of the proxy, else those that a node has counted."""
+        return self._first("rate", "relayed", "taken bytes", "given bytes")
+
+    @property
+    def last(self) -> float | None:
+        """When something was last seen to have come."""
+        return self._first("grew", "taken", "relayed", "given")
+
+    def note_progress(self) -> None:
+        """Remember how far the publisher was whenever the subscriber got something."""
+        given, taken = self.counters.get("given"), self.counters.get("taken")
+        if given is None or taken is None:
+            self.mark = None
+        elif self.mark is None or (taken.grew or 0.0) > self.mark[1] or given.value < self.mark[0]:
+            self.mark = given.value, max(given.at, taken.at)
+
+    def stalled(self, now: float) -> bool:
+        """Whether messages are sent, and none arrives."""
+        if self.mark is None:
+            return False
+        sent, when = self.mark
+        missed = self.counters["given"].value - sent
+        return missed >= MISSED and now - when >= STALLED
+
+    def _first(self, what: str, *names: str) -> float | None:
+        counters = [self.counters[name] for name in names if name in self.counters]
+        found: float | None = getattr(counters[0], what) if counters else None
+        return found
+
+
+class Measures:
+    """The counters of all links, for as long as anybody looks."""
+
+    def __init__(self) -> None:
+        self._links: dict[Key, Link] = {}
+
+    def get(self, key: Key) -> Link:
+        """What is known of a link."""
+        return self._links.get(key, _NOTHING)
+
+    def read_relays(self, relayed: Mapping[Key, int], now: float) -> None:
+        """Take in the bytes that the proxy has relayed, by those links that it relays now."""
+        for key in self._links.keys() - relayed.keys():
+            self._links[key].counters.pop("relayed", None)
+        for key, size in relayed.items():
+            self._links.setdefault(key, Link()).read("relayed", size, now)
+
+    def read_nodes(self, facts: DoctorFacts, pairs: Iterable[Key]) -> None:
+        """Take in what nodes have counted of these links; what is known of others is dropped."""
+        known, seen = self._links, dict[str, Mapping[tuple[str, HostPort], str]]()
+        self._links = {}
+        for key in pairs:
+            topic, publisher, subscriber = key
+            link = self._links[key] = known.get(key, Link())
+            giver, taker = facts.nodes.get(publisher), facts.nodes.get(subscriber)
+            if giver and giver.report and taker:
+                _read(link, "given", giver.report, ("o", topic, taker.name))
+            if taker and taker.report and giver:
+                if subscriber not in seen:
+                    seen[subscriber] = _publishers(taker.report)
+                uri = giver.uri
+                if giver.where is not None:
+                    uri = seen[subscriber].get((topic, giver.where), uri)
+                _read(link, "taken", taker.report, ("i", topic, uri))
+            link.note_progress()
+
+
+def _read(link: Link, side: str, report: SlaveReport, connection: tuple[str, str, str]) -> None:
+    counts = report.counts.get(connection)
+    if counts is None:
+        for name in (side, f"{side} bytes"):
+            link.counters.pop(name, None)
+        return
+    link.read(side, counts[1], report.at)
+    link.read(f"{side} bytes", counts[0], report.at)
+
+
+def _publishers(report: SlaveReport) -> Mapping[tuple[str, HostPort], str]:
+    """The URIs that a subscriber knows publishers by, which roscpp has without their paths."""
+    found: dict[tuple[str, HostPort], str] = {}
+    for direction, topic, peer in report.counts:
+        where = parse_slave_uri(peer) if direction == "i" else None
+        if where is not None:
+            found.setdefault((topic, where), peer)
+    return found
+
+
+_NOTHING = Link()

@@ -1,0 +1,192 @@
+"""The page over HTTP: its files, the document, and its changes as server-sent events.
+
+It only tells. Its files are the same for everybody; what is told of nodes is for those that
+`Visitors` lets in. The page may load nothing from anywhere else and run no script but its own (its
+Content-Security-Policy), so that a name that a node has given itself does nothing there.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from functools import cache
+from importlib.resources import files
+from urllib.parse import parse_qs
+
+from aiohttp import web
+
+from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy.page.changes import changes
+from rosproxy.page.document import Json
+from rosproxy.page.feed import Ended, Feed, TooManyWatchers
+from rosproxy.page.visitors import SESSION, Visitors, cookie_name
+
+Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
+HEARTBEAT = 15.0
+"""Seconds after which something is sent, so that who has gone is noticed."""
+FIRST = 10.0
+"""Seconds in which the first document must be there."""
+MOST_OF_FORM = 4096
+"""Longest form in bytes."""
+FORM_TIMEOUT = 10.0
+"""Seconds in which it must have arrived."""
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+_FILES = {
+    "/page.js": ("page.js", "text/javascript"),
+    "/view.js": ("view.js", "text/javascript"),
+    "/page.css": ("page.css", "text/css"),
+    "/cytoscape.min.js": ("cytoscape.min.js", "text/javascript"),
+}
+_WRONG = '<p role="alert">That is not the token.</p>'
+
+
+class Page:
+    """The routes of the page, over a feed of documents."""
+
+    def __init__(self, feed: Feed, visitors: Visitors) -> None:
+        self.feed, self.visitors = feed, visitors
+        self._encoded: tuple[Json | None, Json, bytes] | None = None
+
+    @property
+    def routes(self) -> Mapping[tuple[str, str], Handler]:
+        """What is served, by method and path."""
+        own: dict[tuple[str, str], Handler] = {
+            ("GET", "/"): self._show,
+            ("POST", "/login"): self._log_in,
+            ("GET", "/graph"): self._tell,
+            ("GET", "/events"): self._stream,
+        }
+        return own | {("GET", path): _send_file for path in _FILES}
+
+    async def close(self) -> None:
+        """End all streams."""
+        await self.feed.close()
+
+    async def _show(self, request: web.BaseRequest) -> web.StreamResponse:
+        key = request.query.get("key", "")
+        if key and self.visitors.uses_key(key):
+            return self._let_in(request)
+        if self.visitors.may_look(request):
+            return _html("index.html")
+        return self._turn_away()
+
+    def _turn_away(self, remark: str = "") -> web.Response:
+        if not self.visitors.needs_token:
+            return web.Response(status=403, text=self.visitors.refusal, headers=_HEADERS)
+        return _html("login.html", 403 if remark else 401, remark)
+
+    async def _log_in(self, request: web.BaseRequest) -> web.StreamResponse:
+        try:
+            async with asyncio.timeout(FORM_TIMEOUT):
+                body = await read_bounded(request.content, MOST_OF_FORM)
+            fields = parse_qs(body.decode("utf-8", "surrogateescape"), max_num_fields=4)
+        except (TimeoutError, TooLong, ValueError):
+            return web.Response(status=400, text="rosproxy: no such form\n", headers=_HEADERS)
+        if self.visitors.knows_token(fields.get("token", [""])[0]):
+            return self._let_in(request)
+        return self._turn_away(_WRONG)
+
+    def _let_in(self, request: web.BaseRequest) -> web.Response:
+        response = web.Response(status=303, headers={**_HEADERS, "Location": "./"})
+        response.set_cookie(
+            cookie_name(request),
+            self.visitors.new_session(),
+            max_age=int(SESSION),
+            httponly=True,
+            samesite="Strict",
+        )
+        return response
+
+    async def _tell(self, request: web.BaseRequest) -> web.StreamResponse:
+        """The whole document, for programs."""
+        if not self.visitors.may_look(request):
+            return _refusal()
+        try:
+            with self.feed.watching():
+                document = await self.feed.after(None, FIRST)
+        except (TooManyWatchers, Ended) as error:
+            return _not_now(error)
+        return _not_now() if document is None else web.json_response(document, headers=_HEADERS)
+
+    async def _stream(self, request: web.BaseRequest) -> web.StreamResponse:
+        """The document and then, as long as the browser is there, what changes in it."""
+        if not self.visitors.may_look(request):
+            return _refusal()
+        if request.method == "HEAD":
+            return web.Response(headers=_HEADERS)
+        response = web.StreamResponse(headers={**_HEADERS, "Cache-Control": "no-store"})
+        response.content_type = "text/event-stream"
+        try:
+            with self.feed.watching():
+                await response.prepare(request)
+                await self._send(response)
+        except TooManyWatchers as error:
+            return _not_now(error)
+        except (Ended, ConnectionError):
+            pass
+        with contextlib.suppress(ConnectionError):
+            await response.write_eof()
+        return response
+
+    async def _send(self, response: web.StreamResponse) -> None:
+        """Raises Ended, and ConnectionError once the browser has gone."""
+        # The page tells how old something is, and the browser's clock may be another.
+        await response.write(f"event: clock\ndata: {time.time():.3f}\n\n".encode())
+        seen: Json | None = None
+        while True:
+            newest = await self.feed.after(seen, HEARTBEAT)
+            await response.write(b":\n\n" if newest is None else self._event(seen, newest))
+            seen = newest or seen
+
+    def _event(self, seen: Json | None, newest: Json) -> bytes:
+        """An event. Most watchers have seen the same, so that it is encoded once."""
+        kept = self._encoded
+        if kept is None or kept[0] is not seen or kept[1] is not newest:
+            news = newest if seen is None else changes(seen, newest)
+            kind = "all" if seen is None else "change"
+            data = json.dumps(news, separators=(",", ":"))
+            self._encoded = kept = (seen, newest, f"event: {kind}\ndata: {data}\n\n".encode())
+        return kept[2]
+
+
+async def _send_file(request: web.BaseRequest) -> web.StreamResponse:
+    name, kind = _FILES[request.path]
+    body, tag = _read(name)
+    headers = {**_HEADERS, "ETag": tag, "Cache-Control": "no-cache"}
+    if request.headers.get("If-None-Match") == tag:
+        return web.Response(status=304, headers=headers)
+    return web.Response(body=body, content_type=kind, charset="utf-8", headers=headers)
+
+
+@cache
+def _read(name: str) -> tuple[bytes, str]:
+    """A file of the page, and what tells it from others of that name."""
+    body = files("rosproxy.page").joinpath("files", name).read_bytes()
+    return body, f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+
+
+def _html(name: str, status: int = 200, remark: str = "") -> web.Response:
+    text = _read(name)[0].decode().replace("<!-- remark -->", remark)
+    headers = {**_HEADERS, "Cache-Control": "no-store"}
+    return web.Response(status=status, text=text, content_type="text/html", headers=headers)
+
+
+def _refusal() -> web.Response:
+    text = "rosproxy: this needs 'Authorization: Bearer TOKEN', or the cookie that / gives for it\n"
+    return web.Response(status=403, text=text, headers=_HEADERS)
+
+
+def _not_now(reason: object = "") -> web.Response:
+    text = f"rosproxy: {reason or 'nothing is known yet; try again'}\n"
+    return web.Response(status=503, text=text, headers={**_HEADERS, "Retry-After": "10"})

@@ -1,0 +1,50 @@
+"""Fixtures: machines with real nodes, a proxy between them, and a browser beside the proxy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.browser.webdriver import Browser
+from tests.ros.cpp import compiled_node
+from tests.ros.forks import Forks
+from tests.ros.lab import Lab
+from tests.ros.topology import SHARED, Topology, remove_leftovers
+
+
+@pytest.fixture(scope="session")
+def lab_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """One master and one proxy for all tests."""
+    remove_leftovers()
+    compiled_node()
+    topology, forks = Topology(SHARED), Forks()
+    topology.build()
+    lab = Lab(topology, tmp_path_factory.mktemp("lab"), forks)
+    try:
+        lab.ensure_running()
+        yield lab
+    finally:
+        lab.stop()
+        forks.stop()
+        topology.remove()
+
+
+@pytest.fixture
+def lab(lab_of_all: Lab) -> Iterator[Lab]:
+    """The lab, with no node of another test."""
+    lab_of_all.ensure_running()
+    yield lab_of_all
+    lab_of_all.stop_nodes()
+    lab_of_all.check_proxy()
+
+
+@pytest.fixture
+def browser(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """A browser on the proxy's machine; at the end its console must be clean."""
+    browser = Browser(lab.place("px"), tmp_path_factory.mktemp("browser"))
+    try:
+        yield browser
+        assert browser.console() == []
+    finally:
+        browser.close()

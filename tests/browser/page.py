@@ -1,0 +1,111 @@
+"""The live page as somebody sees it who looks at its table, or at the lines of its graph."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+from tests.browser.webdriver import Browser, Json
+from tests.ros.lab import ADMIN_PORT, Lab
+from tests.ros.processes import wait_until
+from tests.ros.topology import run_command
+
+UNKNOWN = "\N{EN DASH}"
+URL = f"http://127.0.0.1:{ADMIN_PORT}/"
+ROWS = """
+return [...document.querySelectorAll("#rows tr")].map((row) => ({
+  ...Object.fromEntries([...row.cells].slice(0, 9)
+    .map((cell) => [cell.dataset.head, cell.textContent])),
+  text: row.lastChild.firstChild.textContent, fix: row.lastChild.lastChild.textContent,
+  colour: getComputedStyle(row.cells[0]).color }));
+"""
+LINE = """
+const { cy } = window.rosproxyPage;
+const ends = arguments.length ? [...arguments] : [];
+const line = cy.edges().filter((one) =>
+  one.source().data("label") === ends[0] && one.target().data("label") === ends[1]);
+return line.empty() ? null : { colour: line.style("line-color"), label: line.data("label") };
+"""
+CUT = """
+table ip cut {{
+  chain forward {{
+    type filter hook forward priority -10
+    meta l4proto tcp ct original proto-dst {port} drop
+  }}
+}}
+"""
+
+
+def rows(browser: Browser) -> list[Json]:
+    """All rows of the table."""
+    found: list[Json] = browser.run(ROWS)
+    return found
+
+
+def row(browser: Browser, name: str, **wanted: str) -> Json:
+    """The row of a topic, once it says what is wanted; raises AssertionError."""
+    seen: list[Json] = []
+
+    def fits() -> bool:
+        seen[:] = [one for one in rows(browser) if one["Name"] == name]
+        return any(wanted.items() <= one.items() for one in seen)
+
+    try:
+        wait_until(f"the row of {name} has {wanted}", fits, 90)
+    except AssertionError as error:
+        raise AssertionError(f"{error}; it has {seen}") from None
+    return next(one for one in seen if wanted.items() <= one.items())
+
+
+def line(browser: Browser, source: str, target: str) -> Json:
+    """A line of the graph, between two boxes."""
+    found: Json | None = browser.run(LINE, source, target)
+    assert found, f"no line from {source} to {target}"
+    return {**found, "colour": found["colour"].replace(" ", "")}
+
+
+def colour(browser: Browser, name: str) -> str:
+    """A colour of the style sheet, as the canvas names it."""
+    script = """
+    const span = document.createElement("span");
+    span.className = arguments[0];
+    document.body.append(span);
+    const found = getComputedStyle(span).color;
+    span.remove();
+    return found;
+    """
+    return str(browser.run(script, name)).replace(" ", "")
+
+
+def port_of(lab: Lab, name: str) -> int:
+    """The port that stands for a node outside."""
+    port = urlsplit(lab.node_uri(name) or "").port
+    assert port
+    return port
+
+
+@contextmanager
+def cut(lab: Lab, port: int) -> Iterator[None]:
+    """The host drops all packets of a published port, in both directions."""
+    enter = ("ip", "netns", "exec", lab.place("host").namespace)
+    run_command(*enter, "nft", "-f", "-", text=CUT.format(port=port))
+    try:
+        yield
+    finally:
+        run_command(*enter, "nft", "delete", "table", "ip", "cut")
+
+
+def play(lab: Lab) -> dict[str, Any]:
+    """Some nodes as a robot has them, on all machines; the names of those that matter."""
+    start = lab.node
+    start("roscpp", "c1", "pub", name="detector", topic="/objects", rate=10)
+    start("roscpp", "c1", "sub", name="viewer", topic="/camera/image")
+    start("roscpp", "c2", "pub", name="planner", topic="/plan", rate=5, size=2000)
+    start("roscpp", "out", "pub", name="camera", topic="/camera/image", rate=20, size=30000)
+    start("roscpp", "out", "sub", name="arm", topic="/plan")
+    start("roscpp", "out", "sub", name="logger", topic="/objects")
+    for name in ("detector", "viewer", "planner", "camera", "arm", "logger"):
+        lab.wait_registered(name)
+    return {"port": port_of(lab, "planner")}

@@ -1,0 +1,153 @@
+"""The live page in Chromium, with real nodes on both sides of the proxy."""
+
+from __future__ import annotations
+
+import socket
+
+from rosproxy.ros1.protocol.tcpros import encode_header
+from tests.browser.page import UNKNOWN, URL, colour, cut, line, port_of, row, rows
+from tests.browser.webdriver import Browser
+from tests.ros.lab import Lab
+from tests.ros.processes import wait_until
+from tests.ros.topology import OUT_HOST
+
+HOSTILE = "/<img src=x onerror=document.title='mine'>"
+
+
+def talk(lab: Lab, library: str = "roscpp") -> None:
+    """A publisher inside with a subscriber outside, that get along."""
+    lab.node(library, "c1", "pub", name="talker", topic="/chatter", rate=10)
+    heard = lab.node(library, "out", "sub", name="listener", topic="/chatter")
+    heard.wait_for_count("^got ", 3)
+
+
+def test_a_link_that_breaks_turns_red_with_the_command_and_green_when_mended(
+    lab: Lab, browser: Browser
+) -> None:
+    talk(lab)
+    port = port_of(lab, "talker")
+    browser.open(URL)
+    well = row(browser, "/chatter", State="ok", To="/listener", **{"Last message": "just now"})
+    assert (well["Carried by"], well["Port"]) == ("splice", str(port))
+    assert line(browser, "/talker", "/listener")["colour"] == colour(browser, "ok")
+    with cut(lab, port):
+        broken = row(browser, "/chatter", State="BROKEN", To="/listener")
+        assert f"on the machine of /listener: nc -vz {OUT_HOST} {port}" in broken["fix"]
+        red = line(browser, "/talker", "/listener")["colour"]
+        assert red == colour(browser, "broken")
+        told = browser.run("return document.querySelector('#findings').textContent")
+        assert f"nc -vz {OUT_HOST} {port}" in told
+        assert browser.run("return document.title") == "(1 broken) rosproxy"
+    row(browser, "/chatter", State="ok", To="/listener", **{"Last message": "just now"})
+    assert line(browser, "/talker", "/listener")["colour"] == colour(browser, "ok")
+    assert browser.run("return document.title") == "rosproxy"
+
+
+def test_a_pair_that_never_met(lab: Lab, browser: Browser) -> None:
+    lab.node("rospy", "c1", "pub", name="talker", topic="/chatter", rate=10)
+    lab.wait_registered("talker")
+    port = port_of(lab, "talker")
+    browser.open(URL)
+    with cut(lab, port):
+        heard = lab.node("roscpp", "out", "sub", name="listener", topic="/chatter")
+        lab.wait_registered("listener")
+        broken = row(browser, "/chatter", State="BROKEN", To="/listener")
+        assert "has not come to" in broken["text"]
+        assert f"nc -vz {OUT_HOST} {port}" in broken["fix"]
+    heard.wait_for("^got ")
+    row(browser, "/chatter", State="ok", To="/listener")
+
+
+def test_hertz_and_bytes_are_those_of_the_nodes(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    talk_back = lab.node("rospy", "out", "pub", name="sender", topic="/back", rate=20, size=5000)
+    lab.node("rospy", "c2", "sub", name="taker", topic="/back").wait_for_count("^got ", 3)
+    browser.open(URL)
+
+    def told() -> set[str]:
+        known = (UNKNOWN, "0")
+        return {one["Name"] for one in rows(browser) if one["To"] and one["Hz"] not in known}
+
+    wait_until("the page tells both rates", lambda: told() >= {"/chatter", "/back"}, 90)
+    back = row(browser, "/back", State="ok", To="/taker")
+    assert back["Carried by"] == "direct"
+    assert back["MB/s"] not in (UNKNOWN, "0")
+    talk_back.kill()
+    row(browser, "/back", State="BROKEN", To="/taker")
+
+
+def test_what_every_node_has_is_hidden_until_asked_for(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    browser.open(URL)
+    row(browser, "/chatter", State="ok", To="/listener")
+    assert not {"/rosout"} & {one["Name"] for one in rows(browser)}
+    browser.run("document.querySelector('#quiet').focus()")
+    browser.press(" ")
+    row(browser, "/rosout")
+    browser.run("document.querySelector('#filter').focus()")
+    browser.press("chatt")
+    wait_until(
+        "other names are hidden", lambda: {one["Name"] for one in rows(browser)} == {"/chatter"}
+    )
+
+
+def test_namespaces_are_folded_until_asked_for(lab: Lab, browser: Browser) -> None:
+    for name in ("left", "right"):
+        words = ["__ns:=/arm"]
+        lab.node("roscpp", "c1", "pub", name=name, topic=f"/{name}", rate=5, remap=words)
+        lab.wait_registered(f"/arm/{name}")
+    browser.open(URL)
+    labels = "return window.rosproxyPage.cy.nodes().map((one) => one.data('label'))"
+    wait_until("the namespace is one box", lambda: "/arm (2)" in browser.run(labels))
+    browser.run("document.querySelector('#namespaces').open = true")
+    browser.run("document.querySelector('#folds button').focus()")
+    browser.press("\ue007")
+    wait_until("each node has a box", lambda: {"/arm/left", "/arm/right"} <= {*browser.run(labels)})
+
+
+def test_names_are_text_whatever_they_are(lab: Lab, browser: Browser) -> None:
+    """The master refuses odd names; who connects to a node may call himself anything."""
+    lab.node("roscpp", "c1", "pub", name="talker", topic="/chatter", rate=10)
+    lab.wait_registered("talker")
+    header = {"callerid": HOSTILE, "topic": "/chatter", "md5sum": "*", "type": "*"}
+    with lab.place("out").entered():
+        stranger = socket.create_connection((OUT_HOST, port_of(lab, "talker")))
+    with stranger:
+        stranger.sendall(encode_header(header))
+        browser.open(URL)
+        row(browser, "/chatter", To=HOSTILE)
+        assert browser.run("return document.querySelector('img')") is None
+        assert browser.run("return document.title") == "rosproxy"
+
+
+def test_light_dark_and_a_phone(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    browser.open(URL)
+    row(browser, "/chatter", State="ok", To="/listener")
+    shades = {}
+    for scheme in ("light", "dark"):
+        browser.prefer(scheme)
+        shades[scheme] = browser.run("return getComputedStyle(document.body).backgroundColor")
+        wait_until(
+            f"the graph is {scheme}",
+            lambda: line(browser, "/talker", "/listener")["colour"] == colour(browser, "ok"),
+        )
+    assert shades["light"] != shades["dark"]
+    browser.resize(360, 740)
+    narrow = "return document.documentElement.scrollWidth <= innerWidth"
+    wait_until("nothing is wider than a phone", lambda: browser.run(narrow))
+
+
+def test_a_screen_reader_finds_it_all(lab: Lab, browser: Browser) -> None:
+    talk(lab)
+    browser.open(URL)
+    row(browser, "/chatter", State="ok", To="/listener")
+    nodes = browser.devtools("Accessibility.getFullAXTree")["nodes"]
+    told = {(one["role"]["value"], one.get("name", {}).get("value", "")) for one in nodes}
+    roles = {role for role, _ in told}
+    assert {"table", "columnheader", "status", "searchbox", "checkbox", "heading"} <= roles
+    assert ("cell", "/chatter") in told
+    unnamed = {
+        role for role, name in told if role in ("button", "searchbox", "checkbox") and not name
+    }
+    assert not unnamed

@@ -1,0 +1,108 @@
+"""A browser on a machine of the lab, driven over WebDriver (https://www.w3.org/TR/webdriver2/).
+
+Half a dozen calls of JSON over HTTP are all that is needed, for which a client library would bring
+a dozen packages.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+from tests.ros.processes import Process, wait_until
+from tests.ros.topology import Place
+
+PORT = 9515
+ARGUMENTS = (
+    *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+    *("--no-first-run", "--disable-extensions", "--disable-background-networking"),
+    *("--force-device-scale-factor=1", "--hide-scrollbars"),
+)
+Json = dict[str, Any]
+
+
+class Browser:
+    """Chromium without a screen; `close` ends it."""
+
+    def __init__(self, place: Place, folder: Path) -> None:
+        self._place = place
+        environment = {
+            "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
+            "HOME": str(folder),
+            "LANG": "C.UTF-8",
+        }
+        command = [shutil.which("chromedriver") or "chromedriver", f"--port={PORT}"]
+        self._driver = Process("chromedriver", place, command, environment, folder / "driver.log")
+        wait_until("chromedriver answers", self._is_there)
+        options = {"args": [*ARGUMENTS, f"--user-data-dir={folder}/profile"]}
+        wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
+        session = self._call("POST", "/session", capabilities={"alwaysMatch": wanted})
+        self._session = f"/session/{session['sessionId']}"
+
+    def close(self) -> None:
+        """End the browser, then its driver."""
+        try:
+            self._call("DELETE", self._session)
+        finally:
+            self._driver.kill()
+
+    def open(self, url: str) -> None:
+        """Go to a page, and wait until it is loaded."""
+        self._post("/url", url=url)
+
+    def run(self, script: str, *arguments: Any) -> Any:
+        """What a script returns."""
+        return self._post("/execute/sync", script=script, args=list(arguments))
+
+    def resize(self, width: int, height: int) -> None:
+        """Give what is seen of the page this size in CSS pixels."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.devtools("Emulation.setDeviceMetricsOverride", **metrics)
+
+    def prefer(self, scheme: str) -> None:
+        """Prefer light or dark."""
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.devtools("Emulation.setEmulatedMedia", features=[feature])
+
+    def devtools(self, command: str, **parameters: Any) -> Any:
+        """Call the DevTools protocol."""
+        return self._post("/goog/cdp/execute", cmd=command, params=parameters)
+
+    def press(self, keys: str) -> None:
+        """Press keys, where the focus is."""
+        actions = [{"type": kind, "value": key} for key in keys for kind in ("keyDown", "keyUp")]
+        source = {"type": "key", "id": "keyboard", "actions": actions}
+        self._post("/actions", actions=[source])
+
+    def screenshot(self) -> bytes:
+        """What is seen, as PNG."""
+        return base64.b64decode(self._call("GET", f"{self._session}/screenshot"))
+
+    def console(self) -> list[str]:
+        """What the console has printed since it was asked last: errors, refused content."""
+        return [str(row["message"]) for row in self._post("/se/log", type="browser")]
+
+    def _post(self, path: str, **body: Any) -> Any:
+        return self._call("POST", f"{self._session}{path}", **body)
+
+    def _is_there(self) -> bool:
+        try:
+            return bool(self._call("GET", "/status")["ready"])
+        except OSError:
+            return False
+
+    def _call(self, method: str, path: str, **body: Any) -> Any:
+        with self._place.entered():
+            connection = HTTPConnection("127.0.0.1", PORT, timeout=120)
+            try:
+                connection.request(method, path, json.dumps(body) if method == "POST" else None)
+                reply = connection.getresponse()
+                answer = json.loads(reply.read())["value"]
+            finally:
+                connection.close()
+        assert reply.status == 200, answer
+        return answer

@@ -1,0 +1,103 @@
+"""The live page of an operator, over proxies that run."""
+
+import json
+from collections.abc import AsyncIterator
+
+import aiohttp
+import pytest
+from aiohttp import web
+from prometheus_client import CollectorRegistry
+
+from examples.demo.fake_http import free_ports
+from examples.demo.fake_node import FakeNode
+from rosproxy.net.addresses import HostPort
+from rosproxy.page.document import Document
+from rosproxy_operator.common.health import HealthServer
+from rosproxy_operator.common.operator_page import operator_page
+from rosproxy_operator.common.proxy_client import ProxyClient
+from tests.integration.conftest import MakeProxy
+from tests.integration.net import until
+from tests.integration.proxy import Proxy
+
+TOKEN = "0123456789abcdef"
+
+
+@pytest.fixture
+async def client() -> AsyncIterator[ProxyClient]:
+    made = ProxyClient()
+    yield made
+    await made.close()
+
+
+async def opened(proxies: dict[str, tuple[HostPort, str]], client: ProxyClient) -> HealthServer:
+    """An operator's endpoint over these proxies."""
+
+    async def documents() -> dict[str, Document | str]:
+        return await client.documents(proxies)
+
+    return HealthServer(CollectorRegistry(), lambda: None, lambda: None, operator_page(documents))
+
+
+async def test_all_proxies_stand_on_one_page(
+    make_proxy: MakeProxy, node: FakeNode, client: ProxyClient
+) -> None:
+    one, two = await make_proxy(admin_token=TOKEN), await make_proxy()
+    await node.publish(one.master)
+    gone = HostPort("127.0.0.1", free_ports(1))
+    proxies = {
+        "one": (one.settings.admin, TOKEN),
+        "two": (two.settings.admin, ""),
+        "gone": (gone, ""),
+    }
+    server = await opened(proxies, client)
+    where = HostPort("127.0.0.1", free_ports(1))
+    await server.start(where)
+    try:
+        async with aiohttp.ClientSession() as session:
+            async with session.get(f"http://{where}/graph") as reply:
+                nodes = json.loads(await reply.read())["nodes"]
+            assert nodes["one /talker"]["label"] == "/talker"
+            assert nodes["two rosproxy"]["label"] == "two"
+            assert nodes["gone"]["state"] == "broken"
+            assert f"{gone} refuses connections" in nodes["gone"]["text"]
+            async with session.get(f"http://{where}/", headers={"Host": "evil.example"}) as reply:
+                assert reply.status == 403
+            async with session.get(f"http://{where}/events") as reply:
+                assert reply.status == 200
+                assert looked_at(one)
+    finally:
+        await server.stop()
+
+
+def looked_at(proxy: Proxy) -> bool:
+    """Whether a proxy makes documents."""
+    return not proxy.app.page.feed.idle
+
+
+async def test_a_proxy_of_a_former_release_says_so(client: ProxyClient) -> None:
+    former = web.AppRunner(web.Application())
+    await former.setup()
+    where = HostPort("127.0.0.1", free_ports(1))
+    await web.TCPSite(former, where.host, where.port).start()
+    try:
+        found = await client.documents({"old": (where, TOKEN)})
+        assert found == {"old": "it has no live page: its image is that of a former release"}
+    finally:
+        await former.cleanup()
+
+
+async def test_nobody_is_asked_while_nobody_looks(
+    make_proxy: MakeProxy, client: ProxyClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.page.feed.LINGER", 0.05)
+    proxy = await make_proxy()
+    server = await opened({"one": (proxy.settings.admin, "")}, client)
+    where = HostPort("127.0.0.1", free_ports(1))
+    await server.start(where)
+    assert not looked_at(proxy)
+    try:
+        async with aiohttp.ClientSession() as session, session.get(f"http://{where}/events"):
+            await until(lambda: looked_at(proxy), "the proxy is asked")
+        await until(lambda: not looked_at(proxy), "the proxy is left alone")
+    finally:
+        await server.stop()

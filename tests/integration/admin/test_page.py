@@ -1,0 +1,370 @@
+"""The live page: its routes, who is let in, and the stream of changes with its bounds."""
+
+import asyncio
+import json
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import aiohttp
+import pytest
+
+from examples.demo.fake_http import value
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
+from tests.integration.admin_calls import post, tell
+from tests.integration.commands import admin_url, run
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.net import (
+    HOST,
+    PATIENCE,
+    Reply,
+    connect,
+    exchange,
+    read_header,
+    topic_header,
+    until,
+)
+from tests.integration.proxy import Proxy
+
+TOKEN = "0123456789abcdef"
+FILES = ("/page.js", "/view.js", "/page.css", "/cytoscape.min.js")
+LINK = "topic /chatter /talker /outside"
+
+
+@pytest.fixture
+def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No caller counts as one on loopback; in these tests all are."""
+    for module in ("rosproxy.admin.server", "rosproxy.page.visitors"):
+        monkeypatch.setattr(f"{module}.is_loopback", lambda _: False)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is done each second or two is done at once."""
+    for name in ("TICK", "LOOK_AGAIN", "LINGER"):
+        monkeypatch.setattr(f"rosproxy.page.feed.{name}", 0.05)
+    monkeypatch.setattr("rosproxy.page.feed.PER_SECOND", 10_000.0)
+
+
+async def get(proxy: Proxy, path: str, *headers: str, host: str = "localhost") -> Reply:
+    """The response to a GET; ``headers`` are whole lines."""
+    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    lines = [f"GET {path} HTTP/1.1", f"Host: {host}", *headers, "", ""]
+    return await exchange(where, "\r\n".join(lines).encode())
+
+
+class Stream:
+    """A page that is open: the document as it follows from the events that came."""
+
+    def __init__(self, reply: aiohttp.ClientResponse) -> None:
+        self._reply = reply
+        self.kinds: list[str] = []
+        self.document: dict[str, Any] = {}
+
+    async def event(self) -> tuple[str, Any]:
+        """The next event."""
+        kind = ""
+        while True:
+            async with asyncio.timeout(PATIENCE):
+                line = (await self._reply.content.readuntil(b"\n")).decode().rstrip("\n")
+            if line.startswith("event: "):
+                kind = line.removeprefix("event: ")
+            elif line.startswith("data: "):
+                return kind, json.loads(line.removeprefix("data: "))
+
+    async def follow(self) -> None:
+        """Take in one event."""
+        from rosproxy.page.changes import changed
+
+        kind, news = await self.event()
+        self.kinds.append(kind)
+        if kind == "all":
+            self.document = news
+        elif kind == "change":
+            self.document = changed(self.document, news)
+
+    async def link(self, key: str, **wanted: Any) -> dict[str, Any]:
+        """A link, once it is so."""
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                found: dict[str, Any] = self.document.get("links", {}).get(key, {})
+                if found and wanted.items() <= found.items():
+                    return found
+                await self.follow()
+
+
+@asynccontextmanager
+async def opened(proxy: Proxy, **headers: str) -> AsyncIterator[Stream]:
+    """The stream of events."""
+    async with (
+        aiohttp.ClientSession() as session,
+        session.get(f"{admin_url(proxy)}/events", headers=headers) as reply,
+    ):
+        assert reply.status == 200
+        assert reply.content_type == "text/event-stream"
+        yield Stream(reply)
+
+
+async def test_the_page_and_its_files(proxy: Proxy) -> None:
+    page = await get(proxy, "/")
+    assert page.status == 200
+    named = set(re.findall(rb'(?:src|href)="([\w.]+)"', page.body))
+    named |= set(re.findall(rb'from "\./([\w.]+)"', (await get(proxy, "/page.js")).body))
+    assert {f"/{name.decode()}" for name in named} == {*FILES}
+    for path in ("/", *FILES):
+        reply = await get(proxy, path)
+        policy = reply.headers["content-security-policy"]
+        assert reply.status == 200
+        assert policy.startswith("default-src 'none'; script-src 'self';")
+        assert "unsafe" not in policy
+        assert reply.headers["x-content-type-options"] == "nosniff"
+
+
+async def test_no_script_and_no_style_stands_in_the_page(proxy: Proxy) -> None:
+    for path in ("/", "/login"):
+        page = (await get(proxy, path)).body if path == "/" else (await post(proxy, path)).body
+        assert not re.search(rb"<script(?![^>]* src=)|<style|\bstyle=|\bon\w+=", page)
+        assert b"://" not in page
+
+
+async def test_a_file_that_is_known_is_not_sent_again(proxy: Proxy) -> None:
+    tag = (await get(proxy, "/page.js")).headers["etag"]
+    url, headers = f"{admin_url(proxy)}/page.js", {"If-None-Match": tag}
+    async with aiohttp.ClientSession() as session, session.get(url, headers=headers) as again:
+        assert (again.status, await again.read()) == (304, b"")
+
+
+async def test_a_link_comes_flows_and_goes(proxy: Proxy, node: FakeNode) -> None:
+    await node.publish(proxy.master)
+    async with opened(proxy) as page:
+        await page.link("topic /chatter /talker ")
+        async with connect(proxy.lease(node)) as wire:
+            await wire.send(topic_header())
+            await read_header(wire)
+            link = await page.link(LINK, state="ok", carried="splice")
+            assert str(link["port"]) in proxy.uri(node)
+        await page.link("topic /chatter /talker ")
+        assert page.kinds[:2] == ["clock", "all"]
+        assert set(page.kinds[2:]) == {"change"}
+
+
+async def test_hertz_are_those_that_the_node_counts(
+    proxy: Proxy, node: FakeNode, make_node: MakeNode
+) -> None:
+    counted = iter(range(0, 10**6, 5))
+    bus = [1, "", [[1, "/listener", "o", "TCPROS", "/chatter", True, ""]]]
+    node.answers["getBusInfo"] = value(bus)
+    node.answers["getBusStats"] = lambda *_: value(
+        [1, "", [[["/chatter", 0, [[1, 0, next(counted), True]]]], [], []]]
+    )
+    other = await make_node("/listener", HOST)
+    await node.publish(proxy.master)
+    await other.subscribe(proxy.ros1.settings.master_uri)
+    async with opened(proxy) as page:
+        link = await page.link("topic /chatter /talker /listener", state="ok")
+        while "hz" not in link:
+            await page.follow()
+            link = page.document["links"]["topic /chatter /talker /listener"]
+    assert link["hz"] > 0
+
+
+async def test_a_pair_that_is_apart_is_broken_until_it_meets(
+    proxy: Proxy, node: FakeNode, make_node: MakeNode
+) -> None:
+    meets = False
+    node.answers["getBusInfo"] = lambda *_: value(
+        [1, "", [[1, "/listener", "o", "TCPROS", "/chatter", meets, ""]]]
+    )
+    other = await make_node("/listener", HOST)
+    await node.publish(proxy.master)
+    await other.subscribe(proxy.ros1.settings.master_uri)
+    async with opened(proxy) as page:
+        link = await page.link("topic /chatter /talker /listener", state="broken")
+        assert "not connected" in link["text"]
+        assert link["fix"]
+        meets = True
+        link = await page.link("topic /chatter /talker /listener", state="ok")
+        assert not {"text", "fix"} & link.keys()
+
+
+async def test_nobody_is_asked_while_nobody_looks(proxy: Proxy, node: FakeNode) -> None:
+    await node.publish(proxy.master)
+    assert json.loads((await get(proxy, "/graph")).body)["nodes"]["/talker"]
+
+    def asked() -> int:
+        return sum(method == "getBusInfo" for method, _ in node.calls)
+
+    async with opened(proxy):
+        before = asked()
+        await until(lambda: asked() > before + 1, "nodes are asked again and again")
+    await until(lambda: proxy.app.page.feed.idle, "it ends after the last page")
+    before = asked()
+    await until(lambda: sum(method == "getPid" for method, _ in node.calls) > 3, "time passes")
+    assert asked() == before
+
+
+async def test_so_many_pages_and_no_more(proxy: Proxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rosproxy.page.feed.MOST_WATCHERS", 1)
+    async with opened(proxy):
+        refused = await get(proxy, "/events")
+        assert refused.status == 503
+        assert refused.headers["retry-after"] == "10"
+        assert b"1 pages are open already" in refused.body
+        assert (await get(proxy, "/graph")).status == 503
+    await until(lambda: not proxy.app.page.feed.watchers, "it is noticed that the page has gone")
+    async with opened(proxy) as page:
+        await page.follow()
+
+
+async def test_a_page_that_reads_nothing_misses_documents_and_holds_few(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Documents of 8 MB, and nobody who reads: no more are encoded than buffers can take."""
+    made, encoded = 0, 0
+    page = proxy.app.page
+    encode = page._event
+
+    async def documents() -> AsyncIterator[dict[str, Any]]:
+        nonlocal made
+        while True:
+            made += 1
+            yield {"nodes": {}, "links": {}, "text": str(made) + "x" * 8_000_000}
+            await asyncio.sleep(0.001)
+
+    def counted(*given: Any) -> bytes:
+        nonlocal encoded
+        encoded += 1
+        return encode(*given)
+
+    monkeypatch.setattr(page.feed, "_make", documents)
+    monkeypatch.setattr(page, "_event", counted)
+    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    async with connect(where) as wire:
+        await wire.send(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        await until(lambda: made > 40, "documents are made")
+        assert 0 < encoded <= 4
+
+
+async def test_a_page_goes_on_after_a_mistake_of_ours(
+    proxy: Proxy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    failures = iter([True, False])
+    state = proxy.app.state
+
+    def failing() -> Any:
+        if next(failures, False):
+            raise ValueError("a mistake")
+        return state()
+
+    monkeypatch.setattr(proxy.app, "state", failing)
+    async with opened(proxy) as page:
+        await page.follow()
+        await page.follow()
+        assert "rosproxy" in page.document["nodes"]
+    assert [one.getMessage() for one in caplog.records if one.exc_info] == [
+        "the live page failed; going on"
+    ]
+    caplog.clear()
+
+
+async def test_a_head_has_no_stream(proxy: Proxy) -> None:
+    url = f"{admin_url(proxy)}/events"
+    async with aiohttp.ClientSession() as session, session.head(url) as reply:
+        assert reply.status == 200
+    assert not proxy.app.page.feed.watchers
+
+
+async def test_the_proxy_stops_though_pages_are_open(proxy: Proxy) -> None:
+    async with opened(proxy) as page:
+        await page.follow()
+        await proxy.stop()
+
+
+async def test_by_a_strangers_name_nothing_is_told(proxy: Proxy) -> None:
+    for path in ("/", "/graph", "/events"):
+        assert (await get(proxy, path, host="evil.example:11312")).status == 403
+    assert b"--admin-token" in (await get(proxy, "/", host="evil.example")).body
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_who_does_not_know_the_token_sees_nothing(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    page = await get(proxy, "/")
+    assert page.status == 401
+    assert b'name="token"' in page.body
+    for path in ("/graph", "/events"):
+        for headers in ([], ["Authorization: Bearer wrong"], ["Cookie: rosproxy=x; rosproxy-1=y"]):
+            assert (await get(proxy, path, *headers)).status == 403
+    told = await get(proxy, "/graph", f"Authorization: Bearer {TOKEN}")
+    assert told.status == 200
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_the_form_gives_a_cookie_that_looks_and_does_nothing_else(
+    make_proxy: MakeProxy, caplog: pytest.LogCaptureFixture
+) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    for body in ("token=wrong", "", "token=", "\xff=%ff", "&".join("abcdef"), "x" * 5000):
+        assert (await post(proxy, "/login", body.encode("latin-1"))).status in (400, 403)
+    let_in = await post(proxy, "/login", f"token={TOKEN}")
+    assert (let_in.status, let_in.headers["location"]) == (303, "./")
+    cookie, *rules = let_in.headers["set-cookie"].split("; ")
+    assert {"HttpOnly", "SameSite=Strict"} <= {*rules}
+    assert TOKEN not in cookie
+    assert (await get(proxy, "/", f"Cookie: {cookie}", host="x")).status == 200
+    assert (await get(proxy, "/graph", f"Cookie: {cookie}", host="x")).status == 200
+    assert (await post(proxy, "/retire", "{}", f"Cookie: {cookie}")).status == 403
+    assert TOKEN not in caplog.text
+
+
+@pytest.mark.usefixtures("from_afar")
+async def test_a_key_lets_a_browser_in_once(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    assert (await post(proxy, "/page-key", "{}")).status == 403
+    answer = await post(proxy, "/page-key", "{}", f"Authorization: Bearer {TOKEN}")
+    key = json.loads(answer.body)["key"]
+    assert (await get(proxy, f"/?key={key}")).status == 303
+    assert (await get(proxy, f"/?key={key}")).status == 401
+
+
+async def test_status_opens_the_page(make_proxy: MakeProxy) -> None:
+    proxy = await make_proxy(admin_token=TOKEN)
+    words = ("status", "--open", "--admin", admin_url(proxy))
+    plain = await run(*words, BROWSER="true")
+    assert (plain.code, plain.out) == (0, f"{admin_url(proxy)}/\n")
+    keyed = await run(*words, BROWSER="true", ROSPROXY_ADMIN_TOKEN=TOKEN)
+    assert (await get(proxy, keyed.out.strip().removeprefix(admin_url(proxy)))).status == 303
+
+
+async def test_status_has_a_browser_show_it(proxy: Proxy, tmp_path: Any) -> None:
+    shown = tmp_path / "shown"
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\nprintf %s "$1" > {shown}\n')
+    browser.chmod(0o755)
+    result = await run("status", "--open", "--admin", admin_url(proxy), BROWSER=str(browser))
+    assert shown.read_text() == result.out.strip() == f"{admin_url(proxy)}/"
+
+
+async def test_a_proxy_whose_master_is_away_is_shown(
+    make_proxy: MakeProxy, master: FakeMaster
+) -> None:
+    await master.stop()
+    proxy = await make_proxy()
+    async with opened(proxy) as page:
+        while page.document.get("nodes", {}).get("master", {}).get("state") != "broken":
+            await page.follow()
+        while not page.document["findings"]:
+            await page.follow()
+        assert page.document["findings"][0]["severity"] == "error"
+
+
+async def test_news_of_containers_go_on_while_a_page_is_open(proxy: Proxy, node: FakeNode) -> None:
+    await node.publish(proxy.master)
+    async with opened(proxy) as page:
+        await page.link("topic /chatter /talker ")
+        await node.stop()
+        assert (await tell(proxy, "/containers", gone=[node.address]))["unregistered"] == 1
+        while "/talker" in page.document["nodes"]:
+            await page.follow()

@@ -1,0 +1,27 @@
+"""What is sent of a document: nothing less than what makes the new one of the old, and no more."""
+
+import json
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.page.changes import changed, changes
+
+ROWS = st.dictionaries(st.sampled_from("abcd"), st.fixed_dictionaries({"n": st.integers(0, 2)}))
+DOCUMENTS = st.fixed_dictionaries({"nodes": ROWS, "links": ROWS, "left_out": st.integers(0, 2)})
+
+
+@given(DOCUMENTS, DOCUMENTS)
+def test_changes_make_the_new_document_of_the_old(
+    before: dict[str, Any], after: dict[str, Any]
+) -> None:
+    news = json.loads(json.dumps(changes(before, after)))
+    assert changed(before, news) == after
+    assert bool(news) == (before != after)
+
+
+def test_only_what_differs_is_told() -> None:
+    before: dict[str, Any] = {"nodes": {"a": {"n": 1}, "b": {"n": 1}}, "links": {}, "left_out": 0}
+    after = {"nodes": {"a": {"n": 1}, "c": {"n": 2}}, "links": {}, "left_out": 0}
+    assert changes(before, after) == {"nodes": {"b": None, "c": {"n": 2}}}

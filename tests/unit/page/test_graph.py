@@ -1,0 +1,231 @@
+"""The document of a proxy for ROS 1: lanes, ways, measures, and what is wrong where it is wrong."""
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.admin.findings import error
+from rosproxy.admin.status_document import ProxyStatus, read_status
+from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach, SlaveReport, SystemState
+from rosproxy.page.document import LONGEST, MOST_LINKS
+from rosproxy.page.graph import Judged, chosen, graph_document, judge, relayed
+from rosproxy.page.measures import Measures
+from tests.unit.doctor.cases import INSIDE_URI, by_name, listener, make_facts, talker
+from tests.unit.status_json import make_connection, make_node, make_status
+
+LINK = "topic /chatter /talker /listener"
+STRING = {"/chatter": "std_msgs/String"}
+KERNEL = {"plane": "kernel", "port": 45050, "connections": 1, "sent_rate": 10.0}
+
+
+def judged(**changes: Any) -> Judged:
+    """What the doctor says of a talker inside and a listener outside, asked about their topic."""
+    facts = make_facts(names=("/chatter",), **changes)
+    return judge(facts, judge(facts))
+
+
+def made(
+    found: Judged | None, status: dict[str, Any] | None = None, measures: Measures | None = None
+) -> dict[str, Any]:
+    """The document at the second 100, which was 1000 seconds since the epoch."""
+    known: ProxyStatus = read_status(status) if status else found.facts.proxy if found else ...  # type: ignore[assignment]
+    return graph_document(known, found, measures or Measures(), (), 100.0, 900.0)
+
+
+def test_who_is_where() -> None:
+    nodes = made(judged())["nodes"]
+    assert {name: node["lane"] for name, node in nodes.items()} == {
+        "rosproxy": "host",
+        "master": "robot",
+        "/talker": "container",
+        "/listener": "robot",
+    }
+    here = replace(listener(), addresses=("192.168.0.2",))
+    assert made(judged(nodes=by_name(talker(), here)))["nodes"]["/listener"]["lane"] == "host"
+
+
+@pytest.mark.parametrize("name", ["master", "rosproxy", "0 01020304", ""])
+def test_a_subscriber_that_calls_itself_as_another_box_is_called(name: str) -> None:
+    before = made(judged())["nodes"]
+    connection = make_connection(caller_id=name)
+    assert made(judged(status=make_status(make_node(connections=[connection]))))["nodes"] == before
+
+
+def test_a_link_that_is_well() -> None:
+    link = made(judged(status=make_status(make_node(connections=[make_connection()]))))["links"][
+        LINK
+    ]
+    assert (link["state"], link["carried"], link["port"]) == ("ok", "splice", 45000)
+    assert not {"text", "fix", "hz", "rate"} & link.keys(), "nothing is invented"
+
+
+def test_the_kernel_carries_what_the_proxy_does_not_relay() -> None:
+    status = make_status(make_node(data_plane=KERNEL))
+    document = made(judged(status=status))
+    assert (document["links"][LINK]["carried"], document["links"][LINK]["port"]) == (
+        "kernel",
+        45050,
+    )
+    assert document["nodes"]["/talker"]["rate"] == 10.0
+    assert document["nodes"]["/talker"]["ports"] == "45000, 45050"
+
+
+def test_a_pair_that_is_apart_has_the_finding_and_the_command() -> None:
+    silent = talker(report=SlaveReport(STRING))
+    link = made(judged(nodes=by_name(silent, listener())))["links"][LINK]
+    assert link["state"] == "broken"
+    assert "/listener has not come to robot-host:45000" in link["text"]
+    assert "nc -vz robot-host 45000" in link["fix"]
+
+
+def test_nodes_that_have_just_started_are_not_said_to_be_apart() -> None:
+    silent = talker(report=SlaveReport(STRING))
+    found = judge(make_facts(names=("/chatter",), nodes=by_name(silent, listener())))
+    assert "state" not in made(found)["links"][LINK]
+
+
+def test_a_node_that_is_wrong_is_the_first_cause_on_its_links() -> None:
+    gone = listener(attempt=Attempt(Reach.REFUSED), report=None)
+    silent = talker(report=SlaveReport(STRING))
+    document = made(judged(nodes=by_name(silent, gone)))
+    assert document["nodes"]["/listener"]["state"] == "broken"
+    assert document["links"][LINK]["text"].startswith("/listener: registered as ")
+    assert document["links"][LINK]["fix"] == "rosnode cleanup (answer y)"
+
+
+def counted(*rounds: tuple[float, int, int]) -> tuple[Measures, DoctorFacts]:
+    """Rounds in which talker and listener have counted so many messages of 10 bytes."""
+    measures, facts = Measures(), make_facts()
+    for at, sent, got in rounds:
+        gave = SlaveReport(
+            STRING,
+            {},
+            frozenset({("o", "/chatter", "/listener")}),
+            {("o", "/chatter", "/listener"): (10 * sent, sent)},
+            at,
+        )
+        took = SlaveReport(
+            {}, STRING, counts={("i", "/chatter", INSIDE_URI): (10 * got, got)}, at=at
+        )
+        facts = make_facts(
+            names=("/chatter",), nodes=by_name(talker(report=gave), listener(report=took))
+        )
+        measures.read_nodes(facts, [("/chatter", "/talker", "/listener")])
+    return measures, facts
+
+
+def test_measures_of_a_link_that_flows() -> None:
+    measures, facts = counted((97.0, 10, 10), (99.0, 30, 30))
+    link = made(judge(facts), measures=measures)["links"][LINK]
+    assert (link["hz"], link["rate"], link["flows"]) == (10.0, 100.0, True)
+    assert "since" not in link
+
+
+def test_a_link_that_pauses_tells_since_when() -> None:
+    measures, facts = counted((60.0, 10, 10), (62.0, 30, 30), (98.0, 30, 30))
+    link = made(judge(facts), measures=measures)["links"][LINK]
+    assert (link["hz"], link["since"], link["state"]) == (0.0, 962, "ok")
+    assert "flows" not in link
+
+
+def test_a_link_that_carries_nothing_is_broken_and_names_the_command() -> None:
+    measures, facts = counted((60.0, 10, 10), (62.0, 30, 30), (98.0, 300, 30))
+    link = made(judge(facts), measures=measures)["links"][LINK]
+    assert (link["state"], link["since"]) == ("broken", 962)
+    assert "nothing of what /talker publishes arrives at /listener" in link["text"]
+    assert link["fix"].startswith("on the machine of /listener: nc -vz robot-host 45000")
+
+
+def test_before_anybody_was_asked_the_status_tells() -> None:
+    status = make_status(make_node(connections=[make_connection()], services=["/add"]))
+    document = made(None, status)
+    assert document["links"][LINK]["state"] == "ok"
+    assert document["links"]["service /add /talker "]["port"] == 45000
+    assert relayed(read_status(status), SystemState()) == {
+        ("/chatter", "/talker", "/listener"): 3_400_000
+    }
+
+
+def test_what_every_node_has_is_quiet() -> None:
+    graph = SystemState(
+        {"/rosout": ["/talker"], "/chatter": ["/talker"]}, {"/rosout": ["/rosout"]}, {}
+    )
+    node = make_node(
+        services=["/talker/get_loggers", "/add"],
+        parameters=["/rosout_disable_topics_generation"],
+        publishes=["/chatter", "/rosout"],
+    )
+    nodes = by_name(talker(), listener(name="/rosout"))
+    links = made(judged(status=make_status(node), graph=graph, nodes=nodes))["links"]
+    quiet = {key for key, link in links.items() if link.get("quiet")}
+    assert quiet == {
+        "topic /rosout /talker /rosout",
+        "service /talker/get_loggers /talker ",
+        "parameter /rosout_disable_topics_generation master /talker",
+    }
+    assert "state" not in links["topic /chatter /talker "], "nobody has looked at it"
+
+
+def test_what_the_policy_hides_says_so() -> None:
+    status = make_status(make_node())
+    status["policy"] = {"hidden": [{"name": "/chatter", "node": "/talker", "reason": "deny it"}]}
+    links = made(judged(status=status, graph=SystemState()))["links"]
+    assert links["topic /chatter /talker "]["text"] == "hidden from outside by the policy: deny it"
+
+
+def test_a_subscription_by_udpros() -> None:
+    status = make_status(make_node())
+    status["udpros"] = [{"topic": "/chatter", "caller_id": "/listener", "port": 45009}]
+    link = made(judged(status=status))["links"][LINK]
+    assert (link["carried"], link["port"]) == ("UDPROS", 45009)
+
+
+def test_two_nodes_outside_are_no_concern_of_the_proxy() -> None:
+    graph = SystemState({"/far": ["/one"]}, {"/far": ["/listener"]}, {})
+    assert not made(judged(graph=graph))["links"].keys() & {"topic /far /one /listener"}
+    assert chosen(make_facts().proxy, graph) == ()
+
+
+def test_a_master_that_is_away_is_told() -> None:
+    status = make_status(make_node(), master={"up": False, "error": "master is away"})
+    facts = make_facts(status=status, graph=None, nodes={}, names=())
+    document = graph_document(
+        facts.proxy,
+        judge(facts),
+        Measures(),
+        (error("published range", "range", "x", "y"),),
+        0.0,
+        0.0,
+    )
+    assert document["nodes"]["master"]["state"] == "broken"
+    assert document["findings"][0] == {
+        "severity": "error",
+        "subject": "range",
+        "text": "x",
+        "fix": "y",
+    }
+
+
+@pytest.mark.parametrize(
+    "hostile", ["<script>alert(1)</script>", "/a\u202eb\x07", "/" + "x" * 9999]
+)
+def test_names_are_short_and_harmless(hostile: str) -> None:
+    status = make_status(make_node(publishes=[hostile]))
+    (link,) = [one for one in made(None, status)["links"].values() if one["kind"] == "topic"]
+    assert len(link["name"]) <= LONGEST
+    assert link["name"].isprintable()
+
+
+def test_a_large_graph_is_cut_and_what_is_broken_stays() -> None:
+    names = [f"/n{number}" for number in range(80)]
+    graph = SystemState(
+        {"/tf": names, "/chatter": ["/talker"]}, {"/tf": names, "/chatter": ["/listener"]}, {}
+    )
+    nodes = [make_node(name, 45000 + n, publishes=["/tf"]) for n, name in enumerate(names[:70])]
+    status = make_status(make_node("/talker", 45080), *nodes)
+    silent = by_name(talker(report=SlaveReport(STRING)), listener())
+    document = made(judged(status=status, graph=graph, nodes=silent))
+    assert len(document["links"]) <= MOST_LINKS
+    assert document["left_out"] >= 80 * 80
+    assert document["links"][LINK]["state"] == "broken"

@@ -1,0 +1,106 @@
+"""Who may look at the page."""
+
+from typing import Any
+
+import pytest
+from aiohttp.test_utils import make_mocked_request
+
+from rosproxy.page.visitors import KEY, MOST, SESSION, Passes, Visitors, names_us
+from rosproxy.settings import hash_token
+
+TOKEN = "a token of a test"
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def request(source: str = "192.0.2.9", host: str = "192.0.2.1:11312", **headers: str) -> Any:
+    """A request from an address."""
+
+    class Transport:
+        def get_extra_info(self, name: str, default: object = None) -> object:
+            return (source, 4000) if name == "peername" else default
+
+        def is_closing(self) -> bool:
+            return False
+
+    return make_mocked_request("GET", "/", headers={"Host": host, **headers}, transport=Transport())
+
+
+@pytest.mark.parametrize(
+    ("host", "ours"),
+    [
+        ("127.0.0.1:11312", True),
+        ("[::1]:11312", True),
+        ("192.168.1.4", True),
+        ("localhost:8080", True),
+        ("robot:11312", True),
+        ("robot.local:11312", True),
+        ("evil.example:11312", False),
+        ("evil.example", False),
+        ("evil.example.", False),
+        ("127.0.0.1.evil.example", False),
+    ],
+)
+def test_names_that_strangers_may_have_are_none_of_ours(host: str, ours: bool) -> None:
+    assert names_us(host) is ours
+
+
+def test_without_a_token_whoever_gets_there_may_look() -> None:
+    open_to_all = Visitors(None, Clock())
+    assert open_to_all.may_look(request())
+    assert not open_to_all.may_look(request(host="evil.example"))
+    assert not open_to_all.may_look(request("127.0.0.1", "evil.example"))
+
+
+def test_an_operators_page_is_for_loopback_alone() -> None:
+    local = Visitors(None, Clock(), local=True)
+    assert local.may_look(request("127.0.0.1", "localhost:11313"))
+    assert local.may_look(request("::1", "localhost:11313"))
+    assert not local.may_look(request())
+    assert not local.may_look(request(Authorization="Bearer "))
+    assert "loopback" in local.refusal
+
+
+def test_with_a_token_others_than_loopback_must_know_it() -> None:
+    guarded = Visitors(hash_token(TOKEN), Clock())
+    assert guarded.may_look(request("127.0.0.1", "localhost:11312"))
+    assert not guarded.may_look(request("127.0.0.1", "evil.example"))
+    assert not guarded.may_look(request())
+    assert not guarded.may_look(request(Authorization="Bearer wrong"))
+    assert not guarded.may_look(request(Authorization=f"Basic {TOKEN}"))
+    assert guarded.may_look(request(Authorization=f"Bearer {TOKEN}"))
+    assert guarded.may_look(request(host="evil.example", Authorization=f"Bearer {TOKEN}"))
+
+
+def test_a_cookie_lets_look_for_a_time_and_at_one_port() -> None:
+    clock = Clock()
+    guarded = Visitors(hash_token(TOKEN), clock)
+    cookie = guarded.new_session()
+    assert guarded.may_look(request(Cookie=f"rosproxy-11312={cookie}"))
+    assert not guarded.may_look(request(Cookie=f"rosproxy-11313={cookie}"))
+    assert not guarded.may_look(request(Cookie=f"rosproxy-11312={TOKEN}"))
+    clock.now += SESSION + 1
+    assert not guarded.may_look(request(Cookie=f"rosproxy-11312={cookie}"))
+
+
+async def test_a_key_is_good_once_and_not_for_long() -> None:
+    clock = Clock()
+    guarded = Visitors(hash_token(TOKEN), clock)
+    key = (await guarded.issue_key({}))["key"]
+    assert guarded.uses_key(key)
+    assert not guarded.uses_key(key)
+    late = (await guarded.issue_key({}))["key"]
+    clock.now += KEY + 1
+    assert not guarded.uses_key(late)
+    assert not guarded.uses_key("")
+
+
+def test_so_many_are_good_at_a_time_and_the_oldest_goes() -> None:
+    passes = Passes(10.0, Clock())
+    issued = [passes.issue() for _ in range(MOST + 1)]
+    assert [passes.is_good(one) for one in issued] == [False] + [True] * MOST
