@@ -32,7 +32,7 @@ def _run(words: list[str], variables: Mapping[str, str]) -> Settings:
         except click.UsageError as error:
             option, _, message = OneLineError(error, "rosproxy").message.partition(": ")
             raise SettingError(option, message) from None
-    others = ("check", "log_format", "log_level")
+    others = ("check", "deep", "log_format", "log_level")
     return make_settings(**{name: value for name, value in values.items() if name not in others})
 
 

@@ -47,8 +47,9 @@ async def perform(scenario: Scenario, console: Console) -> bool:
 def main(seconds: float, quiet: bool) -> None:
     """Show rosproxy at work: nodes on both sides of a boundary, with the real proxy between them.
 
-    A small ROS master and small nodes are built in; nothing else is needed. In the middle the
-    proxy is killed and restarted. Exits with 0 only if all worked and every message count fits.
+    A small ROS master and small nodes of ROS 1 and ROS 2 are built in; nothing else is needed. In
+    the middle the proxy is killed and restarted. Exits with 0 only if all worked and every message
+    count fits.
     """
     # The inside names resolve nowhere; a resolver that is slow to say so must not slow us down.
     os.environ["RES_OPTIONS"] = "timeout:1 attempts:1"

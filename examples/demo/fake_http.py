@@ -86,9 +86,9 @@ def where(uri: str) -> Where:
     return parts.hostname, parts.port
 
 
-def is_free(port: int, address: str = "") -> bool:
-    """Whether a port could be bound; 0 asks whether there is such an address."""
-    with socket.socket() as probe:
+def is_free(port: int, address: str = "", kind: int = socket.SOCK_STREAM) -> bool:
+    """Whether a port could be bound, for TCP or UDP; 0 asks whether there is such an address."""
+    with socket.socket(type=kind) as probe:
         try:
             probe.bind((address, port))
         except OSError:
@@ -97,10 +97,12 @@ def is_free(port: int, address: str = "") -> bool:
 
 
 def free_ports(count: int) -> int:
-    """The first of `count` ports in a row among `PORTS` that nobody uses."""
+    """The first of `count` ports in a row among `PORTS` that nobody uses, for TCP or UDP."""
+    kinds = socket.SOCK_STREAM, socket.SOCK_DGRAM
     while True:
         first = random.randrange(PORTS.start, PORTS.stop - count)  # noqa: S311
-        if all(map(is_free, range(first, first + count))):
+        ports = range(first, first + count)
+        if all(is_free(port, kind=kind) for port in ports for kind in kinds):
             return first
 
 

@@ -92,6 +92,11 @@ class Talker(Player):
         self.sent: dict[int, float] = {}
         self.subscribers: set[asyncio.StreamWriter] = set()
 
+    @property
+    def connected(self) -> bool:
+        """Whether somebody listens."""
+        return bool(self.subscribers)
+
     async def register(self, master: str) -> None:
         """Offer the topic."""
         await super().register(master)

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address, ip_network
+from math import inf
 from time import monotonic
 from typing import Any
 
@@ -21,6 +22,8 @@ from examples.demo.fake_http import free_ports, is_free, where
 from examples.demo.fake_master import CALL_ERRORS, FakeMaster
 from examples.demo.players import Actor, Adder, Listener, Talker, in_words
 from examples.demo.proxy_process import DemoError, ProxyProcess
+from examples.demo.ros2_acts import Ros2Acts, Ros2Listener, Ros2Talker
+from rosproxy.net.addresses import HostPort
 
 PATIENCE = 30.0
 """Seconds that anything may take, so that what is slow can be told from what never comes."""
@@ -31,7 +34,12 @@ It takes tenths of a second, which are shown; on a busy machine the promise is k
 """
 IN_FLIGHT_SECONDS = 0.3
 """A message written this shortly before the proxy was killed may still have been inside of it."""
+NEVER = -inf
 LEASES = 8
+"""Ports of the range. ROS 1 takes one for a node; ROS 2 two, of UDP, and one for the proxy."""
+
+AnyTalker = Talker | Ros2Talker
+AnyListener = Listener | Ros2Listener
 
 
 @dataclass(frozen=True)
@@ -100,15 +108,27 @@ class Scenario:
             node.pid = pid
         for node in self.inside:
             node.slave.admits = node.tcpros.admits = self.layout.admits
+        self.ros2 = Ros2Acts(robot, (first, second), self.layout.admits)
         self.proxy = ProxyProcess()
         self.first_port = free_ports(LEASES + 2)
         self.inside_master = f"http://{self.layout.proxy_inside}:{self.first_port}/"
-        self._talking: dict[Talker, asyncio.Task[None]] = {}
+        self._talking: dict[AnyTalker, asyncio.Task[None]] = {}
 
     @property
     def ok(self) -> bool:
         """Whether all was shown and worked."""
         return all(check.kept for check in self.checks)
+
+    @property
+    def pairs(self) -> dict[tuple[str, str], tuple[AnyTalker, AnyListener]]:
+        """Who talks to whom, by version of ROS and direction."""
+        outwards, inwards, ros2 = "inside to outside", "outside to inside", self.ros2
+        return {
+            ("ROS 1", outwards): (self.talker, self.far_listener),
+            ("ROS 1", inwards): (self.far_talker, self.listener),
+            ("ROS 2", outwards): (ros2.talker, ros2.far_listener),
+            ("ROS 2", inwards): (ros2.far_talker, ros2.listener),
+        }
 
     def clock(self) -> float:
         """The seconds since the demonstration began."""
@@ -135,13 +155,14 @@ class Scenario:
         await self._connect_through_proxy()
         await self._traffic_until(self.seconds * 0.5)
         calls = await self._call_both_ways()
-        self._check("service calls cross both ways before the kill", *calls)
-        addresses = await self._addresses_of_inside()
+        self._check("ROS 1: service calls cross both ways before the kill", *calls)
+        addresses = await self._addresses_of_inside(), self.ros2.addresses()
         killed = await self._kill_and_restart()
-        self._check_addresses(addresses, await self._addresses_of_inside())
+        self._check_addresses("ROS 1", addresses[0], await self._addresses_of_inside())
+        self._check_addresses("ROS 2", addresses[1], self.ros2.addresses())
         await self._traffic_until(self.seconds - 0.7)
         calls = await self._call_both_ways()
-        self._check("service calls cross both ways after the restart", *calls)
+        self._check("ROS 1: service calls cross both ways after the restart", *calls)
         await self._count(killed)
 
     async def _start_outside(self, ending: AsyncExitStack) -> None:
@@ -151,6 +172,9 @@ class Scenario:
         await self.master.start()
         ending.push_async_callback(self.master.stop)
         self.tell(f"ROS master at {self.master.uri}, outside")
+        ending.push_async_callback(self.ros2.stop)
+        await self.ros2.start()
+        self.tell(f"ROS 2 nodes in domain {self.ros2.domain}, no master")
         ending.push_async_callback(self.proxy.stop)
         for node in self.nodes:
             await node.start()
@@ -159,12 +183,17 @@ class Scenario:
         for node in self.outside:
             await node.register(self.master.uri)
         self._let_talk(self.far_talker)
+        self._let_talk(self.ros2.far_talker)
 
     async def _try_without_proxy(self) -> None:
         self.act = "without rosproxy: inside registers at the master"
         talker, listener = self.talker, self.far_listener
         await talker.register(self.master.uri)
         self._let_talk(talker)
+        self._let_talk(self.ros2.talker)
+        if self.layout.outside_network:
+            self.ros2.announce_directly()
+            await self._until(lambda: self.ros2.talker.turned_away, "ROS 2: the direct attempt")
         await self._until(lambda: listener.problem, "the direct attempt")
         await asyncio.sleep(min(1.0, self.seconds / 10))
         told = f"{talker.uri}: {listener.problem}"
@@ -176,9 +205,19 @@ class Scenario:
                 reached = True
             told += f"; {address}: {'reached' if reached else 'turned away'}"
         self.tell(f"without rosproxy: {told}")
-        self._check("without the proxy nothing crosses", not reached, told)
+        self._check("ROS 1: without the proxy nothing crosses", not reached, told)
+        self._check_ros2_without_proxy()
         await talker.call(self.master.uri, "unregisterPublisher", talker.topic, talker.uri)
         self._talking.pop(talker).cancel()
+
+    def _check_ros2_without_proxy(self) -> None:
+        """Whether discovery and messages have stayed on their side, where there are two sides."""
+        if not self.layout.outside_network:
+            return
+        inside, received = self.ros2.talker, self.ros2.far_listener.received
+        told = f"{inside.locators[0]}: {inside.turned_away} datagrams turned away"
+        self.tell(f"ROS 2 without rosproxy: {told}")
+        self._check("ROS 2: without the proxy nothing crosses", not received, told)
 
     def proxy_options(self) -> list[str]:
         """The command line of the proxy."""
@@ -191,6 +230,7 @@ class Scenario:
             f"--admin-bind={LOOPBACK}:{first + 1}",
             f"--port-range={first + 2}-{first + 1 + LEASES}",
             "--data-plane=splice",
+            *self.ros2.proxy_options(),
         ]
 
     async def _connect_through_proxy(self) -> None:
@@ -204,8 +244,13 @@ class Scenario:
         self._let_talk(self.talker)
         listeners = self.listener, self.far_listener
         await self._until(lambda: all(one.received for one in listeners), "both sides hear")
-        self.tell("both listeners hear the other side")
+        self.tell("ROS 1: both listeners hear the other side")
         await self._call_both_ways()
+        discovery = HostPort(self.layout.host, self.first_port + 2)
+        self.ros2.announce_to_proxy(self.layout.proxy_inside, discovery)
+        ready = monotonic()
+        await self._until(lambda: self.ros2.is_connected(ready), "ROS 2: both sides hear")
+        self.tell("ROS 2: both listeners hear the other side")
 
     async def _traffic_until(self, moment: float) -> None:
         self.act = "messages cross the boundary in both directions"
@@ -223,7 +268,7 @@ class Scenario:
             except CALL_ERRORS as problem:
                 result = in_words(problem)
             told.append(f"{way}: {result}")
-        self.tell("service calls, " + ", ".join(told))
+        self.tell(f"ROS 1: {', '.join(told)}")
         return all(one.endswith(": 2 + 3 = 5") for one in told), ", ".join(told)
 
     async def _addresses_of_inside(self) -> dict[str, str]:
@@ -243,21 +288,30 @@ class Scenario:
         await self.proxy.kill()
         self.tell("rosproxy killed with SIGKILL")
         await asyncio.sleep(min(1.5, self.seconds / 10))
-        heard = len(self.far_listener.received)
+        heard = len(self.far_listener.received), len(self.ros2.listener.received)
         self.act = "restart: same command, no state on disk"
         self.tell(f"rosproxy ready {await self.proxy.start():.2f} s after its start")
         ready, received = monotonic(), self.far_listener.received
-        await self._until(lambda: len(received) > heard, "messages flow again")
+        await self._until(lambda: len(received) > heard[0], "messages flow again")
         await self._until(self._service_answers, "the service answers again")
-        took = received[heard][1] - ready, monotonic() - ready
-        detail = (
-            f"first message {took[0]:.2f} s, first service call {took[1]:.2f} s after it was ready;"
-            f" the whole outage took {max(took) + ready - killed:.2f} s"
+        took = {"message": received[heard[0]][1] - ready, "service call": monotonic() - ready}
+        self._check_recovery("ROS 1", took, ready - killed)
+        await self._until(
+            lambda: len(self.ros2.listener.received) > heard[1], "ROS 2: messages flow again"
         )
-        self.tell(detail)
-        promise = f"recovered in less than {RECOVERY_SECONDS:g} s"
-        self._check(promise, max(took) < RECOVERY_SECONDS, detail)
+        await self._until(lambda: self.ros2.are_heard(ready), "ROS 2: outside hears of inside")
+        took = {"message": self.ros2.listener.received[heard[1]][1] - ready}
+        self._check_recovery("ROS 2", took, ready - killed)
         return killed
+
+    def _check_recovery(self, ros: str, took: dict[str, float], away: float) -> None:
+        """Check the seconds that things took to work again; `away` is for how long none could."""
+        slowest = max(took.values())
+        each = ", ".join(f"{what} {seconds:.2f} s" for what, seconds in took.items())
+        self.tell(f"{ros}: {each} later; outage {away + slowest:.2f} s")
+        promise = f"{ros}: recovered in less than {RECOVERY_SECONDS:g} s"
+        detail = f"first {each} after it was ready; the whole outage took {away + slowest:.2f} s"
+        self._check(promise, slowest < RECOVERY_SECONDS, detail)
 
     async def _service_answers(self) -> bool:
         """Whether outside gets an answer of the inside adder."""
@@ -266,31 +320,30 @@ class Scenario:
             return True
         return False
 
-    def _check_addresses(self, before: dict[str, str], after: dict[str, str]) -> None:
+    def _check_addresses(self, ros: str, before: dict[str, str], after: dict[str, str]) -> None:
         told = [", ".join(map(" ".join, one.items())) for one in (before, after)]
         same = before == after and "another" not in told[0]
         detail = told[0] if same else f"before the kill: {told[0]}; afterwards: {told[1]}"
-        self._check("the same ports serve the same nodes", same, detail)
+        self._check(f"{ros}: the same ports serve the same nodes", same, detail)
 
     async def _count(self, killed: float) -> None:
         self.act = "the talkers stop; counting"
         self._fall_silent()
-        pairs = {
-            "inside to outside": (self.talker, self.far_listener),
-            "outside to inside": (self.far_talker, self.listener),
+        # TCP ends with the proxy, and with it what is on its way; a writer of DDS sends that again.
+        counts = {
+            which: (*pair, NEVER if pair[0] in self.ros2.nodes else killed)
+            for which, pair in self.pairs.items()
         }
         with suppress(DemoError):  # the count tells what is missing
-            await self._until(
-                lambda: all(count(*pair, killed)[0] for pair in pairs.values()), "all arrive"
-            )
+            await self._until(lambda: all(count(*one)[0] for one in counts.values()), "all arrive")
         await asyncio.sleep(0.2)  # in which what would arrive twice arrives
-        for way, pair in pairs.items():
-            self._check(f"every message {way} arrived once", *count(*pair, killed))
+        for (ros, way), one in counts.items():
+            self._check(f"{ros}: every message {way} arrived once", *count(*one))
 
     def _check(self, promise: str, kept: bool, detail: str) -> None:
         self.checks.append(Check(promise, kept, detail))
 
-    def _let_talk(self, talker: Talker) -> None:
+    def _let_talk(self, talker: AnyTalker) -> None:
         self._talking[talker] = asyncio.create_task(talker.talk())
 
     def _fall_silent(self) -> None:
@@ -309,8 +362,11 @@ class Scenario:
             await asyncio.sleep(0.01)
 
 
-def count(talker: Talker, listener: Listener, killed: float) -> tuple[bool, str]:
-    """Whether each message arrived once, but for those on the way as the proxy was killed."""
+def count(talker: AnyTalker, listener: AnyListener, killed: float) -> tuple[bool, str]:
+    """Whether each message arrived once, but for those on the way as the proxy was killed.
+
+    With `killed` NEVER there is no such excuse.
+    """
     received = [number for number, _ in listener.received]
     missing = talker.sent.keys() - {*received}
     cut_off = {n for n in missing if abs(talker.sent[n] - killed) <= IN_FLIGHT_SECONDS}

@@ -3,61 +3,68 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator
 from contextlib import nullcontext, suppress
-from time import monotonic
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from examples.demo.fake_participant import FakeParticipant
 from examples.demo.players import Actor, Adder, Listener, Talker
-from examples.demo.scenario import Scenario
+from examples.demo.ros2_acts import Ros2Listener, Ros2Talker
+from examples.demo.scenario import AnyListener, AnyTalker, Scenario
 
-EVENTS_SHOWN = 8
+EVENTS_SHOWN = 6
 
 
-def state_of(node: Actor) -> str:
+def state_of(node: Actor | Ros2Talker | Ros2Listener) -> str:
     """What a node is up to, in few words."""
-    if not node.slave.listening:
+    if not (node.listening if isinstance(node, FakeParticipant) else node.slave.listening):
         return "stopped"
     if isinstance(node, Adder):
         return "1 call" if node.answered == 1 else f"{node.answered} calls"
-    if isinstance(node, Listener):
-        return "connected" if node.connected else node.problem or "no publisher"
-    unheard = node.number - len(node.sent)
-    state = "connected" if node.subscribers else "nobody listens"
-    return f"{state}, {unheard} unheard" if unheard else state
+    if node.connected:
+        return "connected"
+    if isinstance(node, Talker | Ros2Talker):
+        return "nobody listens"
+    return (node.problem if isinstance(node, Listener) else "") or "no publisher"
 
 
-def moments_of(node: Talker | Listener) -> list[float]:
+def moments_of(node: AnyTalker | AnyListener) -> list[float]:
     """When a node sent or received its messages."""
-    if isinstance(node, Talker):
+    if isinstance(node, Talker | Ros2Talker):
         return [*node.sent.values()]
     return [moment for _, moment in node.received]
+
+
+def rows(scenario: Scenario) -> Iterator[tuple[str, Actor | Ros2Talker | Ros2Listener, str, str]]:
+    """Of all nodes: the version of ROS, what they call themselves, and what others call them."""
+    for node in scenario.nodes:
+        address = f"{node.host}:{node.slave.address[1]}"
+        yield "1", node, address, scenario.seen.get(node.name, "")
+    for one in scenario.ros2.nodes:
+        yield "2", one, ", ".join(map(str, one.locators[1:])), scenario.ros2.seen(one)
 
 
 def frame(scenario: Scenario) -> Group:
     """The whole screen: what is being played, the nodes, and what happened last."""
     title = f"{scenario.clock():5.1f} s  [rosproxy {scenario.proxy.state}]  {scenario.act}"
-    table = Table(box=None, header_style="dim")
-    for name in ("SIDE", "NODE", "CALLS ITSELF", "OTHER SIDE USES"):
-        table.add_column(name)
-    for name in ("SENT", "RECV", "RATE"):
-        table.add_column(name, justify="right")
-    table.add_column("STATE", no_wrap=True)
-    for node in scenario.nodes:
+    table = Table(box=None, header_style="dim", padding=(0, 1, 0, 0))
+    for name in ("ROS", "SIDE", "NODE", "CALLS ITSELF", "OTHER SIDE USES"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("MSGS", justify="right", no_wrap=True)
+    table.add_column("STATE")  # where the table is too wide, this column alone is cut
+    for version, node, address, seen in rows(scenario):
         _, side, name = node.name.split("/")
-        counts = ["", "", ""]
-        if not isinstance(node, Adder):
-            moments = moments_of(node)
-            counts[isinstance(node, Listener)] = str(len(moments))
-            counts[2] = f"{sum(moment > monotonic() - 1 for moment in moments[-100:])}/s"
-        address = f"{node.host}:{node.slave.address[1]}"
-        seen = scenario.seen.get(node.name)
-        table.add_row(side, name, address, seen, *counts, Text(state_of(node)))
-    events = [Text(event_line(*event)) for event in scenario.events[-EVENTS_SHOWN:]]
-    return Group(Text(title, style="bold"), "", table, "", *events)
+        state = Text(state_of(node), no_wrap=True, overflow="ellipsis")
+        number = "" if isinstance(node, Adder) else str(len(moments_of(node)))
+        table.add_row(version, side, name, address, seen, number, state)
+    events = Table.grid(padding=(0, 2, 0, 0))
+    for moment, text in scenario.events[-EVENTS_SHOWN:]:
+        events.add_row(f"{moment:5.1f} s", Text(text))
+    return Group(Text(title, style="bold"), "", table, "", events)
 
 
 def event_line(moment: float, text: str) -> str:
@@ -66,11 +73,10 @@ def event_line(moment: float, text: str) -> str:
 
 
 def counts_line(scenario: Scenario) -> str:
-    """Where the play is and what has been counted so far."""
+    """Where the play is, and how many messages have come to either side, of those sent to it."""
     counts = [
-        f"{node.name[1:].replace('/', ' ')}: {len(moments_of(node))} ({state_of(node)})"
-        for node in scenario.nodes
-        if not isinstance(node, Adder)
+        f"{ros} {way.split()[-1]} {len(moments_of(listener))}/{len(moments_of(talker))}"
+        for (ros, way), (talker, listener) in scenario.pairs.items()
     ]
     return event_line(scenario.clock(), f"[{scenario.act}] {'  '.join(counts)}")
 

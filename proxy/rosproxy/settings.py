@@ -20,6 +20,8 @@ from rosproxy.net import addresses
 from rosproxy.net.addresses import HostPort, Network, parse_host_port
 
 MEBIBYTE = 1024 * 1024
+LEAST_PER_DOMAIN = 4
+"""Ports of the range for a domain of ROS 2: one to be found at, three for a participant."""
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11312)
 DataPlane = Literal["auto", "kernel", "splice", "copy"]
 """How topics' bytes are forwarded: by the kernel, spliced, or copied; auto: the best possible."""
@@ -55,6 +57,10 @@ class Settings:
     proxy, too; ``udp``: the range is published for UDP as well. ``admin_token``: what callers that
     are not on loopback must know, or ``admin_token_hash``: its SHA-256 in hex digits, for a proxy
     that is not to hold the token.
+    ``ros`` are the versions of ROS that it is for, 1 or 2 or both. Of ROS 2: ``ros2_domain`` are
+    the domains, which share the range out among them (none: domain 0), ``ros2_peer`` who outside is
+    told of participants inside (with port 0 at the well-known ports), ``ros2_ear`` where the ear
+    listens.
     ``policy`` are the layers of the options, in ``policy_mode`` as is that of the ``policy_file``;
     ``policy_layers`` are those that an operator gives for the start, ``await_policy`` is how long
     nothing is registered then, unless the operator has told the present ones before.
@@ -64,6 +70,10 @@ class Settings:
     master_uri: str
     advertise_host: str
     ports: PortMap
+    ros: tuple[str, ...] = ("1",)
+    ros2_domain: tuple[int, ...] = ()
+    ros2_peer: tuple[HostPort, ...] = ()
+    ros2_ear: HostPort | None = None
     master_port: int = 11311
     publish_master: int | None = None
     bind: str = "0.0.0.0"
@@ -100,6 +110,7 @@ class Settings:
             bounded((*self.policy, *self.policy_layers))
         except ValueError as error:
             raise SettingError("--policy", str(error)) from None
+        self._check_versions()
         taken: dict[int, str] = {}
         for option, port in (
             ("--master-port", self.master_port),
@@ -115,6 +126,42 @@ class Settings:
                 text = f"port {port} is that of {taken[port]}; move one of them"
                 raise SettingError(option, text)
             taken[port] = option
+
+    def _check_versions(self) -> None:
+        if self.for_ros1 and not self.master_uri:
+            text = "missing; give the real ROS master, e.g. http://robot:11311 (ROS_MASTER_URI)"
+            raise SettingError("--master-uri", text)
+        count = len(self.domains)
+        if self.for_ros2 and len(self.ports.listen) < LEAST_PER_DOMAIN * count:
+            text = f"{self.ports.listen} is too short: each of {count} domains needs"
+            raise SettingError("--port-range", f"{text} {LEAST_PER_DOMAIN} ports")
+        if self.for_ros2 and count > 1:
+            self._check_domains_stay_apart()
+
+    def _check_domains_stay_apart(self) -> None:
+        """An announcement need not tell its domain: what has one port has one domain."""
+        cure = "start a proxy for each domain"
+        if self.ros2_ear:
+            raise SettingError("--ros2-ear", f"an ear is for one domain: {cure}")
+        for peer in self.ros2_peer:
+            if peer.port:
+                text = f"{peer} is one domain of another proxy: {cure}"
+                raise SettingError("--ros2-peer", text)
+
+    @property
+    def for_ros1(self) -> bool:
+        """Whether it is for ROS 1."""
+        return "1" in self.ros
+
+    @property
+    def for_ros2(self) -> bool:
+        """Whether it is for ROS 2."""
+        return "2" in self.ros
+
+    @property
+    def domains(self) -> tuple[int, ...]:
+        """The domains of ROS 2."""
+        return tuple(dict.fromkeys(self.ros2_domain)) or (0,)
 
     @property
     def token_hash(self) -> str | None:
@@ -151,6 +198,7 @@ def make_settings(
             f"{len(port_range)}; both need the same number",
         )
     ports = PortMap(port_range, advertise)
+    others["master_uri"] = others.get("master_uri") or ""  # ROS 2 has none
     mode, rules = PolicyMode(policy_mode), tuple(rule for given in policy for rule in given)
     return Settings(
         ports=ports,
@@ -206,6 +254,14 @@ def read_host_port(text: str) -> HostPort:
     if where is None:
         raise ValueError(f"{text[:_LONGEST]!r} is not of the form {DEFAULT_ADMIN}")
     return where
+
+
+def read_peer(text: str) -> HostPort:
+    """A peer of ROS 2: a host, or ``host:port``; without a port it is 0. Raises ValueError."""
+    try:
+        return HostPort(read_host(text), 0)
+    except ValueError:
+        return read_host_port(text)
 
 
 def read_network(text: str) -> Network:

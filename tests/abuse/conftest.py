@@ -86,7 +86,8 @@ class Abused(Process):
     def refused(self) -> set[str]:
         """The reasons for which it has refused something."""
         lines = self.get("/metrics").splitlines()
-        return {line.split('"')[1] for line in lines if line.startswith("rosproxy_refused_total{")}
+        told = [line for line in lines if line.startswith("rosproxy_refused_total{")]
+        return {line.split('"')[1] for line in told if float(line.split()[-1])}
 
     def lease(self, of: FakeNode) -> Where:
         """Where outside reaches a node."""
@@ -156,14 +157,14 @@ def start_apart(_apart: Apart, start_abused: StartAbused, apart_master: FakeMast
     """Starts proxies that are machines of their own; see `tests.abuse.apart`."""
 
     def start(**options: Any) -> Abused:
-        made = start_abused(
-            master_uri=apart_master.uri,
-            prefix=_apart.prefix,
-            advertise_host=APART_HOST,
-            inside_network=INSIDE,
-            admin_bind=f"{APART}:{free_ports(1)}",
-            **options,
-        )
+        own = {
+            "master_uri": apart_master.uri,
+            "prefix": _apart.prefix,
+            "advertise_host": APART_HOST,
+            "inside_network": INSIDE,
+            "admin_bind": f"{APART}:{free_ports(1)}",
+        }
+        made = start_abused(**{**own, **options})
         made.master = APART, made.master[1]
         return made
 

@@ -6,30 +6,19 @@ from contextlib import AsyncExitStack, closing
 import pytest
 
 from examples.demo.fake_http import where
+from tests.abuse.apart import APART, APART_MASTER, NODES, STRANGERS
 from tests.abuse.conftest import Abused
-from tests.integration.net import (
-    MASTER,
-    NODE,
-    OTHER_NODE,
-    OUTSIDE,
-    PROXY,
-    connect,
-    exchange,
-    post,
-    refuses,
-    rpc,
-    xml,
-)
-from tests.integration.ros1.test_alias import behind_its_name
+from tests.integration.net import connect, exchange, post, refuses, rpc, xml
 
 PER_UPDATE = 1000
 """URIs in one call from outside; all ports of a host are named by 63 calls."""
 
 
 @pytest.fixture
-def aliased(start_abused, master) -> Abused:
-    """A proxy that stands in for the master's host."""
-    return start_abused(**behind_its_name(master))
+def aliased(start_apart, apart_master) -> Abused:
+    """A proxy that stands in for the master's host, which is another machine."""
+    port = where(apart_master.uri)[1]
+    return start_apart(master_uri=f"http://robot:{port}", master_address=APART_MASTER)
 
 
 def updates(topic: str, first: int, but_not: str = "") -> bytes:
@@ -38,50 +27,55 @@ def updates(topic: str, first: int, but_not: str = "") -> bytes:
     return post(xml("publisherUpdate", "/master", topic, uris))
 
 
-async def test_updates_that_name_every_port_of_the_masters_host(aliased, master, make_node):
+async def test_updates_that_name_every_port_of_the_masters_host(aliased, apart_master, make_node):
     """Whoever called publisherUpdate at a lease had any port there opened to inside."""
-    node, robot = await make_node(), await make_node("/robot", MASTER, host="robot")
-    secret = await asyncio.start_server(lambda *_: None, MASTER)
+    node = await make_node(address=NODES[0])
+    robot = await make_node("/robot", APART_MASTER, host="robot")
+    secret = await asyncio.start_server(lambda *_: None, APART_MASTER)
     port = secret.sockets[0].getsockname()[1]
     lease = await aliased.publish(node)
-    await robot.publish(where(master.uri), "/map")
+    await robot.publish(where(apart_master.uri), "/map")
     with closing(secret), aliased.watched():
-        asked = len(master.named("getSystemState"))
-        sources = (OUTSIDE, OTHER_NODE, NODE)
+        asked = len(apart_master.named("getSystemState"))
+        sources = (STRANGERS[0], NODES[1], NODES[0])
         calls = [
             exchange(lease, updates(f"/t{number}", first), sources[number % 3])
             for number, first in enumerate(range(1024, 64_000, PER_UPDATE))
         ]
-        calls += [exchange(lease, updates("/map", port, but_not=robot.uri)) for _ in range(5)]
+        again = updates("/map", port, but_not=robot.uri)
+        calls += [exchange(lease, again, STRANGERS[0]) for _ in range(5)]
         replies = await asyncio.gather(*calls)
         assert {reply.status for reply in replies} <= {200, 503}
         assert aliased.status()["stand_ins"] == []
-        assert await refuses((PROXY, port), NODE)
-        assert len(master.named("getSystemState")) - asked <= 2 * len(calls)
-        assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
+        assert await refuses((APART, port), NODES[0])
+        assert len(apart_master.named("getSystemState")) - asked <= 2 * len(calls)
+        assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid
         # What the master names is opened meanwhile.
         assert (await node.subscribe(aliased.master, "/map"))[2] == [robot.uri]
-        there = (PROXY, where(robot.uri)[1])
-        assert (await rpc(there, "getPid", "/n", source=NODE))[2] == robot.pid
+        there = (APART, where(robot.uri)[1])
+        assert (await rpc(there, "getPid", "/n", source=NODES[0]))[2] == robot.pid
 
 
 async def test_more_nodes_on_the_masters_host_than_there_are_stand_ins(
-    aliased, master, node, make_node
+    aliased, apart_master, make_node
 ):
     """Whoever may register at the master has any ports named: they are bounded in all."""
-    robot = await make_node("/robot", MASTER, host="robot")
-    await robot.publish(where(master.uri), "/map")
-    master.calls_back = False
+    node = await make_node(address=NODES[0])
+    robot = await make_node("/robot", APART_MASTER, host="robot")
+    await robot.publish(where(apart_master.uri), "/map")
+    apart_master.calls_back = False
     for number in range(3000):
-        master.register("publishers", "/many", f"/r{number}", f"http://robot:{20000 + number}/")
+        apart_master.register(
+            "publishers", "/many", f"/r{number}", f"http://robot:{20000 + number}/"
+        )
     lease = await aliased.publish(node)
     with aliased.watched():
         assert len((await node.subscribe(aliased.master, "/many"))[2]) == 3000
         assert len(aliased.status()["stand_ins"]) <= 1024
         async with AsyncExitStack() as stack:
             for row in aliased.status()["stand_ins"][:200]:
-                await stack.enter_async_context(connect((PROXY, row["port"]), OTHER_NODE))
+                await stack.enter_async_context(connect((APART, row["port"]), NODES[1]))
             assert (await node.subscribe(aliased.master, "/map"))[2] == [robot.uri]
-            there = (PROXY, where(robot.uri)[1])
-            assert (await rpc(there, "getPid", "/n", source=NODE))[2] == robot.pid
-            assert (await rpc(lease, "getPid", "/n"))[2] == node.pid
+            there = (APART, where(robot.uri)[1])
+            assert (await rpc(there, "getPid", "/n", source=NODES[0]))[2] == robot.pid
+            assert (await rpc(lease, "getPid", "/n", source=STRANGERS[0]))[2] == node.pid

@@ -70,6 +70,13 @@ def is_left_out(record: logging.LogRecord) -> bool:
 
 
 @pytest.fixture
+def machines_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All hosts of a test are on one machine: here none of their addresses is another's."""
+    for question in ("is_own", "is_loopback"):
+        monkeypatch.setattr(f"rosproxy.ros1.standins.outside.{question}", lambda address: False)
+
+
+@pytest.fixture
 async def master() -> AsyncIterator[FakeMaster]:
     """A ROS master outside."""
     made = FakeMaster(MASTER)
@@ -104,7 +111,7 @@ async def make_proxy(
 
     They are stopped before the nodes: a node can't close connections that are just being made.
     """
-    monkeypatch.setattr("rosproxy.app.PROBE_TICK", 0.03)
+    monkeypatch.setattr("rosproxy.app.ros1.PROBE_TICK", 0.03)
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:

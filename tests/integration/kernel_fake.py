@@ -3,15 +3,30 @@
 import json
 from typing import Any
 
+import pytest
+
+from rosproxy.forwarding.kernel import plane, syncer
+from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 
 PAIRS = ("marks", "hosts4", "hosts6", "ports")
 
 
+def clear_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a kernel plane find nothing in the way in its network namespace."""
+
+    async def nothing(mode: str, tools: Tools) -> None:
+        return None
+
+    monkeypatch.setattr(plane, "why_not", nothing)
+    monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
+
+
 class FakeTools(Tools):
     """A kernel with one table.
 
-    ``table`` is None where there is none; ``flows`` is what conntrack prints. The next runs of a
+    ``table`` is None where there is none; ``flows`` is what conntrack prints, ``counted`` are the
+    bytes that nft prints for each mark. The next runs of a
     program fail as often as ``failing`` says.
     """
 
@@ -20,9 +35,10 @@ class FakeTools(Tools):
         self.table: dict[str, list[Any]] | None = None
         self.name = ""
         self.flows = ""
+        self.counted = {"sent": 1000, "received": 1000}
         self.failing = 0
         self.documents: list[str] = []
-        self.forgotten: list[tuple[str, bool, str]] = []
+        self.forgotten: list[tuple[bool, tuple[str, ...]]] = []
 
     async def nft(self, *words: str, document: str = "") -> str:
         """What nft prints."""
@@ -34,15 +50,15 @@ class FakeTools(Tools):
             self._apply(line.split(maxsplit=5))
         return ""
 
-    async def list_flows(self, mark: str, ipv6: bool) -> str:
+    async def list_flows(self, transport: str, ipv6: bool, *which: str) -> str:
         """What conntrack prints."""
         self._maybe_fail()
         return "" if ipv6 else self.flows
 
-    async def forget_flows(self, mark: str, ipv6: bool, state: str = "") -> None:
+    async def forget_flows(self, transport: str, ipv6: bool, *which: str) -> None:
         """Note what is to be forgotten."""
         self._maybe_fail()
-        self.forgotten.append((mark, ipv6, state))
+        self.forgotten.append((ipv6, which))
 
     @property
     def forwards(self) -> dict[int, tuple[str, int]]:
@@ -65,6 +81,8 @@ class FakeTools(Tools):
                 self.table = None
             case ["map" | "set", name, *_] if self.table is not None:
                 self.table[name] = []
+            case ["flush", "set", _, _, name] if self.table is not None:
+                self.table[name] = []
             case ["add" | "delete" as verb, "element", _, _, name, elements]:
                 if self.table is None:
                     raise ToolError("nft: No such file or directory")
@@ -78,18 +96,19 @@ class FakeTools(Tools):
         objects = []
         for name, held in self.table.items():
             kind = "map" if name in PAIRS else "set"
-            elements = held if kind == "map" else [_counter(mark) for mark in held]
+            counts = name in ("sent", "received")
+            elements = [_counter(mark, self.counted[name]) for mark in held] if counts else held
             objects.append({kind: {"name": name, "table": self.name, "elem": elements}})
         return json.dumps({"nftables": objects})
 
 
 def _element(text: str) -> Any:
-    """An element as nft prints it: a mark, or a pair."""
+    """An element as nft prints it, or nearly so: a number, a network, or a pair."""
     key, _, value = text.partition(" : ")
     if not value:
-        return int(key)
+        return int(key) if key.isdigit() else key
     return [int(key), int(value) if value.isdigit() else value]
 
 
-def _counter(mark: int) -> Any:
-    return {"elem": {"val": mark, "counter": {"packets": 1, "bytes": 1000}}}
+def _counter(mark: int, size: int) -> Any:
+    return {"elem": {"val": mark, "counter": {"packets": 1, "bytes": size}}}

@@ -6,7 +6,8 @@ from typing import Any
 
 from examples.demo.fake_http import Where, free_ports, where
 from examples.demo.fake_node import FakeNode
-from rosproxy.app import App
+from rosproxy.app.proxy import App
+from rosproxy.app.ros1 import Ros1
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.registry.endpoint import Endpoint
@@ -38,7 +39,7 @@ def options_for(**options: Any) -> dict[str, Any]:
         "port_range": f"{first}-{first + count - 1}",
         "inside_network": ("127.0.2.0/24",),
         "probe_interval": 0.3,
-        "probe_timeout": 0.5,
+        "probe_timeout": 1.0,
         "cleanup_after": 1.0,
         "linger": 0.5,
         "master_interval": 0.2,
@@ -61,6 +62,12 @@ class Proxy:
         self.master: Where = (PROXY, settings.master_port)
         self._stopped = False
 
+    @property
+    def ros1(self) -> Ros1:
+        """Its part for ROS 1."""
+        assert self.app.ros1
+        return self.app.ros1
+
     async def start(self) -> None:
         """Begin."""
         await self.app.start()
@@ -82,7 +89,7 @@ class Proxy:
 
     def metric(self, name: str, /, **labels: str) -> float:
         """What a metric stands at; 0 if there is none of these labels yet."""
-        registry = self.app.context.metrics.registry
+        registry = self.ros1.context.metrics.registry
         return registry.get_sample_value(f"rosproxy_{name}", labels) or 0
 
     async def serves(self, node: FakeNode) -> bool:
@@ -96,13 +103,13 @@ class Proxy:
     def endpoint(self, node: FakeNode) -> Endpoint:
         """What the proxy knows of a node."""
         slave = HostPort(node.address, node.slave.address[1])
-        return next(e for e in self.app.context.registry if e.slave == slave)
+        return next(e for e in self.ros1.context.registry if e.slave == slave)
 
     def lease(self, node: FakeNode) -> Where:
         """Where outside reaches a node."""
         endpoint = self.endpoint(node)
-        return where(self.app.context.addressing.advertised_uri(endpoint))
+        return where(self.ros1.context.addressing.advertised_uri(endpoint))
 
     def uri(self, node: FakeNode) -> str:
         """A node's slave URI as outside sees it."""
-        return self.app.context.addressing.advertised_uri(self.endpoint(node))
+        return self.ros1.context.addressing.advertised_uri(self.endpoint(node))

@@ -138,7 +138,7 @@ async def test_a_multicall_ends_with_its_client(proxy, node):
     async with connect(proxy.lease(node)) as wire:
         await wire.send(post(xml("system.multicall", calls)))
         await until(lambda: asked() > 2, "the first calls are made")
-    await until(lambda: not proxy.app.context.buffered.used, "the call is given up")
+    await until(lambda: not proxy.ros1.context.buffered.used, "the call is given up")
     assert asked() < 400
 
 
@@ -151,8 +151,8 @@ async def test_a_registration_whose_client_has_gone_is_not_half_noted(proxy, mas
     ]
     async with connect(proxy.master, NODE) as wire:
         await wire.send(post(xml("system.multicall", calls)))
-    await until(lambda: not proxy.app.context.buffered.used, "the call has ended")
-    assert {e.pending for e in proxy.app.context.registry} == {False}
+    await until(lambda: not proxy.ros1.context.buffered.used, "the call has ended")
+    assert {e.pending for e in proxy.ros1.context.registry} == {False}
 
 
 async def test_too_many_elements_are_a_fault(proxy, node):
@@ -206,7 +206,7 @@ async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
     assert proxy.metric("refused_total", reason="over_budget")
     (problem,) = proxy.app.status()["problems"]
     assert problem["subject"] == "refused: over budget"
-    await until(lambda: not proxy.app.context.buffered.used, "all is given back")
+    await until(lambda: not proxy.ros1.context.buffered.used, "all is given back")
 
 
 async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, master, monkeypatch):
@@ -226,7 +226,7 @@ async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, maste
 
     idle, slow = await open_reader(), await open_reader()
     loop = asyncio.get_running_loop()
-    passes = proxy.app.context.passing
+    passes = proxy.ros1.context.passing
     await until(lambda: passes.used == 2, "both replies are under way")
     taken = 0
     while passes.used == 2:
@@ -252,7 +252,7 @@ async def test_a_source_with_too_many_connections_is_refused_and_others_are_not(
         assert await knock(lease, b"") == "reset"
         assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
     assert proxy.metric("refused_total", reason="connections_per_source")
-    await until(lambda: not proxy.app.context.gate._by_source[OUTSIDE], "all have gone")
+    await until(lambda: not proxy.ros1.context.gate._by_source[OUTSIDE], "all have gone")
     assert (await exchange(lease, pid())).value[0] == 1
 
 

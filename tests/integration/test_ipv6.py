@@ -122,6 +122,6 @@ async def test_recovery_over_ipv6(
         inside_network=("::1/128",),
         port_range=str(proxy6.settings.ports.listen),
     )
-    await until(lambda: len(fresh.app.context.registry), "the node is found")
+    await until(lambda: len(fresh.ros1.context.registry), "the node is found")
     await until(lambda: fresh.serves(node6), "it is served")
     assert (await rpc(uri, "getPid", "/outside"))[2] == node6.pid

@@ -323,7 +323,7 @@ async def test_odd_slave_uris_are_refused(proxy, node):
     for uri in ODD_URIS:
         code, text, _ = await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
         assert (code, "not of the form" in text) == (-1, True), uri
-    assert not len(proxy.app.context.registry)
+    assert not len(proxy.ros1.context.registry)
     assert (await node.publish(proxy.master))[0] == 1
 
 
@@ -331,7 +331,7 @@ async def test_odd_host_names_are_placed_at_their_source(proxy, node):
     for host in ("a" * 300, "é.invalid", "-", "_", "x.", "127.1", "0x7f.1"):
         uri = f"http://{host}:5/"
         assert (await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri))[0] == 1, uri
-    assert {e.place.address for e in proxy.app.context.registry} == {NODE}
+    assert {e.place.address for e in proxy.ros1.context.registry} == {NODE}
 
 
 async def test_multicalls_with_odd_elements_keep_their_order(proxy, node):
@@ -365,7 +365,7 @@ async def test_a_name_server_that_hangs_does_not_hold_up_a_call_to_a_node(proxy,
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_more: answer.wait(20) and [])
     try:
         with pytest.raises(Unreachable, match="can't be resolved"):
-            await proxy.app.context.upstream.post_to_node(
+            await proxy.ros1.context.upstream.post_to_node(
                 HostPort("nowhere.invalid", 1), b"", within=30
             )
     finally:

@@ -96,7 +96,7 @@ async def test_a_forged_caller_api_does_not_open_a_door_to_an_ordinary_service(
     victim.answer = answer
     uri = f"http://{OTHER_NODE}:{victim.port}/"
     await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
-    (endpoint,) = proxy.app.context.registry
+    (endpoint,) = proxy.ros1.context.registry
     assert endpoint.place.address == NODE
     probes = len(victim.seen)
     lease = HOST, endpoint.port
@@ -153,17 +153,17 @@ async def test_the_master_can_not_redirect_the_proxy(proxy, master, victim):
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
 async def test_the_proxys_own_ports_do_not_pass_for_nodes(make_proxy, master, node, monkeypatch):
-    monkeypatch.setattr("rosproxy.app.PROBE_TICK", 60)  # a second probe would close the port
+    monkeypatch.setattr("rosproxy.app.ros1.PROBE_TICK", 60)  # a second probe would close the port
     proxy = await make_proxy()
     uri = f"http://{PROXY}:{proxy.settings.master_port}/"
     await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
-    (endpoint,) = proxy.app.context.registry
+    (endpoint,) = proxy.ros1.context.registry
     with pytest.raises(Fault, match="leads back"):
         await rpc((HOST, endpoint.port), "getPid", "/outside")
     assert not [call for call in master.named("getPid") if call == ("/outside",)]
     own = f"http://{PROXY}:{endpoint.port}/"
     await node.call(proxy.master, "registerPublisher", "/t2", "x/Y", own)
-    assert len(proxy.app.context.registry) == 1
+    assert len(proxy.ros1.context.registry) == 1
 
 
 async def forge(master, name, port, inside, *topics):
@@ -217,7 +217,7 @@ async def test_a_forged_claim_does_not_displace_the_real_node(master, make_proxy
     here = f"{NODE}:{node.slave.address[1]}"
     await forge(master, "/evil2", port + 1, here, *topics)
     fresh = await make_proxy(port_range=str(proxy.settings.ports.listen))
-    await until(lambda: len(fresh.app.context.registry), "the node is found")
+    await until(lambda: len(fresh.ros1.context.registry), "the node is found")
     await until(lambda: fresh.serves(node), "the node is served")
     assert fresh.uri(node) == uri
     assert (await rpc(uri, "getPid", "/outside"))[2] == node.pid

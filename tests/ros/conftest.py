@@ -29,18 +29,21 @@ from tests.ros.lab import Lab  # noqa: E402
 from tests.ros.topology import SHARED, Plan, Topology, remove_leftovers  # noqa: E402
 
 FLAT = os.environ.get("ROS_TESTS_FLAT") == "1"
+ISOLATED = os.environ.get("ROS_TESTS_ISOLATED") == "1"
 _MISSING = pytest.StashKey[str]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "boundary: makes sense only with a boundary and a proxy")
+    config.addinivalue_line("markers", "direct: makes sense only where inside gets out by itself")
     config.stash[report.KEY] = report.Report(flat=FLAT)
     config.pluginmanager.register(Collector(config))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     own = [item for item in items if HERE in item.path.parents]
-    dropped = [item for item in own if FLAT and item.get_closest_marker("boundary")]
+    off = [name for name, so in (("boundary", FLAT), ("direct", ISOLATED)) if so]
+    dropped = [item for item in own if any(map(item.get_closest_marker, off))]
     problem = requirements.missing(with_proxy=not FLAT)
     if problem and own:
         # One failure that says what to do is better than two hundred that say the same.
@@ -100,6 +103,8 @@ def topology_of() -> Iterator[Callable[[Plan], Topology]]:
     def get(plan: Plan) -> Topology:
         if FLAT:
             plan = replace(plan, flat=True)
+        if ISOLATED:
+            plan = replace(plan, isolated=True)
         if plan not in built:
             built[plan] = Topology(plan)
             built[plan].build()

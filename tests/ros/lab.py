@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,6 @@ from tests.ros.forks import PROGRAMS, Forks
 from tests.ros.processes import Process, stop_all, wait_until
 from tests.ros.topology import (
     ADVERTISED_NAME,
-    ISOLATED,
     MASTER_PORT,
     OUT_HOST,
     OUT_NODE,
@@ -32,9 +33,8 @@ MASTER_URI = f"http://robot:{MASTER_PORT}"
 ROSCORE = f"exec roscore -p {MASTER_PORT}"
 CORE = f"/usr/lib/rosout/rosout & exec rosmaster --core -p {MASTER_PORT}"
 """What roscore starts, without roslaunch, which it is itself: at a fifth of the cost."""
+ADMIN_PORT = 11312
 CALLER = "/rosproxy_tests"
-DIRECTION = os.environ.get("ROS_TESTS_DIRECTION", "both" if ISOLATED else "out")
-"""The proxy's ``--direction``."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,14 @@ class Lab:
         argv += ["--advertise-host", self.advertise_host, "--port-range", ports.bound]
         if ports.published != ports.bound:
             argv += ["--advertise-port-range", ports.published]
-        argv += ["--direction", DIRECTION]
-        self.proxy = self._spawn_proxy([*argv, *self.proxy_options])
+        plan = self.topology.plan
+        usual = "both" if plan.isolated else "out"
+        argv += ["--direction", os.environ.get("ROS_TESTS_DIRECTION", usual)]
+        if plan.isolated and plan.second is None:
+            # Else its first network, by which it gets outside here, would not be inside.
+            for number in range(1, len(plan.networks) + 1):
+                argv += ["--inside-network", f"172.30.{number}.0/24"]
+        self.proxy = self.spawn_proxy("px", [*argv, *self.proxy_options])
         self.proxy.wait_for(r"ready: ")
 
     def _upstream(self) -> str:
@@ -113,11 +119,12 @@ class Lab:
             return MASTER_URI
         return f"http://{self.place(self.master_role).address}:{MASTER_PORT}"
 
-    def _spawn_proxy(self, argv: list[str]) -> Process:
+    def spawn_proxy(self, role: str, argv: list[str]) -> Process:
+        """Starts a proxy on a machine, as the image would."""
         env = {"PATH": self.proxy_path, "PYTHONUNBUFFERED": "1", "HOME": str(self.folder)}
         env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
         env["SSL_CERT_FILE"] = "/dev/null"  # as in the image
-        return self._spawn("rosproxy", self.place("px"), [*self.proxy_prefix, *argv], env)
+        return self._spawn("rosproxy", self.place(role), [*self.proxy_prefix, *argv], env)
 
     def ensure_running(self) -> None:
         """Starts roscore and proxy where a test before has left them dead."""
@@ -188,6 +195,42 @@ class Lab:
     def rosproxy(self, *argv: str, check: bool = True) -> Result:
         """Runs a subcommand of rosproxy where the proxy is."""
         return self.run("px", sys.executable, "-m", "rosproxy", *argv, check=check)
+
+    def tell(self, path: str, **body: Any) -> dict[str, Any]:
+        """POSTs to the proxy's admin endpoint from where the proxy is; the answer."""
+        with self.place("px").entered():
+            connection = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            try:
+                connection.request("POST", path, json.dumps(body))
+                reply = connection.getresponse()
+                text = reply.read().decode()
+            finally:
+                connection.close()
+        assert reply.status == 200, text
+        answer: dict[str, Any] = json.loads(text)
+        return answer
+
+    def links(self, topic: str) -> list[dict[str, Any]]:
+        """The links of a topic on the live page."""
+        with self.place("px").entered():
+            connection = HTTPConnection("127.0.0.1", ADMIN_PORT, timeout=20)
+            try:
+                connection.request("GET", "/graph")
+                links = json.loads(connection.getresponse().read())["links"].values()
+            finally:
+                connection.close()
+        return [link for link in links if link["name"] == topic]
+
+    def wait_shown(self, topic: str, **wanted: Any) -> dict[str, Any]:
+        """A link of a topic on the live page, once it is so and its messages are counted."""
+        shown: list[dict[str, Any]] = []
+
+        def is_so() -> bool:
+            shown[:] = self.links(topic)
+            return any(wanted.items() <= one.items() and one.get("hz") for one in shown)
+
+        wait_until(f"the page shows {topic}: {wanted}", is_so)
+        return next(one for one in shown if one.get("hz"))
 
     def environment(self, role: str) -> dict[str, str]:
         """All that a ROS program on this machine gets: no ROS_IP, no ROS_HOSTNAME."""

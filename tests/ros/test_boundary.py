@@ -22,6 +22,7 @@ def test_outside_cannot_open_a_connection_to_inside(lab: Lab) -> None:
         pass
 
 
+@pytest.mark.direct
 def test_inside_reaches_outside_with_the_address_of_the_host(lab: Lab) -> None:
     with lab.place("out").entered(), socket.create_server((OUT_NODE, 0)) as server:
         port = server.getsockname()[1]
@@ -40,6 +41,7 @@ def test_the_host_name_of_a_container_is_known_in_it_alone(lab: Lab) -> None:
         assert lab.run(role, "getent", "hosts", "c1box", check=False).returncode != 0
 
 
+@pytest.mark.direct
 def test_split_networks_do_not_reach_each_other(lab: Lab, topology_of) -> None:
     places = topology_of(SPLIT).places
     with (
@@ -50,6 +52,7 @@ def test_split_networks_do_not_reach_each_other(lab: Lab, topology_of) -> None:
         pass
 
 
+@pytest.mark.direct
 @each_library
 def test_without_the_proxy_outside_hears_nothing_from_inside(lab: Lab, library: str) -> None:
     topic = f"/{lab.unique('unheard')}"
@@ -59,3 +62,17 @@ def test_without_the_proxy_outside_hears_nothing_from_inside(lab: Lab, library: 
     sender = lab.node(library, "c1", "pub", topic=topic, env=direct)
     sender.wait_for("^sent hello 20 ")
     assert "got" not in receiver.output()
+
+
+@pytest.mark.direct
+@pytest.mark.parametrize("first", ["publisher", "subscriber"], ids=lambda w: f"{w}-first")
+def test_datagrams_of_an_inside_publisher_pass_through_nat(lab: Lab, first: str) -> None:
+    """UDPROS without the proxy's doing: the subscriber outside says where it wants them."""
+    topic = f"/{lab.unique('udp')}"
+    if first == "subscriber":
+        receiver = lab.node("roscpp", "out", "sub", topic=topic, udp=1)
+        receiver.wait_for("^ready")
+    lab.node("roscpp", "c1", "pub", topic=topic, rate=50).wait_for("^sent hello 2 ")
+    if first == "publisher":
+        receiver = lab.node("roscpp", "out", "sub", topic=topic, udp=1)
+    receiver.wait_for_count("^got hello ", 20)

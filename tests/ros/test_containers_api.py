@@ -8,13 +8,11 @@ container starts before the proxy has joined its network.
 from __future__ import annotations
 
 import contextlib
-import json
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ import pytest
 from tests.ros.combinations import LIBRARIES, each_library
 from tests.ros.lab import Lab
 from tests.ros.processes import Process, wait_until
-from tests.ros.topology import ALIAS, OUT_NODE, Place
+from tests.ros.topology import ALIAS, OUT_NODE, Place, run_command
 
 pytestmark = pytest.mark.boundary
 
@@ -32,22 +30,6 @@ PROXY_OPTIONS = ("--master-address", OUT_NODE)
 
 Measure = Callable[[str, float], None]
 ROLES = {"publisher": "pub", "subscriber": "sub", "server": "serve"}
-ADMIN = 11312
-
-
-def tell(lab: Lab, path: str, **body: Any) -> dict[str, int]:
-    """POSTs to the admin endpoint from where the proxy is."""
-    with lab.place("px").entered():
-        connection = HTTPConnection("127.0.0.1", ADMIN, timeout=20)
-        try:
-            connection.request("POST", path, json.dumps(body))
-            reply = connection.getresponse()
-            text = reply.read().decode()
-        finally:
-            connection.close()
-    assert reply.status == 200, text
-    answer: dict[str, int] = json.loads(text)
-    return answer
 
 
 def ip(*arguments: str) -> None:
@@ -75,13 +57,14 @@ def before_the_proxy(lab: Lab, role: str) -> Iterator[None]:
 @contextlib.contextmanager
 def off_the_network(place: Place) -> Iterator[None]:
     """The machine's address answers nothing, as that of a container that has been removed."""
+    routes = run_command("ip", "-n", place.namespace, "route", "show", "default").split()
     ip("-n", place.namespace, "link", "set", "eth0", "down")
     try:
         yield
     finally:
         ip("-n", place.namespace, "link", "set", "eth0", "up")
-        gateway = place.address.rpartition(".")[0] + ".1"
-        ip("-n", place.namespace, "route", "replace", "default", "via", gateway)
+        if routes:
+            ip("-n", place.namespace, "route", "replace", *routes)
 
 
 @contextlib.contextmanager
@@ -112,7 +95,7 @@ def stray(lab: Lab, library: str, kind: str, role: str = "c1", **options: Any) -
 
 def arrived(lab: Lab, role: str = "c1", names: Sequence[str] = ()) -> dict[str, int]:
     container = {"address": lab.place(role).address, "names": [*names, lab.place(role).hostname]}
-    return tell(lab, "/containers", arrived=[container])
+    return lab.tell("/containers", arrived=[container])
 
 
 def is_leased(lab: Lab, name: str) -> bool:
@@ -138,13 +121,13 @@ def test_nodes_of_a_container_that_is_gone(lab: Lab, library: str, measure: Meas
         node.kill()
     with off_the_network(lab.place("c3")):
         started = time.time()
-        assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 3
+        assert lab.tell("/containers", gone=[lab.place("c3").address])["unregistered"] == 3
         assert not any(lab.registered(name) for name in names.values())
         assert not any(lab.node_uri(name) for name in names.values())
         took = time.time() - started
         measure("gone: 3 nodes unregistered", took)
         assert took < 15  # each node's own time-out: 15 s
-        assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 0
+        assert lab.tell("/containers", gone=[lab.place("c3").address])["unregistered"] == 0
 
 
 @each_library
@@ -153,11 +136,12 @@ def test_a_node_that_answers_survives_the_news_that_it_is_gone(lab: Lab, library
     node = lab.node(library, "c3", "pub", name=name, topic=f"/{name}/t")
     node.wait_for("^ready")
     uri = lab.node_uri(name)
-    assert tell(lab, "/containers", gone=[lab.place("c3").address])["unregistered"] == 0
+    assert lab.tell("/containers", gone=[lab.place("c3").address])["unregistered"] == 0
     lab.node(library, "out", "sub", topic=f"/{name}/t").wait_for_count("^got ", 3)
     assert lab.node_uri(name) == uri
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_publisher_is_adopted(lab: Lab, library: str, measure: Measure) -> None:
     """Heard outside and inside, by those who listened before and after; it lives on."""
@@ -192,6 +176,7 @@ def assert_no_gap(receiver: Process) -> None:
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers))), numbers
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
     """It hears those that it could hear before without a gap, and those that come later."""
@@ -209,6 +194,7 @@ def test_a_stray_subscriber_is_adopted(lab: Lab, library: str) -> None:
             node.wait_for_count(f"^got {word} ", 3)
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_server_is_adopted(lab: Lab, library: str) -> None:
     name = lab.unique("stray")
@@ -221,6 +207,7 @@ def test_a_stray_server_is_adopted(lab: Lab, library: str) -> None:
     assert node.returncode is None
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_under_a_name_that_only_its_container_knows(lab: Lab, library: str) -> None:
     name, topic = lab.unique("stray"), f"/{lab.unique('t')}"
@@ -231,6 +218,7 @@ def test_a_stray_under_a_name_that_only_its_container_knows(lab: Lab, library: s
         lab.node(library, role, "sub", topic=topic).wait_for_count("^got ", 3)
 
 
+@pytest.mark.direct
 @each_library
 def test_rosnode_kill_ends_an_adopted_node(lab: Lab, library: str) -> None:
     name = lab.unique("stray")
@@ -242,6 +230,7 @@ def test_rosnode_kill_ends_an_adopted_node(lab: Lab, library: str) -> None:
     lab.wait_unregistered(name)
 
 
+@pytest.mark.direct
 @pytest.mark.parametrize("way", [signal.SIGINT, signal.SIGKILL], ids=["sigint", "sigkill"])
 @each_library
 def test_an_adopted_node_that_ends_leaves_nothing(
@@ -262,6 +251,7 @@ def test_an_adopted_node_that_ends_leaves_nothing(
     measure("adopted, then ended: unregistered", time.time() - ended)
 
 
+@pytest.mark.direct
 @each_library
 def test_strays_that_the_master_reaches_are_not_shut_down(
     lab: Lab, library: str, tmp_path: Path
@@ -290,6 +280,7 @@ def provider(lab: Lab, service: str) -> str:
         return ""
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> None:
     """Half of its registrations go around the proxy after it has been adopted."""
@@ -311,6 +302,7 @@ def test_a_stray_that_is_adopted_while_it_registers(lab: Lab, library: str) -> N
         assert all(is_leased(lab, name) for name in names)
 
 
+@pytest.mark.direct
 @each_library
 def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
     lab: Lab, library: str, tmp_path: Path
@@ -326,6 +318,7 @@ def test_an_adopted_node_that_drops_a_topic_around_the_proxy(
     wait_until("the topic is gone", lambda: not lab.users(f"/{name}/a")[0])
 
 
+@pytest.mark.direct
 @each_library
 def test_a_stray_that_registers_through_the_proxy_before_the_news(
     lab: Lab, library: str, tmp_path: Path
@@ -391,7 +384,7 @@ def test_a_container_that_has_moved(
     with address_changed(place, old.rpartition(".")[0] + ".99"):
         marks = [peer.mark() for peer in peers]
         moved = time.time()
-        assert tell(lab, "/containers", moved={old: place.address})["moved"] == 3
+        assert lab.tell("/containers", moved={old: place.address})["moved"] == 3
         for peer, mark in zip(peers, marks, strict=True):
             peer.wait_for_count("^got ", 3, since=mark)
         measure("moved: heard again", time.time() - moved)
@@ -408,7 +401,7 @@ def test_a_container_that_has_moved(
             lab.node(library, role, "pub", topic=f"/{name}/c", word=word)
             receiver.wait_for_count(f"^got {word} ", 3)
         assert lab.node_uri(name) == after
-        assert tell(lab, "/containers", moved={old: place.address})["moved"] == 0
+        assert lab.tell("/containers", moved={old: place.address})["moved"] == 0
         assert node.stop() == 0
         lab.wait_unregistered(name, timeout=2)  # by itself, before --cleanup-after 3
 
@@ -417,7 +410,7 @@ def test_a_retired_proxy_leaves_nothing_at_the_master(lab: Lab) -> None:
     names = [lab.unique("last") for _ in LIBRARIES]
     for library, name in zip(LIBRARIES, names, strict=True):
         lab.node(library, "c1", "pub", name=name, topic=f"/{name}/t").wait_for("^ready")
-    assert tell(lab, "/retire")["unregistered"] >= 2
+    assert lab.tell("/retire")["unregistered"] >= 2
     assert not any(lab.registered(name) for name in names)
     late = ("registerPublisher", "/late", "std_msgs/String", "http://c1box:1/")
     with pytest.raises(LookupError, match="retired"):

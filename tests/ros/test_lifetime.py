@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import socket
 import time
@@ -11,6 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.kept import KeptConnections
+from rosproxy.ros1.clients.master import MasterClient
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.telemetry.metrics import Metrics
 from tests.ros.combinations import LIBRARIES, each_library
 from tests.ros.lab import Lab
 from tests.ros.processes import Process, wait_until
@@ -82,6 +89,39 @@ def test_nodes_ended_by_sigkill_are_cleaned_up(lab: Lab, library: str, measure: 
         lab.wait_unregistered(name)
         assert lab.node_uri(name) is None
     measure("cleaned up, --cleanup-after 3", time.time() - killed)
+
+
+@pytest.mark.boundary
+@each_library
+def test_a_node_answers_over_one_connection_until_it_ends(lab: Lab, library: str) -> None:
+    """As it is asked by the proxy while it is well."""
+    node, name = start(lab, library, "pub")
+    port = (lab.node_uri(name) or "").split("/")[3].rpartition(":")[2]
+    where = HostPort(lab.place("c1").address, int(port))
+    with lab.place("host").entered():
+        asyncio.run(asked_until_it_ends(where, node))
+
+
+async def asked_until_it_ends(where: HostPort, node: Process) -> None:
+    upstream = MasterClient("http://127.0.0.1:1", "test", Metrics([]))
+    nodes = NodeClient(upstream, 5.0)
+    kept = KeptConnections[str](nodes, within=60.0)
+    kept.most = 1
+    pid = (await nodes.probe(where)).pid
+    assert pid is not None
+
+    def told() -> list[ProbeResult | None]:
+        return list(kept.collect(0.0).values())
+
+    assert kept.ask("first", where, pid, 0.0)
+    for _ in range(3):
+        assert kept.ask("first", where, pid, 0.0)
+        assert not kept.ask("second", where, pid, 0.0)  # that would be another connection
+        wait_until("it answers", lambda: told() == [ProbeResult.ANSWERED])
+    node.kill()
+    wait_until("its end is noticed", lambda: told() == [None])
+    kept.close_all()
+    await upstream.close()
 
 
 @pytest.mark.boundary

@@ -10,7 +10,7 @@ from tests.ros.combinations import each_direction
 from tests.ros.lab import Lab
 from tests.ros.topology import ADVERTISED_NAME, PUBLISHED_MASTER_PORT, SHARED
 
-pytestmark = pytest.mark.boundary
+pytestmark = [pytest.mark.boundary, pytest.mark.direct]  # the master itself calls nodes outside
 
 PLAN = replace(SHARED, name="h", hairpin=True)
 MASTER_ROLE = "c1"

@@ -67,7 +67,7 @@ def test_calls_of_1_mb(lab: Lab, server: str, client: str) -> None:
 
 
 def test_messages_by_udp(lab: Lab) -> None:
-    test_udpros.test_messages_come_by_udp(lab, "subscriber", size=10000)
+    test_udpros.test_messages_come_by_udp(lab, "subscriber", 10000, "c1", "out")
 
 
 @pytest.mark.boundary
@@ -107,6 +107,7 @@ def stand_ins(lab: Lab) -> set[int]:
 
 
 @pytest.mark.boundary
+@pytest.mark.direct
 @each_library
 def test_uris_are_the_same_inside_and_outside(lab: Lab, library: str) -> None:
     assert lab.environment("c1")["ROS_MASTER_URI"] == MASTER_URI
@@ -167,6 +168,7 @@ def test_a_killed_service_is_missed_and_its_successor_found(
 
 
 @pytest.mark.boundary
+@pytest.mark.direct
 @each_library
 def test_a_publisher_that_comes_back_at_the_same_port_is_heard(lab: Lab, library: str) -> None:
     name, ports = lab.unique("phoenix"), {"xmlrpc_port": 40001, "tcpros_port": 40002}
@@ -194,6 +196,7 @@ def test_tools_go_on_after_the_proxy_was_killed(lab: Lab, library: str) -> None:
 
 
 @pytest.mark.boundary
+@pytest.mark.direct
 def test_a_port_that_the_proxy_needs_itself_is_named_with_the_fix(lab: Lab) -> None:
     assert lab.proxy is not None
     since, name = lab.proxy.mark(), lab.unique("unlucky")

@@ -3,19 +3,20 @@
 Every machine is a network namespace with its own host name and its own `/etc/hosts`,
 so that a host name which is known in one place and nowhere else is the real thing.
 
-    out (roscore, outside nodes) -- host (NAT, published ports) -- bridge -- px, c1, c2
+    out (roscore, outside nodes) -- LAN -- host (NAT, published ports) -- bridge -- px, c1, c2
 
 The host drops what outside sends to inside, apart from the ports it publishes to `px`;
 inside gets out through masquerade only: just what Docker's bridge network does.
 
-With ROS_TESTS_ISOLATED=1 inside does not get out at all, but for the proxy: the other machines
-have no route there, and the host passes nothing of theirs on.
+In an isolated plan inside does not get out at all, but for the proxy: the other machines have no
+route there, and the host passes nothing of theirs on.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import re
 import shutil
@@ -33,9 +34,6 @@ ADVERTISED_NAME = "dockerhost"
 """A name for the host that outside machines know; `OUT_HOST` is its address."""
 MASTER_PORT = 11311
 PUBLISHED_MASTER_PORT = 11411
-
-ISOLATED = os.environ.get("ROS_TESTS_ISOLATED") == "1"
-"""Whether inside has no way out but the proxy."""
 
 _PREFIX = "rost"
 _NETNS_ETC = Path("/etc/netns")
@@ -65,6 +63,22 @@ class PortMap(NamedTuple):
 
 
 @dataclass(frozen=True)
+class SecondProxy:
+    """The machine px2: the numbers of the inside networks that it is on, and its ports.
+
+    The host publishes the ports if it has a way out of its own, without px.
+    """
+
+    networks: tuple[int, ...]
+    ports: PortMap
+
+    @property
+    def behind_first(self) -> bool:
+        """Whether outside is reached through px alone."""
+        return 1 in self.networks
+
+
+@dataclass(frozen=True)
 class Plan:
     """What a topology looks like: its inside networks, ports, and whether it has a boundary.
 
@@ -76,6 +90,9 @@ class Plan:
     with Docker's own proxy process; without, a wrong address handed to inside is found out.
     With `forwarding`, the proxy's machine forwards, as containers of Docker do, and as the
     kernel plane needs it; without, every topic goes through the proxy itself.
+    With `isolated`, inside has no way out but the proxy.
+    With `second`, there is another proxy, and px is on the first network alone.
+    `host` and `robot` are the addresses of the machines host and out on the LAN.
     """
 
     name: str
@@ -85,6 +102,10 @@ class Plan:
     alias: bool = False
     hairpin: bool = False
     forwarding: bool = False
+    isolated: bool = False
+    second: SecondProxy | None = None
+    host: str = OUT_HOST
+    robot: str = OUT_NODE
 
 
 SHARED = Plan("s", (("c1", "c2"),), PortMap(45000, 45099, 45000))
@@ -128,8 +149,11 @@ class Topology:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self.places: dict[str, Place] = {}
-        for role in ("out", "host", "px", *(c for network in plan.networks for c in network)):
-            hostname = {"out": "robot", "px": "rosproxy"}.get(role, f"{role}box")
+        proxies = ("px", "px2") if plan.second else ("px",)
+        for role in ("out", "host", *proxies, *(c for network in plan.networks for c in network)):
+            hostname = {"out": "robot", "px": "rosproxy", "px2": "rosproxy2"}.get(
+                role, f"{role}box"
+            )
             self.places[role] = Place(role, self._namespace(role), hostname)
 
     def _namespace(self, role: str) -> str:
@@ -158,32 +182,44 @@ class Topology:
             self._keep_ports_free()
 
     def _join_outside(self) -> None:
-        self._link("out", "eth0", "out0", f"{OUT_NODE}/24")
-        self._on_host("addr", "add", f"{OUT_HOST}/24", "dev", "out0")
+        self._add_bridge("out0", self.plan.host)
+        self._link("out", "eth0", "lan1", f"{self.plan.robot}/24", "out0")
         # A route to inside exists on purpose: what stops outside is the host's policy.
-        ip("-n", self.places["out"].namespace, "route", "add", "default", "via", OUT_HOST)
-        self.places["host"].addresses.append(OUT_HOST)
+        ip("-n", self.places["out"].namespace, "route", "add", "default", "via", self.plan.host)
+        self.places["host"].addresses.append(self.plan.host)
 
     def _join_inside(self, number: int, members: tuple[str, ...]) -> None:
         bridge, subnet = f"br{number}", f"172.30.{number}"
-        self._on_host("link", "add", bridge, "type", "bridge")
-        self._on_host("addr", "add", f"{subnet}.1/24", "dev", bridge)
-        self._on_host("link", "set", bridge, "up")
-        for role in ("px", *members):
-            last = 2 if role == "px" else 10 + int(role[1:])
+        self._add_bridge(bridge, f"{subnet}.1")
+        for role in (*self._proxies_on(number), *members):
+            last = {"px": 2, "px2": 3}.get(role) or 10 + int(role[1:])
             port = f"{role}-{number}"
             device = f"eth{len(self.places[role].addresses)}"
-            self._link(role, device, port, f"{subnet}.{last}/24")
-            self._on_host("link", "set", port, "master", bridge)
-            if device == "eth0" and (role == "px" or not ISOLATED):
+            self._link(role, device, port, f"{subnet}.{last}/24", bridge)
+            if device == "eth0" and (role.startswith("px") or not self.plan.isolated):
                 gateway = ("default", "via", f"{subnet}.1")
                 ip("-n", self.places[role].namespace, "route", "add", *gateway)
 
-    def _link(self, role: str, device: str, host_device: str, address: str) -> None:
+    def _proxies_on(self, number: int) -> list[str]:
+        second = self.plan.second
+        first = ["px"] if second is None or number == 1 else []
+        return [*first, "px2"] if second and number in second.networks else first
+
+    def _leaving(self) -> list[str]:
+        """The proxies that get outside by themselves where the plan is isolated."""
+        second = self.plan.second
+        return ["px", "px2"] if second and not second.behind_first else ["px"]
+
+    def _add_bridge(self, bridge: str, address: str) -> None:
+        self._on_host("link", "add", bridge, "type", "bridge")
+        self._on_host("addr", "add", f"{address}/24", "dev", bridge)
+        self._on_host("link", "set", bridge, "up")
+
+    def _link(self, role: str, device: str, host_device: str, address: str, bridge: str) -> None:
         place = self.places[role]
         peer = ("peer", "name", device, "netns", place.namespace)
         self._on_host("link", "add", host_device, "type", "veth", *peer)
-        self._on_host("link", "set", host_device, "up")
+        self._on_host("link", "set", host_device, "master", bridge, "up")
         give(place, device, address)
 
     def _on_host(self, *arguments: str) -> None:
@@ -194,7 +230,7 @@ class Topology:
         self._forward("host", True)
         self._forward("px", self.plan.forwarding or os.environ.get("ROS_TESTS_KERNEL") == "1")
         if not self.plan.flat:
-            rules = _rules(self.plan, self.places["px"].address)
+            rules = _rules(self.plan, [self.places[role].address for role in self._leaving()])
             run_command("ip", "netns", "exec", host, "nft", "-f", "-", text=rules)
 
     def _forward(self, role: str, forwards: bool) -> None:
@@ -216,30 +252,36 @@ class Topology:
         others = self.places.values() if self.plan.flat else [place]
         yield from ((other.address, other.hostname) for other in others)
         if not self.plan.flat:
-            yield OUT_HOST, ADVERTISED_NAME
+            yield self.plan.host, ADVERTISED_NAME
             inside = place.role == "px" or place.role.startswith("c")
             hidden = self.plan.alias and inside
-            robot = self._proxy_address(place) if hidden else OUT_NODE
+            robot = self._proxy_address(place) if hidden else self.plan.robot
             yield robot, self.places["out"].hostname
         if place.role.startswith("c"):
             yield self._proxy_address(place), "rosproxy"
 
     def _proxy_address(self, place: Place) -> str:
         subnet = place.address.rpartition(".")[0]
-        return next(a for a in self.places["px"].addresses if a.startswith(f"{subnet}."))
+        proxies = [self.places[role] for role in ("px", "px2") if role in self.places]
+        found = (a for proxy in proxies for a in proxy.addresses if a.startswith(f"{subnet}."))
+        return next(found)
 
 
-def _rules(plan: Plan, proxy: str) -> str:
-    pairs = [*plan.ports.pairs(), (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)]
-    published = ", ".join(f"{host} : {bound}" for host, bound in pairs)
+def _rules(plan: Plan, proxies: list[str]) -> str:
     come = "" if plan.hairpin else 'iifname "out0"'
-    leaves = proxy if ISOLATED else "172.30.0.0/16"
+    master = (PUBLISHED_MASTER_PORT, PUBLISHED_MASTER_PORT)
+    published = [[*plan.ports.pairs(), master], plan.second.ports.pairs() if plan.second else []]
+    lead = "\n".join(
+        f"ip daddr {plan.host} {come} meta l4proto {{ tcp, udp }} dnat ip to {proxy} : "
+        f"th dport map {{ {', '.join(f'{host} : {bound}' for host, bound in pairs)} }}"
+        for proxy, pairs in zip(proxies, published, strict=False)
+    )
+    leaves = f"{{ {', '.join(proxies)} }}" if plan.isolated else "172.30.0.0/16"
     return f"""
     table ip boundary {{
       chain published {{
         type nat hook prerouting priority dstnat;
-        ip daddr {OUT_HOST} {come} meta l4proto tcp \
-          dnat ip to {proxy} : tcp dport map {{ {published} }}
+        {lead}
       }}
       chain leaving {{
         type nat hook postrouting priority srcnat;
@@ -251,6 +293,7 @@ def _rules(plan: Plan, proxy: str) -> str:
         ct state established,related accept
         ct status dnat accept
         iifname "br*" ip saddr {leaves} oifname "out0" accept
+        iifname "out0" oifname "out0" accept
         iifname "br1" oifname "br1" accept
         iifname "br2" oifname "br2" accept
       }}
@@ -258,13 +301,18 @@ def _rules(plan: Plan, proxy: str) -> str:
     """
 
 
-def remove_leftovers() -> None:
-    """Takes away the namespaces of runs whose process is gone, killed before it could."""
-    listed = run_command("ip", "netns", "list")
-    for namespace in re.findall(rf"^({_PREFIX}\d+\w-\w+)", listed, re.MULTILINE):
-        pid = int(re.findall(r"\d+", namespace)[0])
-        if not Path(f"/proc/{pid}").exists():
-            _remove_namespace(namespace)
+def remove_leftovers(prefix: str = _PREFIX) -> None:
+    """Takes away the namespaces of runs whose process is gone, killed before it could.
+
+    They are those whose names are the prefix, then the process. Several runs may begin at the same
+    moment: one at a time looks and removes.
+    """
+    with Path("/run/lock/rosproxy-tests-leftovers").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        listed = run_command("ip", "netns", "list")
+        for namespace, pid in re.findall(rf"^({prefix}(\d+)\S+)", listed, re.MULTILINE):
+            if not Path(f"/proc/{pid}").exists():
+                _remove_namespace(namespace)
 
 
 def _remove_namespace(namespace: str) -> None:

@@ -150,6 +150,21 @@ def test_a_token_and_a_hash_do_not_go_together() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("ros2_ear", "172.17.0.1:7500", "an ear is for one domain"),
+        ("ros2_peer", ("robot", "other:11400"), "other:11400 is one domain of another proxy"),
+    ],
+)
+def test_what_has_one_port_is_for_one_domain(name: str, value: object, complaint: str) -> None:
+    given = {**GIVEN, "ros": ("2",), name: value}
+    parse_settings({**given, "ros2_domain": (1,)})
+    with pytest.raises(SettingError, match=complaint) as caught:
+        parse_settings({**given, "ros2_domain": (0, 1)})
+    assert caught.value.option == "--" + name.replace("_", "-")
+
+
+@pytest.mark.parametrize(
     ("name", "complaint", "value"),
     [(name, complaint, value) for name, complaint, values in BAD for value in values],
 )

@@ -59,6 +59,13 @@ class AdminClient:
 
         return read_probe(self._json(self._ask("POST", "/probe", 20.0), "probes"))
 
+    def page(self) -> str:
+        """Where a browser finds the live page; with a key, if a token is set. Raises AdminError."""
+        if not _authorization():
+            self.get("/healthz")
+            return f"{self.url}/"
+        return f"{self.url}/?key={self._json(self._ask('POST', '/page-key', 5.0), 'key')['key']}"
+
     def _ask(self, method: str, path: str, within: float) -> str:
         connection = http.client.HTTPConnection(self.where.host, self.where.port, timeout=within)
         try:
@@ -91,15 +98,17 @@ class AdminClient:
 def _authorization() -> dict[str, str]:
     """What lets callers change things that are not on the proxy's own loopback."""
     token = os.environ.get("ROSPROXY_ADMIN_TOKEN", "")
-    return {"Authorization": f"Bearer {token}"} if token.isascii() and token.isprintable() else {}
+    fits = token and token.isascii() and token.isprintable()
+    return {"Authorization": f"Bearer {token}"} if fits else {}
 
 
-def default_url() -> str:
+def default_url(told: str | None = None) -> str:
     """Where the proxy of this container or shell has its admin endpoint.
 
-    The same variable that told the proxy where to listen tells where to ask.
+    The same variable that told the proxy where to listen tells where to ask, or what ``told`` it
+    instead.
     """
-    bound = parse_host_port(os.environ.get("ROSPROXY_ADMIN_BIND", ""))
+    bound = parse_host_port(told or os.environ.get("ROSPROXY_ADMIN_BIND", ""))
     if bound is None:
         return DEFAULT_URL
     return f"http://{HostPort(_EVERYWHERE.get(bound.host, bound.host), bound.port)}"

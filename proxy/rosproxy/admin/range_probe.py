@@ -61,8 +61,13 @@ class _Trial:
         return self.masters.encode() in seen or self.mine.encode() in seen
 
 
-async def probe_range(context: Context, leases: Leases[Endpoint]) -> RangeProbe:
+async def probe_range(
+    context: Context, leases: Leases[Endpoint], or_fast: bool = True
+) -> RangeProbe:
     """Try the lowest and the highest free port of the range; where none is free, one fast port.
+
+    Its node's topics are then forwarded by the proxy for a while, so nobody does it unasked:
+    without ``or_fast`` nothing is tried where no port is free.
 
     The second port is left out where the master misses the first: rosmaster calls back from three
     threads, and each call into a void holds one for as long as TCP tries, two minutes.
@@ -71,13 +76,15 @@ async def probe_range(context: Context, leases: Leases[Endpoint]) -> RangeProbe:
     probes: list[PortProbe] = []
     for order in (ports, reversed(ports)):
         trial = _Trial()
-        async with leases.lent(order, trial.greet) as port:
+        async with leases.lent(order, trial.greet, or_fast) as port:
             if port is None:
                 break
             where = context.addressing.outside(port)
             mine, masters = await asyncio.gather(
                 _dial(context, trial, where), _ask_master(context, trial, where)
             )
+            if not leases.is_lent(port):
+                break  # a node has got it meanwhile, so nothing is known
         probes.append(PortProbe(port, str(where), mine, masters))
         if probes[0].from_master == "missed" or pool.free == 1:
             break

@@ -10,11 +10,15 @@ from typing import TypeVar
 import msgspec
 
 from rosproxy.access.layers import WrittenLayer
-from rosproxy.net.addresses import parse_address
+from rosproxy.net.addresses import HostPort, parse_address
+from rosproxy.settings import read_peer
 from rosproxy.telemetry.text import clean, shorten
 
 Body = TypeVar("Body", bound=msgspec.Struct)
 _NAME = re.compile(r"[\w.-]{1,253}")
+_PREFIX = re.compile(r"[0-9a-f]{2}(\.[0-9a-f]{2}){11}")
+MOST_PEERS = 1024
+"""Peers that a proxy can be told of: each is told of every participant inside."""
 _LONGEST = 150
 """Characters of a message: it repeats what was sent."""
 
@@ -56,12 +60,27 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ``gone``: addresses that no container has any more. ``moved``: old address to new address.
     ``arrived``: containers that may have nodes which registered before the proxy was there.
     ``selected``: the addresses that may use the proxy as their master; None: unchanged.
+    ``peers`` are those of ROS 2, ``host`` or ``host:port``, instead of all before; None: unchanged.
+    ``former``: the ports, by GUID prefix, that participants had at a proxy with another address, or
+    with another range.
     """
 
     gone: tuple[str, ...] = ()
     moved: dict[str, str] = {}
     arrived: tuple[Arrival, ...] = ()
     selected: tuple[str, ...] | None = None
+    peers: tuple[str, ...] | None = None
+    former: dict[str, tuple[int, ...]] = {}
+
+    @property
+    def former_ports(self) -> dict[bytes, tuple[int, ...]]:
+        """The same by the prefix itself."""
+        return {bytes.fromhex(text.replace(".", "")): each for text, each in self.former.items()}
+
+    @property
+    def ros2_peers(self) -> tuple[HostPort, ...] | None:
+        """The peers, read."""
+        return None if self.peers is None else tuple(map(read_peer, self.peers))
 
     @property
     def tells_events(self) -> bool:
@@ -76,6 +95,16 @@ class ContainerNews(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         }
         msgspec.structs.force_setattr(self, "gone", gone)
         msgspec.structs.force_setattr(self, "moved", moved)
+        for prefix in self.former:
+            if not _PREFIX.fullmatch(prefix):
+                raise ValueError(f"former: must be by GUID prefixes, not {prefix[:40]!r}")
+        if len(self.peers or ()) > MOST_PEERS:
+            raise ValueError(f"peers: must be {MOST_PEERS} at most")
+        for i, peer in enumerate(self.peers or ()):
+            try:
+                read_peer(peer)
+            except ValueError as error:
+                raise ValueError(f"peers[{i}]: {error}") from None
         if self.selected is not None:
             told = (_address(f"selected[{i}]", each) for i, each in enumerate(self.selected))
             msgspec.structs.force_setattr(self, "selected", tuple(told))
@@ -92,13 +121,15 @@ class PortProbe(msgspec.Struct, frozen=True):
 
     ``from_proxy`` is ok, refused, silent, unreachable, unresolvable, closed (taken, but not passed
     on to the proxy) or stranger (something else answers); ``from_master`` is ok, missed (the
-    master's call did not arrive) or unknown (the master could not be asked).
+    master's call did not arrive) or unknown (the master could not be asked). ``transport`` is tcp,
+    or for ROS 2 udp, where nobody but the proxy itself can try.
     """
 
     port: int = 0
     advertised: str = ""
     from_proxy: str = ""
     from_master: str = ""
+    transport: str = "tcp"
 
 
 class RangeProbe(msgspec.Struct, frozen=True):

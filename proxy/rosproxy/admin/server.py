@@ -1,9 +1,10 @@
 """The admin endpoint: health, readiness, metrics, status, and what an operator tells the proxy.
 
-GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default. POST
+GET only tells, and is open to whoever reaches the endpoint, which is on loopback by default; the
+live page, whose routes it is given, decides by itself whom it tells (`rosproxy.page`). POST
 changes things: it is for callers on loopback that are no web page, and for those that know the
-token, of which only the hash is held here. What a POST does is given as an action by its path;
-actions wait for each other as far as they have to.
+token, of which only the hash is held here. So is waiting for a change (`status_changes`). What a
+POST does is given as an action by its path; actions wait for each other as far as they have to.
 
 It serves few and friends, so its bounds are tight and no options: a source that has too many
 connections loses its oldest, and who sends half a request or reads no reply is cut.
@@ -15,7 +16,7 @@ import hmac
 import json
 import logging
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from aiohttp import web
@@ -23,6 +24,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.admin.requests import BodyError
+from rosproxy.admin.status_changes import Crowded, StatusChanges
+from rosproxy.admin.status_document import ProxyStatus, to_json
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.http_client import TooLong, read_bounded
 from rosproxy.net.sockets import BACKLOG, end_if_stalled
@@ -30,7 +33,7 @@ from rosproxy.ros1.clients.master import MasterError, Unreachable
 
 log = logging.getLogger(__name__)
 
-INDEX = "rosproxy: /healthz /readyz /metrics /status\n"
+CHANGES = "/status/changes"
 MAX_BODY = 1024 * 1024
 """Longest body in bytes of a POST."""
 MOST_CONNECTIONS = 32
@@ -40,10 +43,11 @@ IDLE_TIMEOUT = 75.0
 BODY_TIMEOUT = 10.0
 """Seconds in which the body of a POST must have arrived."""
 FORBIDDEN = (
-    "rosproxy: POST is for callers on this host's loopback, and for those that send "
+    "rosproxy: {} is for callers on this host's loopback, and for those that send "
     "'Authorization: Bearer TOKEN' with the proxy's --admin-token (ROSPROXY_ADMIN_TOKEN){}\n"
 )
 
+Handler = Callable[[web.BaseRequest], Awaitable[web.StreamResponse]]
 Action = Callable[[Any], Awaitable[dict[str, Any]]]
 """Does what a POST asks for, given its JSON body. Raises BodyError, Unreachable, MasterError."""
 
@@ -52,17 +56,24 @@ Action = Callable[[Any], Awaitable[dict[str, Any]]]
 class AdminServer:
     """Serves what people, orchestrators and the operator ask.
 
-    ``unready`` gives the reason why the proxy is not ready, None if it is; ``actions`` are what
-    paths do when something is posted there; ``token_hash``, a SHA-256 in hex digits, is that of the
-    token with which callers from elsewhere than loopback may post.
+    ``status`` is the state; ``unready`` gives the reason why the proxy is not ready, None if it is;
+    ``actions`` are what paths do when something is posted there; ``token_hash``, a SHA-256 in hex
+    digits, is that of the token with which callers from elsewhere than loopback may post.
+    ``routes`` are served besides, by method and path.
     """
 
     _metrics: CollectorRegistry
-    _status: Callable[[], dict[str, Any]]
+    _status: Callable[[], ProxyStatus]
     _unready: Callable[[], str | None]
     _actions: Mapping[str, Action]
     _token_hash: str | None
+    _routes: Mapping[tuple[str, str], Handler]
     _runner: web.ServerRunner | None = None
+    _changes: StatusChanges = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Nobody waits yet."""
+        self._changes = StatusChanges(self._status)
 
     async def start(self, where: HostPort) -> None:
         """Listen. Raises OSError."""
@@ -73,41 +84,68 @@ class AdminServer:
 
     async def stop(self) -> None:
         """Stop listening."""
+        self._changes.end()
         if self._runner is not None:
             await self._runner.cleanup()
 
-    async def _answer(self, request: web.BaseRequest) -> web.Response:
-        get = self._pages().get(request.path)
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        method = "GET" if request.method == "HEAD" else request.method
+        page, route = self._pages().get(request.path), self._routes.get((method, request.path))
+        if request.path == CHANGES and request.method == "GET":
+            return await self._wait(request)
+        if page is not None and method == "GET":
+            return page()
+        if route is not None:
+            return await route(request)
         posted = request.path in self._actions
-        if get is not None and request.method in ("GET", "HEAD"):
-            return get()
-        if posted and request.method == "POST":
+        if posted and method == "POST":
             return await self._post(request)
-        if get is None and not posted:
+        allowed = {known for known, path in self._routes if path == request.path}
+        allowed |= ({"GET"} if page else set()) | ({"POST"} if posted else set())
+        if not allowed:
             return web.Response(status=404, text="404: Not Found")
-        allowed = "POST" if posted else "GET,HEAD"
+        told = ",".join(sorted(allowed | ({"HEAD"} if "GET" in allowed else set())))
         text = "405: Method Not Allowed"
-        return web.Response(status=405, text=text, headers={"Allow": allowed})
+        return web.Response(status=405, text=text, headers={"Allow": told})
 
     def _pages(self) -> dict[str, Callable[[], web.Response]]:
         return {
-            "/": lambda: web.Response(text=INDEX),
             "/healthz": lambda: web.Response(text="ok\n"),
             "/readyz": self._readiness,
             "/metrics": lambda: web.Response(
                 body=generate_latest(self._metrics), headers={"Content-Type": CONTENT_TYPE_LATEST}
             ),
-            "/status": lambda: web.json_response(self._status()),
+            "/status": lambda: web.json_response(to_json(self._status())),
         }
 
     def _readiness(self) -> web.Response:
         reason = self._unready()
         return web.Response(status=503 if reason else 200, text=f"{reason or 'ok'}\n")
 
+    async def _wait(self, request: web.BaseRequest) -> web.Response:
+        """Answer once the state is another one than the caller knows (``since``)."""
+        if not self._may_post(request):
+            return self._forbidden(f"GET {CHANGES}")
+        since, transport = request.query.get("since", ""), request.transport
+        try:
+            within = float(request.query.get("within", "0"))
+        except ValueError:
+            return web.Response(status=400, text="rosproxy: within: must be seconds\n")
+        try:
+            version, status = await self._changes.after(
+                since, within, lambda: transport is not None and not transport.is_closing()
+            )
+        except Crowded:
+            return web.Response(status=503, text="rosproxy: too many wait already; ask /status\n")
+        return web.json_response({"version": version, "status": to_json(status)})
+
+    def _forbidden(self, what: str) -> web.Response:
+        hint = "" if self._token_hash else "; this proxy has none"
+        return web.Response(status=403, text=FORBIDDEN.format(what, hint))
+
     async def _post(self, request: web.BaseRequest) -> web.Response:
         if not self._may_post(request):
-            hint = "" if self._token_hash else "; this proxy has none"
-            return web.Response(status=403, text=FORBIDDEN.format(hint))
+            return self._forbidden("POST")
         try:
             async with asyncio.timeout(BODY_TIMEOUT):
                 sent = await read_bounded(request.content, MAX_BODY)

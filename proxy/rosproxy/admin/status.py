@@ -2,19 +2,21 @@
 
 import os
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import msgspec
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from rosproxy import __version__
+from rosproxy.access.access_policy import AccessPolicy
 from rosproxy.admin import status_document as document
 from rosproxy.admin.status_bounds import bounded, first_hidden
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.forwarding.relay import Relay
 from rosproxy.leases import fast_ports
+from rosproxy.net import signs
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import STATES, Endpoint
@@ -22,6 +24,8 @@ from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
+from rosproxy.telemetry.metrics import NamedNodes
+from rosproxy.telemetry.problems import Problems
 
 
 @dataclass(eq=False)
@@ -33,6 +37,7 @@ class ProxyState(Collector):
     _tcpros: TcprosServer
     _stand_ins: StandInPorts
     _plane: KernelPlane
+    _down: NamedNodes = field(default_factory=NamedNodes)
 
     def status(self) -> document.ProxyStatus:
         """Everything that ``rosproxy status`` and ``rosproxy doctor`` show, within bounds."""
@@ -66,54 +71,60 @@ class ProxyState(Collector):
             stand_ins=msgspec.convert(self._stand_ins.status(), tuple[document.StandInStatus, ...]),
             policy=self._policy(),
             nodes=tuple(self._node(e, relays.get(e.port, [])) for e in endpoints),
-            problems=tuple(
-                document.ProblemStatus(round(max(time.time() - p.when, 0.0), 1), p.subject, p.text)
-                for p in context.problems.all()
-            ),
+            problems=told_problems(context.problems),
         )
         return bounded(whole)
 
     def collect(self) -> Iterable[Metric]:
         """The state as metrics: gauges, and counters of bytes."""
-        endpoints, pool = self._context.registry, self._context.registry.pool
-        forwarded = sum(endpoint.fast_connections for endpoint in endpoints)
-        for name, text, value in (
-            ("leases_used", "Ports held by inside nodes.", len(endpoints)),
-            ("leases_free", "Ports left for inside nodes.", fast_ports.left(pool, endpoints)),
-            (
-                "fast_ports",
-                "Of the ports left, those that serve topics meanwhile.",
-                fast_ports.held(endpoints),
-            ),
-            ("leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)),
-            ("open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)),
-            (
-                "stand_ins",
-                "Ports that stand in for nodes outside.",
-                len(self._stand_ins.status()),
-            ),
-            (
-                "udpros_relays",
-                "Subscriptions by UDPROS that the proxy passes on.",
-                len(self._stand_ins.udpros),
-            ),
-            ("master_up", "Whether the master answers.", bool(self._monitor.up)),
-            ("kernel_plane", "Whether the kernel forwards topics.", self._plane.syncer.usable),
-            ("kernel_connections", "TCPROS connections that the kernel forwards.", forwarded),
-        ):
+        for name, text, value in self._numbers():
             yield GaugeMetricFamily(f"rosproxy_{name}", text, value=value)
         if self._context.selected is not None:
             text = "Addresses that may use the proxy as their master."
             count = len(self._context.selected)
             yield GaugeMetricFamily("rosproxy_selected_addresses", text, value=count)
-        states = [endpoint.state for endpoint in endpoints]
+        states = [endpoint.state for endpoint in self._context.registry]
         by_state = GaugeMetricFamily(
             "rosproxy_endpoints", "Inside nodes by state.", labels=["state"]
         )
         for state in STATES:
             by_state.add_metric([state], states.count(state))
         yield by_state
+        yield self._nodes_down()
         yield from self._bytes()
+
+    def _numbers(self) -> Iterator[tuple[str, str, float]]:
+        """Name, meaning and value of each gauge without labels."""
+        context, endpoints = self._context, self._context.registry
+        pool, buffered = endpoints.pool, context.buffered
+        yield "leases_used", "Ports held by inside nodes.", len(endpoints)
+        yield "leases_free", "Ports left for inside nodes.", fast_ports.left(pool, endpoints)
+        text = "Of the ports left, those that serve topics meanwhile."
+        yield "fast_ports", text, fast_ports.held(endpoints)
+        yield "leases_blocked", "Ports of the range held by other programs.", len(pool.blocked)
+        yield "open_connections", "Relayed TCPROS connections.", len(self._tcpros.relays)
+        text = "Ports that stand in for nodes outside."
+        yield "stand_ins", text, len(context.stand_ins.by_local)
+        text = "Subscriptions by UDPROS that the proxy passes on."
+        yield "udpros_relays", text, len(self._stand_ins.udpros)
+        text = "Memory that calls and replies hold while they are read."
+        yield "buffered_bytes", text, buffered.used
+        yield "buffered_bytes_limit", "Memory that they may hold.", buffered.most
+        yield "master_up", "Whether the master answers.", bool(self._monitor.up)
+        text = "Whether the kernel forwards topics."
+        yield "kernel_plane", text, self._plane.syncer.usable
+        forwarded = sum(one.fast_connections for one in self._plane.holders)
+        yield "kernel_connections", "TCPROS connections that the kernel forwards.", forwarded
+
+    def _nodes_down(self) -> Metric:
+        """Who does not answer, by name: it is who is on call that has to know."""
+        text = "Inside nodes that do not answer, by name."
+        found = GaugeMetricFamily("rosproxy_nodes_down", text, labels=["node"])
+        down = [endpoint for endpoint in self._context.registry if endpoint.is_down]
+        names = [name for endpoint in down for name in endpoint.caller_ids]
+        for name, count in self._down.tally(names).items():
+            found.add_metric([name], count)
+        return found
 
     def _bytes(self) -> Iterable[Metric]:
         relayed = CounterMetricFamily(
@@ -135,12 +146,14 @@ class ProxyState(Collector):
     def _settings(self) -> document.StatusSettings:
         settings, selected = self._context.settings, self._context.selected
         return document.StatusSettings(
+            ros=settings.ros,
             master_port=settings.master_port,
             publish_master=settings.publish_master,
             advertise_host=settings.advertise_host,
             bind=settings.bind,
             inside_networks=tuple(map(str, self._context.addressing.networks)),
             direction=settings.direction,
+            udp=settings.udp,
             cleanup_after=settings.cleanup_after,
             linger=settings.linger,
             selected=None if selected is None else len(selected),
@@ -167,27 +180,24 @@ class ProxyState(Collector):
             used=len(registry),
             free=fast_ports.left(registry.pool, registry),
             blocked=len(registry.pool.blocked),
+            held_by=self._held_by() if registry.pool.blocked else (),
         )
+
+    def _held_by(self) -> tuple[str, ...]:
+        """The other proxies on this machine that have ports of the range."""
+        settings = self._context.settings
+        ports = settings.ports.listen
+        return tuple(map(str, signs.others("1", ports.first, ports.last, settings.admin)))
 
     def _policy(self) -> document.PolicyStatus:
         policy = self._context.policy
-        layers = [
-            document.LayerStatus(
-                layer.name,
-                layer.mode.value,
-                tuple(map(str, layer.rules)),
-                None if layer.addresses is None else len(layer.addresses),
-            )
-            for layer in policy.layers
-        ]
         hidden = []
         for (kind, name), holders in sorted(self._context.registry.hidden.items(), key=str):
             for node, endpoint in sorted(holders.items()):
                 asked = KINDS[kind]
                 verdict = policy.judge(asked, name, [node], endpoint.address)
                 hidden.append(document.HiddenStatus(asked.value, name, node, verdict.reason))
-        shown = first_hidden(hidden)
-        return document.PolicyStatus(tuple(layers), tuple(shown), len(hidden) - len(shown))
+        return policy_status(policy, hidden)
 
     def _node(self, endpoint: Endpoint, relays: list[Relay]) -> document.EndpointStatus:
         problems = self._context.problems.at(endpoint.port)
@@ -208,3 +218,28 @@ class ProxyState(Collector):
             problems=tuple(problem.text for problem in problems),
             data_plane=msgspec.convert(self._plane.status_of(endpoint), document.NodePlaneStatus),
         )
+
+
+def policy_status(
+    policy: AccessPolicy, hidden: Sequence[document.HiddenStatus], left_out: int = 0
+) -> document.PolicyStatus:
+    """The layers in force and what they hide, of which so much was left out before."""
+    layers = tuple(
+        document.LayerStatus(
+            layer.name,
+            layer.mode.value,
+            tuple(map(str, layer.rules)),
+            None if layer.addresses is None else len(layer.addresses),
+        )
+        for layer in policy.layers
+    )
+    shown = first_hidden(hidden)
+    return document.PolicyStatus(layers, tuple(shown), left_out + len(hidden) - len(shown))
+
+
+def told_problems(problems: Problems) -> tuple[document.ProblemStatus, ...]:
+    """The problems that were noted, each with how long ago."""
+    return tuple(
+        document.ProblemStatus(round(max(time.time() - one.when, 0.0), 1), one.subject, one.text)
+        for one in problems.all()
+    )

@@ -7,7 +7,7 @@ come first, since connections are what anybody outside can add.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import accumulate, chain
 
 import msgspec
@@ -16,6 +16,7 @@ from rosproxy.admin.status_document import (
     ConnectionStatus,
     EndpointStatus,
     HiddenStatus,
+    ParticipantStatus,
     ProxyStatus,
 )
 
@@ -24,6 +25,8 @@ MOST = 512 * 1024
 with ten topics and as many connections each have 250,000."""
 MOST_HIDDEN = 256 * 1024
 """The same for what the policy hides."""
+MOST_OF_PARTICIPANTS = 128 * 1024
+"""The same for topics and services of the participants of ROS 2 on one side of a domain."""
 CONNECTION = 160
 """Those of a connection besides its texts."""
 Item = str | ConnectionStatus
@@ -44,6 +47,35 @@ def first_hidden(hidden: Sequence[HiddenStatus], most: int = MOST_HIDDEN) -> lis
     """The first of the hidden names, as many as fit."""
     sizes = accumulate(len(msgspec.json.encode(one)) for one in hidden)
     return [one for one, size in zip(hidden, sizes, strict=True) if size <= most]
+
+
+def bounded_names(
+    participants: Iterable[ParticipantStatus], most: int = MOST_OF_PARTICIPANTS
+) -> tuple[ParticipantStatus, ...]:
+    """Participants with so many of each one's names that all fit."""
+    all_of_them = tuple(participants)
+    sizes = [[len(msgspec.json.encode(name)) + 1 for name in _names(one)] for one in all_of_them]
+    shares = fair_shares([sum(own) for own in sizes], most)
+    return tuple(
+        _with_names(one, sum(1 for used in accumulate(own) if used <= share))
+        for one, own, share in zip(all_of_them, sizes, shares, strict=True)
+    )
+
+
+def _names(one: ParticipantStatus) -> tuple[str, ...]:
+    return (*one.publishes, *one.subscribes, *one.services)
+
+
+def _with_names(one: ParticipantStatus, count: int) -> ParticipantStatus:
+    """A participant with the first of its names."""
+    subscribed = max(count - len(one.publishes), 0)
+    return msgspec.structs.replace(
+        one,
+        publishes=one.publishes[:count],
+        subscribes=one.subscribes[:subscribed],
+        services=one.services[: max(subscribed - len(one.subscribes), 0)],
+        left_out=one.left_out + len(_names(one)) - count,
+    )
 
 
 def fair_shares(wanted: Sequence[int], most: int) -> list[int]:

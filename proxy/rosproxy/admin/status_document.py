@@ -29,21 +29,30 @@ class NotAStatus(ValueError):
 
 
 class StatusSettings(msgspec.Struct, frozen=True):
-    """The settings that others have to know. ``inside_networks``: those in force, as CIDRs.
+    """The settings that others have to know.
 
+    ``ros`` are the versions of ROS that it is for. ``inside_networks``: those in force, as CIDRs.
     ``direction``: ``out``, or ``both`` where inside reaches outside through the proxy, too.
+    ``udp``: UDPROS of publishers outside finds its way in.
     ``selected``: how many addresses an operator has selected; None: it has told of none yet.
     """
 
+    ros: Names = ("1",)
     master_port: Count = 11311
     publish_master: Count | None = None
     advertise_host: str = ""
     bind: str = "0.0.0.0"
     inside_networks: Names = ()
     direction: str = "out"
+    udp: bool = False
     cleanup_after: Seconds = 0.0
     linger: Seconds = 0.0
     selected: Count | None = None
+
+    @property
+    def for_ros1(self) -> bool:
+        """Whether it is for ROS 1."""
+        return "1" in self.ros
 
 
 class MasterStatus(msgspec.Struct, frozen=True):
@@ -63,13 +72,17 @@ class MasterStatus(msgspec.Struct, frozen=True):
 
 
 class PortsStatus(msgspec.Struct, frozen=True):
-    """The range of ports, ``A-B`` here and as outside sees it; ``blocked`` ones others hold."""
+    """The range of ports, ``A-B`` here and as outside sees it; ``blocked`` ones others hold.
+
+    ``held_by``: the other proxies on this machine that have some of them.
+    """
 
     listen: str = ""
     advertise: str = ""
     used: Count = 0
     free: Count = 0
     blocked: Count = 0
+    held_by: Names = ()
 
 
 class DataPlaneStatus(msgspec.Struct, frozen=True):
@@ -94,11 +107,17 @@ class NodePlaneStatus(msgspec.Struct, frozen=True):
 
 
 class StandInStatus(msgspec.Struct, frozen=True):
-    """A port that stands in for a node or service outside, which ``uri`` names."""
+    """A port that stands in for a node or service outside, which ``uri`` names.
+
+    ``connections`` and the rates are those of the proxy and of the kernel (``data_plane``).
+    """
 
     port: Count = 0
     uri: str = ""
     connections: Count = 0
+    sent_rate: Rate = 0.0
+    received_rate: Rate = 0.0
+    data_plane: NodePlaneStatus | None = None
 
 
 class UdprosStatus(msgspec.Struct, frozen=True):
@@ -193,12 +212,105 @@ class ProblemStatus(msgspec.Struct, frozen=True):
     text: str = ""
 
 
+class LocatorStatus(msgspec.Struct, frozen=True):
+    """A port and the locator of a participant that it leads to.
+
+    ``kind`` is metatraffic or data. ``plane``: who forwards, and where it is not the kernel, the
+    ``reason``. ``datagrams`` and ``bytes`` are those that the proxy has passed on; those of the
+    kernel are of IP packets.
+    """
+
+    port: Count = 0
+    where: str = ""
+    kind: str = ""
+    datagrams: Count = 0
+    bytes: Count = 0
+    rate: Rate = 0.0
+    plane: str = ""
+    reason: str = ""
+    kernel_datagrams: Count = 0
+    kernel_bytes: Count = 0
+
+
+class NamedTypeStatus(msgspec.Struct, frozen=True):
+    """A topic or service, and its type, as a participant announces it."""
+
+    name: str = ""
+    type: str = ""
+
+
+class ParticipantStatus(msgspec.Struct, frozen=True):
+    """A participant of ROS 2, inside or outside, with the topics and services that it announces.
+
+    ``leases`` are ports of the range for one inside; for one outside its stand-ins, which inside
+    reaches. ``kept``: one inside keeps them for when the proxy starts again. ``proven``: one
+    outside gets what it is sent. ``problem``: what it lacks. ``domain``: that which it says it is
+    in. ``security`` and ``locator_fault`` are one of `rosproxy.ros2.registry.participants`.
+    ``types`` are those of the topics and services.
+    """
+
+    guid_prefix: str = ""
+    address: str = ""
+    vendor: str = ""
+    leases: tuple[LocatorStatus, ...] = ()
+    publishes: Names = ()
+    subscribes: Names = ()
+    services: Names = ()
+    left_out: Count = 0
+    kept: bool = False
+    proven: bool = True
+    problem: str = ""
+    domain: Count | None = None
+    security: str = ""
+    locator_fault: str = ""
+    types: tuple[NamedTypeStatus, ...] = ()
+
+
+class MismatchStatus(msgspec.Struct, frozen=True):
+    """A topic or service (``kind``) for which two participants don't match across the boundary.
+
+    ``policy`` is the first for which they don't, with what the ``writer`` offers and the ``reader``
+    requests; these are GUID prefixes.
+    """
+
+    kind: str = ""
+    name: str = ""
+    policy: str = ""
+    offered: str = ""
+    requested: str = ""
+    writer: str = ""
+    reader: str = ""
+
+
+class DomainStatus(msgspec.Struct, frozen=True):
+    """A domain of ROS 2: its participants, and what came of datagrams.
+
+    ``discovery`` is where outside announces itself to the proxy. ``dropped`` were refused, ``lost``
+    are those that the kernel did not take. ``data_plane``: how user data is forwarded.
+    ``mismatches_left_out``: how many more there are.
+    """
+
+    domain: Count = 0
+    discovery: str = ""
+    peers: Names = ()
+    ear: str = ""
+    ports_used: Count = 0
+    ports_free: Count = 0
+    dropped: Count = 0
+    lost: Count = 0
+    data_plane: DataPlaneStatus | None = None
+    inside: tuple[ParticipantStatus, ...] = ()
+    outside: tuple[ParticipantStatus, ...] = ()
+    mismatches: tuple[MismatchStatus, ...] = ()
+    mismatches_left_out: Count = 0
+
+
 class ProxyStatus(msgspec.Struct, frozen=True):
     """Everything that a proxy tells of itself.
 
     ``instance`` is another one after each start; ``retired``: it registers nothing any more;
     ``stand_ins`` are the ports that stand in for nodes outside, for inside nodes; ``udpros`` the
-    subscriptions by UDPROS that it passes on.
+    subscriptions by UDPROS that it passes on; ``domains`` those of ROS 2.
     """
 
     version: str = ""
@@ -214,6 +326,7 @@ class ProxyStatus(msgspec.Struct, frozen=True):
     udpros: tuple[UdprosStatus, ...] = ()
     policy: PolicyStatus | None = None
     nodes: tuple[EndpointStatus, ...] = ()
+    domains: tuple[DomainStatus, ...] = ()
     problems: tuple[ProblemStatus, ...] = ()
 
 

@@ -1,23 +1,22 @@
-"""The command line: ``rosproxy run``, ``status``, ``health`` and ``doctor``.
+"""The command line: ``rosproxy run`` and ``ear``; what asks a running proxy is in `questions`.
 
 Commands import what they need when they run, so that a health check starts fast.
 """
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
 import click
 
 from rosproxy import __version__
-from rosproxy.cli import options
+from rosproxy.cli import options, questions
 from rosproxy.cli.options import Command
 
 
 @click.group(cls=options.Commands, context_settings=options.GROUP_SETTINGS)
 @click.version_option(__version__, prog_name="rosproxy")
 def main() -> None:
-    """Transparent proxy for ROS 1: nodes behind it and nodes outside talk both ways."""
+    """Transparent proxy for ROS: nodes behind it and nodes outside talk both ways."""
 
 
 def _time(name: str, least: float, default: float, text: str) -> Callable[..., Command]:
@@ -26,11 +25,17 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
 
 @main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
 @click.option(
+    "--ros",
+    type=click.Choice(["1", "2"]),
+    multiple=True,
+    default=["1"],
+    help="Version of ROS that it is for (repeatable: for both).",
+)
+@click.option(
     "--master-uri",
     type=options.MASTER_URI,
-    required=True,
     envvar="ROS_MASTER_URI",
-    help="The real ROS master, e.g. http://robot:11311.",
+    help="The real ROS master, e.g. http://robot:11311; ROS 1 needs it.",
 )
 @click.option(
     "--master-address",
@@ -73,7 +78,7 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     "--admin-bind",
     type=options.HOST_PORT,
     default="127.0.0.1:11312",
-    help="Where /healthz, /readyz, /metrics and /status are served.",
+    help="Where the live page, /healthz, /readyz, /metrics and /status are served.",
 )
 @click.option(
     "--admin-token",
@@ -196,144 +201,107 @@ def _time(name: str, least: float, default: float, text: str) -> Callable[..., C
     default=2048,
     help="Connections to one port of the range.",
 )
+@click.option(
+    "--ros2-domain",
+    type=options.DOMAIN,
+    envvar=["ROSPROXY_ROS2_DOMAINS", "ROS_DOMAIN_ID"],
+    multiple=True,
+    help="ROS 2: a domain (repeatable); they share out the range. Default: 0.",
+)
+@click.option(
+    "--ros2-peer",
+    type=options.PEER,
+    envvar="ROSPROXY_ROS2_PEERS",
+    multiple=True,
+    help="ROS 2: a host outside that is told of participants inside, or another proxy, with the "
+    "first port of its range (repeatable).",
+)
+@click.option(
+    "--ros2-ear",
+    type=options.HOST_PORT,
+    help="ROS 2: where rosproxy ear listens, which carries announcements from and to the LAN.",
+)
 @options.log_options
-@click.option("--check", is_flag=True, help="Validate the options and exit.")
-def run(check: bool, log_format: str, log_level: str, **values: Any) -> None:
+@options.config_option
+@click.option(
+    "--check",
+    is_flag=True,
+    allow_from_autoenv=False,
+    help="Validate the options and the policy's file, and exit.",
+)
+@click.option(
+    "--deep",
+    is_flag=True,
+    allow_from_autoenv=False,
+    help="With --check: also look up the hosts, bind the ports, ask the master, and have the range "
+    "tried from outside; exit with 1 if something is wrong.",
+)
+def run(check: bool, deep: bool, log_format: str, log_level: str, **values: Any) -> None:
     """Run the proxy.
 
-    Every option has an environment variable: ROSPROXY_ and its name (ROSPROXY_PORT_RANGE); the
-    master's is ROS_MASTER_URI, the inside networks' ROSPROXY_INSIDE_NETWORKS.
+    What is given twice counts as on the command line, else as in the variable, else as in the file
+    of --config.
     """
-    from rosproxy import app
     from rosproxy.settings import make_settings
     from rosproxy.telemetry import logs
 
+    if deep and not check:
+        raise click.UsageError("--deep goes with --check")
     with options.setting_errors():
         settings = make_settings(**values)
         logs.set_up(log_format, log_level)
+        remarks = options.unknown_variables(main)
         if not check:
-            app.run(settings)
+            from rosproxy.app import proxy
+
+            proxy.run(settings, {one.name: one.text for one in remarks})
+        else:
+            _check(settings, deep)
 
 
-def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
-    from rosproxy.admin.client import AdminClient, default_url
+def _check(settings: Any, deep: bool) -> None:
+    """Say what is wrong with settings before anything runs. Raises SettingError."""
+    from rosproxy.app.policy_sources import read_policy_file
 
-    try:
-        return AdminClient(url or default_url())
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from None
+    read_policy_file(settings)
+    if deep:
+        from rosproxy.cli.deep_check import deep_check
+        from rosproxy.cli.questions import tell
 
-
-_admin_option = click.option(
-    "--admin",
-    envvar="ROSPROXY_ADMIN",
-    show_envvar=True,
-    callback=_admin_client,
-    metavar="URL",
-    help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
-    "http://127.0.0.1:11312.",
-)
+        tell(deep_check(settings), as_json=False)
 
 
-@main.command()
-@_admin_option
-@click.option("--json", "as_json", is_flag=True, help="Print the state as JSON.")
-@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
-def status(admin: Any, as_json: bool, watch: bool) -> None:
-    """Show the master, the ports, and the nodes behind the proxy."""
-    if as_json and watch:
-        raise click.UsageError("--json or --watch, not both")
-    from rosproxy.cli import terminal
-
-    if watch:
-        terminal.watch_status(admin)
-    else:
-        _or_exit(lambda: terminal.show_status(admin, as_json))
-
-
-@main.command()
-@_admin_option
-def health(admin: Any) -> None:
-    """Exit with 0 if the proxy is alive, with 1 if not; for container health checks."""
-    _or_exit(lambda: admin.get("/healthz", within=3.0))
-
-
-@main.command()
-@click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
-@_admin_option
+@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY_EAR", "show_default": True})
+@click.option("--domain", type=options.DOMAIN, default=0, help="The domain of DDS.")
+@click.option("--lan", type=options.ADDRESS, required=True, help="This host's address on the LAN.")
 @click.option(
-    "--master-uri",
-    type=options.MASTER_URI,
-    envvar="ROS_MASTER_URI",
-    help="The master to look at if the proxy can't be asked for its own.",
+    "--bind",
+    type=options.HOST_PORT,
+    required=True,
+    help="Address and port that the proxy reaches, its --ros2-ear.",
 )
 @click.option(
-    "--advertise-host",
-    type=options.HOST,
-    envvar="ROSPROXY_ADVERTISE_HOST",
-    help="The advertised host if the proxy can't be asked for it.",
+    "--proxy",
+    type=options.HOST_PORT,
+    required=True,
+    help="The proxy's address, as this host reaches it, and the first port of its range.",
 )
-@click.option(
-    "--master-address",
-    type=options.ADDRESS,
-    envvar="ROSPROXY_MASTER_ADDRESS",
-    help="The IP address of the master's host if the proxy can't be asked for it.",
-)
-@click.option(
-    "--outside",
-    is_flag=True,
-    help="Look from here as a machine outside does, for example from a robot; ask no proxy.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
-def doctor(
-    names: tuple[str, ...],
-    admin: Any,
-    master_uri: str | None,
-    advertise_host: str | None,
-    master_address: str | None,
-    outside: bool,
-    as_json: bool,
-) -> None:
-    """Find out why A can't hear B, and say what mends it.
+@options.log_options
+@options.config_option
+def ear(log_format: str, log_level: str, **values: Any) -> None:
+    """Carry announcements of ROS 2 between a LAN and the proxy; runs in the host's network.
 
-    Looks at the proxy, its ports, the master and all nodes. With names: who publishes and who
-    subscribes to that topic; that node's topics; or what two nodes have to say to each other,
-    and which of them are not connected, and why.
-
-    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. What outside machines see
-    is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
-    something is.
+    Nothing else: what users send goes through the ports that the host publishes.
     """
-    import asyncio
-    import json
+    from rosproxy.app.ear import run_ear
+    from rosproxy.ros2.servers.ear import EarSettings
+    from rosproxy.telemetry import logs
 
-    from rosproxy.cli import terminal
-    from rosproxy.doctor import findings, rules
-    from rosproxy.doctor.collect import collect
-
-    if outside and not master_uri:
-        raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
-    asked = collect(
-        None if outside else admin,
-        master_uri or "",
-        advertise_host or "",
-        tuple(f"/{name.strip('/')}" for name in names),
-        master_address,
-    )
-    found = rules.diagnose(asyncio.run(asked))
-    if as_json:
-        terminal.write(json.dumps(findings.as_json(found), indent=2))
-    else:
-        terminal.write(findings.render(found, terminal.size()[0]))
-    sys.exit(1 if findings.failed(found) else 0)
+    with options.setting_errors():
+        logs.set_up(log_format, log_level)
+        options.unknown_variables(main)
+        run_ear(EarSettings(**values))
 
 
-def _or_exit(ask: Callable[[], object]) -> None:
-    """Do something that may find the proxy absent, and say so in one line."""
-    from rosproxy.admin.client import AdminError
-
-    try:
-        ask()
-    except AdminError as error:
-        click.echo(f"rosproxy: {error}", err=True)
-        sys.exit(1)
+for command in (questions.status, questions.health, questions.doctor):
+    main.add_command(command)

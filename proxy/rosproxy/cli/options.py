@@ -6,7 +6,9 @@ the program, the option, what is wrong and what would be right. The exit status 
 """
 
 import contextlib
+import logging
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -14,6 +16,9 @@ import click
 
 from rosproxy import settings
 from rosproxy.access.rules import parse_rules
+from rosproxy.cli import variables
+from rosproxy.cli.config_file import read_config
+from rosproxy.cli.variables import UnknownVariable
 
 Command = Callable[..., Any]
 GROUP_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -76,6 +81,9 @@ HOST = Parsed("host", settings.read_host)
 ADDRESS = Parsed("address", settings.read_address)
 BIND_ADDRESS = Parsed("address", settings.read_bind_address)
 HOST_PORT = Parsed("address:port", settings.read_host_port)
+PEER = Parsed("host[:port]", settings.read_peer)
+DOMAIN = click.IntRange(0, 232)
+DOMAIN.name = "id"
 NETWORK = Parsed("CIDR", settings.read_network)
 MASTER_URI = Parsed("URI", settings.read_master_uri)
 TOKEN = Parsed("token", settings.read_token)
@@ -98,10 +106,32 @@ class OneLineError(click.ClickException):
         click.echo(f"{self.program}: {self.format_message()}", file, err=True)
 
 
-class Commands(click.Group):
+class Shown(click.Command):
+    """A command, or group, whose help names the variable of each option that has one."""
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Its options and arguments."""
+        found = super().get_params(ctx)
+        for each in found:
+            if isinstance(each, click.Option) and variables_of(each, ctx.auto_envvar_prefix):
+                each.show_envvar = True
+        return found
+
+
+def variables_of(option: click.Option, prefix: str | None) -> list[str]:
+    """The variables that an option is read from, of a command whose own begin with ``prefix``."""
+    if option.envvar:
+        return [option.envvar] if isinstance(option.envvar, str) else list(option.envvar)
+    told = prefix and option.allow_from_autoenv and option.expose_value
+    told = told or (prefix and option.name == "config")
+    return [f"{prefix}_{option.name}".upper().replace("-", "_")] if told else []
+
+
+class Commands(Shown, click.Group):
     """Commands whose usage errors are one line, led by the program's name; click prints four."""
 
     program = "rosproxy"
+    command_class = Shown
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Parse the words before the command. Raises OneLineError."""
@@ -133,6 +163,49 @@ def log_options(command: Command) -> Command:
         help="Least severe messages to log.",
     )
     return form(level(command))
+
+
+def config_option(command: Command) -> Command:
+    """The option ``--config``: a file for what neither the command line nor a variable gives."""
+    return click.option(
+        "--config",
+        metavar="FILE",
+        is_eager=True,
+        expose_value=False,
+        callback=_use_config,
+        help='A file in TOML with options by their names: port-range = "11000-11099".',
+    )(command)
+
+
+def _use_config(context: click.Context, option: click.Parameter, path: str | None) -> None:
+    if path is None:
+        return
+    known = [each for each in context.command.params if isinstance(each, click.Option)]
+    names = {name.removeprefix("--"): each for each in known for name in each.opts[:1]}
+    try:
+        context.default_map = read_config(path, names)
+    except ValueError as error:
+        raise click.BadParameter(str(error), context, option) from None
+
+
+def unknown_variables(*groups: click.Command, log: bool = True) -> list[UnknownVariable]:
+    """The variables of this environment that no option of some programs reads; ``log``: tell."""
+    known = {name for group in groups for name in _known(group, None)}
+    found = variables.unknown(os.environ, known)
+    for one in found if log else ():
+        logging.getLogger(__name__).warning("%s %s", one.name, one.text)
+    return found
+
+
+def _known(command: click.Command, prefix: str | None) -> Iterator[str]:
+    """The variables of a command and of those below it."""
+    prefix = command.context_settings.get("auto_envvar_prefix", prefix)
+    for each in command.params:
+        if isinstance(each, click.Option):
+            yield from variables_of(each, prefix)
+    if isinstance(command, click.Group):
+        for name, below in command.commands.items():
+            yield from _known(below, f"{prefix}_{name}".upper() if prefix else None)
 
 
 @contextlib.contextmanager

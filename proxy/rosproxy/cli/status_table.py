@@ -8,6 +8,7 @@ nodes say of themselves passes through `clean`.
 from collections.abc import Iterator, Sequence
 
 from rosproxy.admin import status_document as document
+from rosproxy.cli.domain_table import domain_lines
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.telemetry.tables import GAP, besides_first, table
 from rosproxy.telemetry.text import clean, duration, listed, plural, size, wrap
@@ -28,10 +29,14 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
     head = [line for row in _head(status) for line in wrap(row[9:], columns, " " * 9, row[:9])]
     problems = [*_problems(status, columns)]
     hidden = [*_hidden(status, columns)]
-    full = [*head, "", *_nodes(status, columns, True), *hidden, *problems]
+    domains = [line for domain in status.domains for line in domain_lines(domain, columns)]
+    nodes, brief = (["", *_nodes(status, columns, details)] for details in (True, False))
+    if not status.settings.for_ros1:
+        nodes, brief = [], []
+    full = [*head, *nodes, *domains, *hidden, *problems]
     if lines is None or len(full) <= lines:
         return "\n".join(full)
-    short = [*head, *problems, "", *_nodes(status, columns, False)]
+    short = [*head, *problems, *brief, *domains]
     if len(short) > lines:
         short[lines - 1 :] = [f"… {plural(len(short) - lines + 1, 'line')} more: rosproxy status"]
     return "\n".join(short)
@@ -40,14 +45,17 @@ def render(status: document.ProxyStatus, columns: int, lines: int | None = None)
 def _head(status: document.ProxyStatus) -> Iterator[str]:
     settings = status.settings
     yield f"rosproxy {clean(status.version)}, pid {status.pid}, up {duration(status.uptime)}"
-    yield f"master   {_master(status.master)}"
+    if settings.for_ros1:
+        yield f"master   {_master(status.master)}"
     yield f"ports    {_ports(status)}"
-    if plane := status.data_plane:
+    if settings.for_ros1 and (plane := status.data_plane):
         yield f"topics   {_plane(plane)}"
     if (policy := status.policy) and policy.layers:
         yield f"policy   {_policy(policy)}"
     networks = listed(map(clean, settings.inside_networks)) or "none"
     inside = f"ROS_MASTER_URI=http://<this host>:{settings.master_port}"
+    if not settings.for_ros1:
+        inside = f"ROS 2, domain {listed(str(one.domain) for one in status.domains)}"
     selected = f", {settings.selected} addresses selected" if settings.selected is not None else ""
     yield f"inside   {inside}, networks {networks}{selected}"
     if ports := status.stand_ins:
@@ -71,7 +79,8 @@ def _ports(status: document.ProxyStatus) -> str:
     ports, host = status.ports, clean(status.settings.advertise_host)
     listen, advertise = clean(ports.listen), clean(ports.advertise)
     mapped = "" if advertise == listen else f", here {listen}"
-    blocked = f", {ports.blocked} held by other programs" if ports.blocked else ""
+    by = "; ".join(map(clean, ports.held_by)) or "other programs"
+    blocked = f", {ports.blocked} held by {by}" if ports.blocked else ""
     return f"{host}:{advertise}{mapped}: {ports.used} used, {ports.free} free{blocked}"
 
 
@@ -93,8 +102,10 @@ def _plane(plane: document.DataPlaneStatus) -> str:
 
 def _stand_ins(ports: Sequence[document.StandInStatus]) -> str:
     open_ones = plural(sum(port.connections for port in ports), "connection")
+    into = size(sum(port.received_rate for port in ports))
     named = listed(f"{port.port} for {clean(port.uri)}" for port in ports)
-    return f"reached from inside at {plural(len(ports), 'port')} ({open_ones}): {named}"
+    count = plural(len(ports), "port")
+    return f"reached from inside at {count} ({open_ones}, {into}/s in): {named}"
 
 
 def _nodes(status: document.ProxyStatus, columns: int, details: bool) -> Iterator[str]:

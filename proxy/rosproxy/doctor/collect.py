@@ -3,7 +3,8 @@
 First the proxy (`AdminClient`), which knows its nodes and whether its ports can be reached; then
 the master for who publishes, subscribes to and provides what (``getSystemState``, ``lookupNode``);
 then every node whether it answers; then, where names were given, those nodes for their topics and
-connections (``getBusInfo``) and their data ports. The rules judge what was found.
+connections (``getBusInfo``) and their data ports. Of ROS 2 it asks who is on the networks inside
+(`domain_survey`). The rules judge what was found.
 
 It changes nothing, apart from the short-lived parameter by which the proxy has the master try its
 ports (see `range_probe`). Names and addresses are tried from where it runs; that should be where
@@ -21,26 +22,32 @@ import aiohttp
 from msgspec.structs import replace
 
 from rosproxy.admin.client import AdminClient, AdminError
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.doctor.domain_survey import ask_participants
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
+    HeardParticipant,
     MasterFacts,
     NodeFacts,
     Reach,
+    SystemState,
     data_port,
     slave_report,
     system_state,
 )
 from rosproxy.doctor.rules.pair import connected
-from rosproxy.net.addresses import HostPort, parse_host_port
+from rosproxy.net.addresses import HostPort, is_loopback, parse_host_port
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
+from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 from rosproxy.telemetry.metrics import Metrics
 
 PARALLEL = 32
 """Questions under way at once; fewer than the look-ups of names that may be."""
+FEW_PARALLEL = 4
+"""The same where it goes on for as long as somebody looks."""
 WITHIN = 3.0
 """Seconds that a node has to answer."""
 
@@ -77,18 +84,80 @@ async def collect(
 async def _with_proxy(facts: DoctorFacts, admin: AdminClient) -> DoctorFacts:
     status = await asyncio.to_thread(admin.status)
     host, master = status.settings.advertise_host, status.master
-    facts = replace(facts, admin=admin.url, status=status, advertise_host=host)
+    addresses = tuple(await resolve(host)) if host else ()
+    facts = replace(
+        facts,
+        admin=admin.url,
+        status=status,
+        advertise_host=host,
+        advertised_addresses=addresses,
+    )
+    if status.domains:
+        heard = await _survey(status)
+        status = await asyncio.to_thread(admin.status)  # who has started meanwhile is known now
+        facts = replace(facts, heard=heard, status=status)
     address = master.address if master.pinned else None
-    beyond = asyncio.create_task(_look_beyond(facts, master.uri, address))
+    uri = master.uri if status.settings.for_ros1 else ""
+    beyond = asyncio.create_task(_look_beyond(facts, uri, address))
     probe, reason = None, ""
     try:
         probe = await asyncio.to_thread(admin.probe)
     except AdminError as error:
         reason = str(error)
-    return replace(await beyond, probe=probe, probe_error=reason)
+    return replace(await beyond, probe=probe, probe_error=reason, all_here=_all_here(status))
 
 
-async def _look_beyond(facts: DoctorFacts, uri: str, address: str | None = None) -> DoctorFacts:
+def _all_here(status: ProxyStatus) -> bool:
+    """Whether a proxy for ROS 2 alone has nobody outside but peers on loopback."""
+    told = [peer for domain in status.domains for peer in domain.peers]
+    peers = [where.host if (where := parse_host_port(peer)) else peer for peer in told]
+    ears = [domain.ear for domain in status.domains if domain.ear]
+    return not status.settings.for_ros1 and not ears and all(map(is_loopback, peers))
+
+
+async def collect_running(
+    status: ProxyStatus, admin: str, choose: Callable[[SystemState], tuple[str, ...]]
+) -> DoctorFacts:
+    """What may be asked again and again: the master, all nodes, and those that have the names.
+
+    ``choose`` tells the names from what the master knows. Nobody is asked to try the range, and few
+    are asked at once. Nodes say, too, how much they have counted (``getBusStats``).
+    """
+    host, master = status.settings.advertise_host, status.master
+    facts = DoctorFacts(
+        admin=admin,
+        status=status,
+        advertise_host=host,
+        advertised_addresses=tuple(await resolve(host)),
+    )
+    uri = master.uri if status.settings.for_ros1 else ""
+    return await _look_beyond(facts, uri, master.address if master.pinned else None, choose)
+
+
+async def look_at_master(uri: str, name: str, address: str | None) -> MasterFacts:
+    """The master, asked in the name of a proxy; at an IP address if one is given."""
+    client = MasterClient(uri, name, Metrics(), address)
+    try:
+        return await _Collector(client, client).master()
+    finally:
+        await client.close()
+
+
+async def _survey(status: ProxyStatus) -> tuple[HeardParticipant, ...]:
+    """Who is on the networks inside, each participant once."""
+    domains = [domain.domain for domain in status.domains]
+    networks = status.settings.inside_networks
+    asked = (asyncio.to_thread(ask_participants, network, domains) for network in networks)
+    found = {one.guid_prefix: one for answers in await asyncio.gather(*asked) for one in answers}
+    return tuple(found.values())
+
+
+async def _look_beyond(
+    facts: DoctorFacts,
+    uri: str,
+    address: str | None = None,
+    choose: Callable[[SystemState], tuple[str, ...]] | None = None,
+) -> DoctorFacts:
     """What the master and the nodes say.
 
     The master is asked in the proxy's name, so that a proxy that is its own master shows itself;
@@ -100,7 +169,7 @@ async def _look_beyond(facts: DoctorFacts, uri: str, address: str | None = None)
         MasterClient(uri, name, Metrics(), address) for name in (facts.proxy.instance, "doctor")
     )
     try:
-        collector = _Collector(master, nodes)
+        collector = _Collector(master, nodes, choose)
         published = await collector.published_master(facts)
         facts = replace(facts, master=await collector.master(), published_master=published)
         if facts.master and facts.master.attempt.reach is Reach.ANSWERED:
@@ -114,9 +183,14 @@ async def _look_beyond(facts: DoctorFacts, uri: str, address: str | None = None)
 class _Collector:
     """Questions to the master and to nodes, a bounded number at once."""
 
-    def __init__(self, master: MasterClient, nodes: MasterClient) -> None:
-        self._master, self._nodes = master, nodes
-        self._limit = asyncio.Semaphore(PARALLEL)
+    def __init__(
+        self,
+        master: MasterClient,
+        nodes: MasterClient,
+        choose: Callable[[SystemState], tuple[str, ...]] | None = None,
+    ) -> None:
+        self._master, self._nodes, self._choose = master, nodes, choose
+        self._limit = asyncio.Semaphore(FEW_PARALLEL if choose else PARALLEL)
 
     async def master(self) -> MasterFacts:
         """Look at the master: its name, its answer, its path, and whether it is the proxy."""
@@ -155,6 +229,8 @@ class _Collector:
         tried = facts.scope.nodes if facts.names else names
         nodes |= await _gather(tried, lambda name: self._try_node(facts, nodes[name]))
         facts = replace(facts, nodes=nodes)
+        if self._choose:
+            facts = replace(facts, names=self._choose(graph))
         return await self._examine_named(facts) if facts.names else facts
 
     async def _examine_named(self, facts: DoctorFacts) -> DoctorFacts:
@@ -178,10 +254,21 @@ class _Collector:
         return said in ("1", "true", 1)
 
     async def _try_node(self, facts: DoctorFacts, node: NodeFacts) -> NodeFacts:
-        """Try a node at its address; one behind this proxy is the proxy's to judge."""
+        """Try a node at its address; one behind this proxy is the proxy's to judge.
+
+        One at a port of this proxy's which nobody here holds may be behind another proxy that
+        advertises the same: it is tried there, and where it says that it is inside.
+        """
         where = node.where
-        if where is None or facts.ours(where):
+        if where is None or facts.lease(where):
             return node
+        if facts.ours(where):
+            inside = parse_inside_path(node.uri)
+            places = [where, *([inside.slave] if inside else [])]
+            async with self._limit:
+                tries = [await self._ask_pid(place) for place in places]
+            found = next((one for one in tries if one.reach is Reach.ANSWERED), None)
+            return replace(node, attempt=found) if found else node
         async with self._limit:
             addresses = tuple(await resolve(self._nodes.reach(where).host))
             attempt = await self._ask_pid(where) if addresses else Attempt(Reach.UNRESOLVABLE)
@@ -201,10 +288,13 @@ class _Collector:
         methods = ("getPublications", "getSubscriptions", "getBusInfo")
         try:
             async with self._limit:
-                said = [await ask(where, WITHIN, method) for method in methods]
+                topics, wanted, bus = [await ask(where, WITHIN, method) for method in methods]
+                at = time.monotonic()
+                # Not every library counts; who does not is asked for nothing else.
+                _, stats = await _tried(ask(where, WITHIN, "getBusStats"))
         except (Unreachable, MasterError):
             return node
-        return replace(node, report=slave_report(*said))
+        return replace(node, report=slave_report(topics, wanted, bus, stats, at))
 
     async def _try_data_port(
         self, facts: DoctorFacts, publisher: str, topic: str

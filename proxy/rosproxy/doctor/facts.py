@@ -61,25 +61,64 @@ class SlaveReport(msgspec.Struct, frozen=True):
     """What a node says of itself: topics with types, and its connections.
 
     ``peers`` are (direction, topic, peer) of open connections, the direction ``i`` or ``o``; the
-    peer of an outgoing one is a node's name, of an incoming one a slave URI.
+    peer of an outgoing one is a node's name, of an incoming one a slave URI. ``counts`` are the
+    bytes and messages of those for which the node counts them, ``at`` (monotonic seconds).
     """
 
     publishes: Mapping[str, str] = {}
     subscribes: Mapping[str, str] = {}
     peers: frozenset[tuple[str, str, str]] = frozenset()
+    counts: Mapping[tuple[str, str, str], tuple[int, int]] = {}
+    at: float = 0.0
 
 
-def slave_report(publications: Any, subscriptions: Any, bus: Any) -> SlaveReport:
-    """The replies to ``getPublications``, ``getSubscriptions`` and ``getBusInfo``.
+def slave_report(
+    publications: Any, subscriptions: Any, bus: Any, stats: Any = None, at: float = 0.0
+) -> SlaveReport:
+    """The replies to ``getPublications``, ``getSubscriptions``, ``getBusInfo``, ``getBusStats``.
 
-    A row of the last is ``[id, peer, direction, transport, topic, connected, ...]``.
+    A row of ``getBusInfo`` is ``[id, peer, direction, transport, topic, connected, ...]``; booleans
+    of XML-RPC are read as their text.
     """
-    rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5 and row[5]]
+    rows = [row for row in _items(bus) if isinstance(row, list) and len(row) > 5]
+    rows = [row for row in rows if row[5] not in (0, "0")]
+    counted = _bus_counts(stats)
+    links = {(str(row[2]), str(row[4]), str(row[1])): row[0] for row in rows}
+    counts = {
+        link: counted[link[:2]][number]
+        for link, number in links.items()
+        if isinstance(number, int) and number in counted.get(link[:2], {})
+    }
     return SlaveReport(
-        read_types(publications),
-        read_types(subscriptions),
-        frozenset((str(row[2]), str(row[4]), str(row[1])) for row in rows),
+        read_types(publications), read_types(subscriptions), frozenset(links), counts, at
     )
+
+
+def _bus_counts(stats: Any) -> dict[tuple[str, str], dict[int, tuple[int, int]]]:
+    """Bytes and messages in ``getBusStats``, by direction and topic, then by connection.
+
+    The second list is of subscriptions: ``[id, bytes, messages, drops, ...]`` each. In that of
+    publications rospy has ``[id, bytes, messages, connected]``, roscpp ``[id, bytes, bytes of
+    messages, messages, connected]`` (``Publication::getStats``).
+    """
+    found: dict[tuple[str, str], dict[int, tuple[int, int]]] = {}
+    for direction, rows in zip("oi", _items(stats)[:2], strict=False):
+        for row in _items(rows):
+            match row:
+                case [str(topic), *_, list(connections)]:
+                    counts = found.setdefault((direction, topic), {})
+                    counts.update(filter(None, (_counts(one, direction) for one in connections)))
+    return found
+
+
+def _counts(row: Any, direction: str) -> tuple[int, tuple[int, int]] | None:
+    """The number of a connection, with its bytes and messages."""
+    match row:
+        case [int(number), int(size), _, int(messages), _] if direction == "o":
+            return number, (size, messages)
+        case [int(number), int(size), int(messages), *_]:
+            return number, (size, messages)
+    return None
 
 
 def data_port(answer: Any) -> HostPort | None:
@@ -169,10 +208,11 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
     what they have in common, topics their publishers and subscribers. A name that is both a
     node's and a topic's means the topic.
     """
-    topics = [name for name in names if name in graph.topics]
-    nodes = [name for name in names if name in graph.names() and name not in topics]
+    all_topics, all_nodes = graph.topics, graph.names()
+    topics = [name for name in names if name in all_topics]
+    nodes = [name for name in names if name in all_nodes and name not in all_topics]
     services = [name for name in names if name in graph.services]
-    candidates = sorted(topics or (graph.topics - {"/rosout"} if nodes else ()))
+    candidates = sorted(topics or (all_topics - {"/rosout"} if nodes else ()))
     pairs = [
         (topic, publisher, subscriber)
         for topic in candidates
@@ -186,7 +226,8 @@ def scope(graph: SystemState, names: Sequence[str]) -> Scope:
         if not (graph.publishers.get(topic) and graph.subscribers.get(topic))
         and (topics or {*nodes} & {*graph.sides(topic)})
     ]
-    unknown = [name for name in names if name not in {*nodes, *topics, *services}]
+    known = {*nodes, *topics, *services}
+    unknown = [name for name in names if name not in known]
     asked = {*nodes, *(node for name in services for node in graph.services[name])}
     sides = {node for _, *both in pairs for node in both}
     sides |= {node for topic in topics for node in graph.sides(topic)}
@@ -198,6 +239,15 @@ def _asked_for(pair: set[str], nodes: set[str]) -> bool:
     return pair <= nodes if len(nodes) > 1 else nodes <= pair
 
 
+class HeardParticipant(msgspec.Struct, frozen=True):
+    """A participant of ROS 2 on a network inside that has answered when it was asked."""
+
+    domain: int
+    guid_prefix: str
+    address: str
+    vendor: str
+
+
 class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     """Everything gathered.
 
@@ -206,7 +256,8 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     to here. ``service_uris`` are the master's, by service. ``clock``: nodes are told to use
     simulated time. ``names`` are the nodes, topics and services that the user asked for;
     ``data_ports`` tells, by publisher and topic, where its subscribers have to connect to and
-    whether that was reached from here.
+    whether that was reached from here. ``heard`` are participants on the networks inside.
+    ``all_here``: of ROS 2 everybody outside is on this machine.
     """
 
     admin: str = ""
@@ -225,6 +276,8 @@ class DoctorFacts(msgspec.Struct, frozen=True, dict=True):
     clock: bool = False
     names: tuple[str, ...] = ()
     data_ports: Mapping[tuple[str, str], tuple[str, Attempt]] = {}
+    heard: tuple[HeardParticipant, ...] = ()
+    all_here: bool = False
 
     @property
     def proxy(self) -> ProxyStatus:

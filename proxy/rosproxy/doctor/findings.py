@@ -1,12 +1,11 @@
-"""Findings: what ``rosproxy doctor`` says, as text and as JSON."""
+"""What ``rosproxy doctor`` has found, as text and as JSON."""
 
 from collections.abc import Iterator, Sequence
-from enum import IntEnum
-from functools import partial
 from typing import Any
 
 import msgspec
 
+from rosproxy.admin.findings import DoctorFinding, Severity, failed
 from rosproxy.telemetry.text import clean, plural, wrap
 
 MOST_ALIKE = 10
@@ -14,41 +13,12 @@ MOST_ALIKE = 10
 INDENT = " " * 9
 
 
-class Severity(IntEnum):
-    """How bad it is: an error keeps somebody from hearing somebody."""
-
-    OK = 0
-    INFO = 1
-    WARNING = 2
-    ERROR = 3
-
-
-class DoctorFinding(msgspec.Struct, frozen=True):
-    """One result: of which ``check``, about which ``subject``, what, and what mends it."""
-
-    severity: Severity
-    check: str
-    subject: str
-    text: str
-    fix: str = ""
-
-
-ok = partial(DoctorFinding, Severity.OK)
-note = partial(DoctorFinding, Severity.INFO)
-warning = partial(DoctorFinding, Severity.WARNING)
-error = partial(DoctorFinding, Severity.ERROR)
-
 _WORDS = {
     Severity.OK: "ok",
     Severity.INFO: "note",
     Severity.WARNING: "WARNING",
     Severity.ERROR: "ERROR",
 }
-
-
-def failed(findings: Sequence[DoctorFinding]) -> bool:
-    """Whether anything is wrong."""
-    return any(finding.severity is Severity.ERROR for finding in findings)
 
 
 def as_json(findings: Sequence[DoctorFinding]) -> dict[str, Any]:
@@ -85,4 +55,9 @@ def _summary(findings: Sequence[DoctorFinding]) -> str:
     errors, warnings = severities.count(Severity.ERROR), severities.count(Severity.WARNING)
     if not errors and not warnings:
         return "Nothing wrong was found."
-    return f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
+    told = f"{plural(errors, 'error')}, {plural(warnings, 'warning')}."
+    worst = [one for one in findings if one.severity is max(severities)]
+    if len({one.fix for one in findings if one.severity >= Severity.WARNING}) == 1:
+        return told
+    first = clean(worst[0].subject or worst[0].check)
+    return f"{told} Begin with {first}: the others may follow from it."

@@ -28,6 +28,8 @@ def bind(address: str, port: int) -> socket.socket:
     sock = _socket(address)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        if sock.family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((address, port))
     except OSError:
         sock.close()

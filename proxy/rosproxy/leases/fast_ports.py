@@ -5,14 +5,24 @@ memory gives every recovered endpoint the port that its subscribers are connecte
 is only an acceleration: it is given back before a node is refused a lease.
 """
 
+from collections import ChainMap
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Protocol, TypeVar
+from itertools import chain
+from typing import Protocol, TypeVar, cast
 
 from rosproxy.leases.ports import PortPool, PortRange
 
 
 class Holder(Protocol):
-    """An endpoint as its ports and the kernel plane need it; `rosproxy.ros1.registry` has them."""
+    """Who has a port that the kernel may forward, as the kernel plane needs it.
+
+    An endpoint or stand-in of ROS 1 (`rosproxy.ros1.registry`), or a lease of ROS 2
+    (`rosproxy.ros2.discovery.data_leases`), whose only port is its fast port as well.
+
+    ``inside`` tells on which side its node is: who connects to it comes from the other one.
+    """
+
+    inside: bool
 
     fast_port: int | None
     fast_peers: Mapping[str, int]
@@ -35,8 +45,8 @@ class Holder(Protocol):
         """The IP address at which the proxy reaches the node."""
 
     @property
-    def tcpros_ports(self) -> Collection[int]:
-        """The TCPROS ports that the node itself has named."""
+    def node_ports(self) -> Collection[int]:
+        """The ports that the node itself has named: those of TCPROS, or that of a locator."""
 
     @property
     def trusted(self) -> bool:
@@ -68,6 +78,28 @@ class Holders(Protocol[_H_co]):
 
     def __iter__(self) -> Iterator[_H_co]:
         """All endpoints; safe against changes while iterating."""
+
+
+class BothSides:
+    """The endpoints inside and the stand-ins for nodes outside, which share no port."""
+
+    def __init__(self, inside: Holders[Holder], outside: Mapping[int, Holder]) -> None:
+        self._inside, self._outside = inside, outside
+
+    @property
+    def by_port(self) -> Mapping[int, Holder]:
+        """All by their leases, or the ports that stand in for them."""
+        views = (self._inside.by_port, self._outside)
+        return ChainMap(*(cast(dict[int, Holder], view) for view in views))  # it is only read
+
+    @property
+    def pool(self) -> PortPool:
+        """The ports of the range, which are for the endpoints inside."""
+        return self._inside.pool
+
+    def __iter__(self) -> Iterator[Holder]:
+        """All; safe against changes while iterating."""
+        return chain(self._inside, list(self._outside.values()))
 
 
 def partner(ports: PortRange, port: int) -> int | None:
@@ -119,7 +151,7 @@ def why_none(pool: PortPool, endpoint: Holder) -> str:
     if port is None:
         return f"no port of the range goes with port {endpoint.port}"
     if pool.is_free(port):
-        return "nobody outside has asked for a topic of it lately"
+        return "nobody has asked for a topic of it lately"
     return f"port {port}, which goes with its port {endpoint.port}, is in use"
 
 

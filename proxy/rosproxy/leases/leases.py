@@ -1,9 +1,10 @@
-"""Who listens: the ports of the range, bound from the start and listening only while leased.
+"""Who listens: the ports of the range, reserved from the start and listening only while leased.
 
 Each endpoint holds a *lease*, one port of the range, and maybe a *fast port* for its topics, which
 the kernel forwards where it may (`fast_ports`). Both listen and are served alike. All ports are
-bound at the start: that keeps the kernel from giving one of them to an outgoing connection, and
-tells which are taken. A bound port that does not listen refuses.
+reserved at the start (`rosproxy.net.sockets.reserve`): that keeps the kernel from giving one of
+them to an outgoing connection and other programs from binding it, and tells which are taken. A
+reserved port refuses.
 
 What an endpoint is, who serves it and how the kernel forwards is left to the protocols below.
 """
@@ -17,7 +18,7 @@ from typing import Generic, Protocol, TypeVar
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import Holder, Holders
 from rosproxy.net.gate import Gate
-from rosproxy.net.sockets import BACKLOG, Acceptor, Handler, bind
+from rosproxy.net.sockets import Acceptor, Handler, listen_on, reserve
 from rosproxy.net.tasks import Tasks
 from rosproxy.telemetry.problems import Problems
 
@@ -89,10 +90,11 @@ class Leases(Generic[_H]):
         gate: Gate,
     ) -> None:
         self._gate = gate
-        self._holders, self._address, self._kernel, self._watch = holders, address, kernel, watch
+        self._holders, self._address, self._kernel, self.watch = holders, address, kernel, watch
         self._tasks, self._problems = tasks, problems
         self._reserved: dict[int, socket.socket] = {}
         self._acceptors: dict[int, Acceptor] = {}
+        self._lent: set[int] = set()
         self._closed = False
 
     def reserve_range(self) -> list[int]:
@@ -156,8 +158,11 @@ class Leases(Generic[_H]):
             sock.close()
         self._reserved.clear()
 
-    def give_up_fast_port(self) -> bool:
-        """Take the fast port back that is needed least, if there is one."""
+    def give_up_spare(self) -> bool:
+        """Take a port back that no node needs, if there is one: a lent one, or a fast port."""
+        if self._lent:
+            self._take_back(next(iter(self._lent)))
+            return True
         return self._give_fast_port_back() is not None
 
     def take_fast_port(self, endpoint: _H) -> None:
@@ -166,7 +171,7 @@ class Leases(Generic[_H]):
         self._refuse(port)
         fast_ports.give_back(self._holders.pool, endpoint)
         self._kernel.note_change(endpoint)
-        self._watch([endpoint])
+        self.watch([endpoint])
 
     def end_idle(self) -> bool:
         """End the lease that is needed least, if nobody needs it."""
@@ -193,34 +198,48 @@ class Leases(Generic[_H]):
         return None
 
     @asynccontextmanager
-    async def lent(self, order: Iterable[int], handler: Handler) -> AsyncIterator[int | None]:
+    async def lent(
+        self, order: Iterable[int], handler: Handler, or_fast: bool
+    ) -> AsyncIterator[int | None]:
         """A port that no node needs meanwhile, on which a handler serves; None if there is none.
 
-        It is the first in an order that is free, else a fast port: whose that was gets it again
-        when a subscriber next asks. Raises OSError if another program took it meanwhile.
+        It is the first in an order that is free, ``or_fast`` else a fast port: whose that was gets
+        it again when a subscriber next asks. It is taken back where a node needs it (`is_lent`).
+        Raises OSError if another program took it meanwhile.
         """
         pool = self._holders.pool
         port = next(filter(pool.claim, order), None)
-        if port is None:
+        if port is None and or_fast:
             spare = self._give_fast_port_back()
             port = spare if spare is not None and pool.claim(spare) else None
         if port is None:
             yield None
             return
+        self._lent.add(port)
         try:
             await self._kernel.cleared(port)
-            self._accept(port, handler)
+            if port in self._lent:
+                self._accept(port, handler)
             yield port
         finally:
+            self._take_back(port)
+
+    def is_lent(self, port: int) -> bool:
+        """Whether a port that was lent still is."""
+        return port in self._lent
+
+    def _take_back(self, port: int) -> None:
+        if port in self._lent:
+            self._lent.remove(port)
             self._refuse(port)
-            pool.give_back(port)
+            self._holders.pool.give_back(port)
 
     def _reserve(self, port: int) -> bool:
         """Bind a port, which then refuses; False if another program holds it, or all is over."""
         if self._closed:
             return False
         try:
-            self._reserved[port] = bind(self._address, port)
+            self._reserved[port] = reserve(self._address, port)
         except OSError as error:
             log.debug("port %d can't be reserved: %s", port, error)
             return False
@@ -228,9 +247,9 @@ class Leases(Generic[_H]):
 
     def _accept(self, port: int, handler: Handler) -> None:
         """Let a port listen. Raises OSError if another program took it meanwhile."""
-        sock = self._reserved.pop(port, None) or bind(self._address, port)
+        sock = self._reserved.pop(port, None) or reserve(self._address, port)
         try:
-            sock.listen(BACKLOG)
+            listen_on(sock)
         except OSError:
             sock.close()
             raise

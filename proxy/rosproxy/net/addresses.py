@@ -72,6 +72,12 @@ def is_loopback(host: str) -> bool:
     return f".{host}".lower().endswith(".localhost")
 
 
+def is_of_link(host: str) -> bool:
+    """Whether a host is an IPv6 address that means something on its own link alone."""
+    parsed = as_ip(host)
+    return parsed is not None and parsed.version == 6 and parsed.is_link_local
+
+
 @cached
 def plain_address(address: str) -> str:
     """An IP address without an IPv4-in-IPv6 prefix (``::ffff:``) and without a zone."""

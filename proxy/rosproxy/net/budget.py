@@ -16,14 +16,14 @@ class Budget:
     """At most ``most`` at once, of which a source has at most ``share``; ``what`` names it."""
 
     def __init__(self, most: int, share: int, what: str) -> None:
-        self._most, self._share, self._what = most, share, what
+        self.most, self._share, self._what = most, share, what
         self._held: dict[str, int] = {}
         self.used = 0
 
     def take(self, source: str, size: int) -> None:
         """Take so much for a source. Raises OverBudget, and takes nothing."""
-        if self.used + size > self._most:
-            raise OverBudget(f"more than {self._most} {self._what} at once; try again")
+        if self.used + size > self.most:
+            raise OverBudget(f"more than {self.most} {self._what} at once; try again")
         held = self._held.get(source, 0) + size
         if held > self._share:
             raise OverBudget(f"more than {self._share} {self._what} at once from {source}")

@@ -1,5 +1,6 @@
 """What the operating system knows of addresses: routes and interfaces."""
 
+import errno
 import socket
 from ipaddress import ip_address, ip_network
 from pathlib import Path
@@ -19,6 +20,21 @@ def address_towards(address: str) -> str:
         except OSError:
             return "::1" if family == socket.AF_INET6 else "127.0.0.1"
         return plain_address(probe.getsockname()[0])
+
+
+def address_into(network: Network) -> str:
+    """The address of this machine that connections into a network come from."""
+    return address_towards(str(network[min(1, network.num_addresses - 1)]))
+
+
+def interface_index(address: str) -> int:
+    """The index of the interface that has an own address of IPv6. Raises OSError if none has it."""
+    packed = socket.inet_pton(socket.AF_INET6, address).hex()
+    for line in _lines("/proc/net/if_inet6"):
+        digits, index, *_ = line.split()
+        if digits == packed:
+            return int(index, 16)
+    raise OSError(errno.ENODEV, f"no interface has the address {address}")
 
 
 def is_own(address: str) -> bool:

@@ -1,7 +1,8 @@
 """TCP sockets: bound, listening, accepted, connected, looked into and closed.
 
-Everything here is non-blocking and belongs to one event loop. A bound socket that does not listen
-refuses connections and keeps its port from everybody else; `leases` builds on that.
+Everything here is non-blocking and belongs to one event loop. A reserved socket refuses connections
+and keeps its port from everybody else until it listens (`reserve`, `listen_on`); `leases` builds on
+that.
 """
 
 import asyncio
@@ -19,7 +20,8 @@ from rosproxy.net.tasks import Tasks
 
 log = logging.getLogger(__name__)
 
-BACKLOG = 256
+BACKLOG = 1024
+"""Connections that wait to be accepted: the client of one more waits a second and tries again."""
 ACCEPTS_PER_TURN = 64
 CONNECT_TIMEOUT = 5.0
 """Seconds that a peer has to accept a connection."""
@@ -36,7 +38,7 @@ _LINGER_RESET = struct.pack("ii", 1, 0)
 
 def bind(address: str, port: int) -> socket.socket:
     """A bound, non-blocking TCP socket that does not listen yet. Raises OSError."""
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    family = _family(address)
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -48,6 +50,35 @@ def bind(address: str, port: int) -> socket.socket:
         raise
     sock.setblocking(False)
     return sock
+
+
+def reserve(address: str, port: int) -> socket.socket:
+    """A bound socket that refuses connections, and whose port nobody else can bind. Raises OSError.
+
+    Merely bound it would not keep others out: SO_REUSEADDR, without which a port can't be bound
+    while connections of a former process linger, lets any number bind that don't listen. It counts
+    at that moment only, for either side; so it is taken off once the port is had. Linux looks again
+    who has a port when a socket listens; after ``shutdown`` that socket listens no more and is
+    still bound.
+    """
+    sock = bind(address, port)
+    try:
+        sock.listen(1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 0)
+        sock.shutdown(socket.SHUT_RDWR)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def listen_on(sock: socket.socket) -> None:
+    """Let a reserved socket listen. Raises OSError.
+
+    Its connections are to keep nobody from binding the port later, so they get SO_REUSEADDR.
+    """
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    sock.listen(BACKLOG)
 
 
 def listen(address: str, port: int) -> socket.socket:
@@ -129,10 +160,25 @@ def _leave(gate: Gate, source: str, port: int, _: asyncio.Task[None]) -> None:
     gate.leave(source, port)
 
 
+def begin_to_dial(where: HostPort) -> socket.socket:
+    """A non-blocking connection to an IP address and port, under way. Raises OSError.
+
+    What is sent before it is made raises BlockingIOError, or what has become of it.
+    """
+    sock = socket.socket(_family(where.host), socket.SOCK_STREAM)
+    sock.setblocking(False)
+    try:
+        with contextlib.suppress(BlockingIOError):
+            sock.connect((where.host, where.port))
+    except BaseException:
+        sock.close()
+        raise
+    return sock
+
+
 async def dial(where: HostPort, within: float = CONNECT_TIMEOUT) -> socket.socket:
     """A non-blocking connection to an IP address and port. Raises OSError, TimeoutError."""
-    family = socket.AF_INET6 if ":" in where.host else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_STREAM)
+    sock = socket.socket(_family(where.host), socket.SOCK_STREAM)
     sock.setblocking(False)
     try:
         async with asyncio.timeout(within):
@@ -169,6 +215,16 @@ async def read_exactly(conn: socket.socket, size: int) -> bytes:
     return b"".join(parts)
 
 
+def has_ended(conn: socket.socket) -> bool:
+    """Whether the peer of a non-blocking connection has closed it and nothing is left to read."""
+    try:
+        return not conn.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
 def reset_on_close(sock: socket.socket) -> None:
     """Make closing a socket send a reset instead of an orderly end."""
     with contextlib.suppress(OSError):
@@ -189,6 +245,10 @@ def end_if_stalled(sock: socket.socket, after: float = WRITE_TIMEOUT) -> None:
     """
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(after * 1000))
+
+
+def _family(address: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in address else socket.AF_INET
 
 
 async def _readable(conn: socket.socket) -> None:

@@ -4,28 +4,23 @@ Made once, before the parts; none of them keeps a copy of what is in it.
 """
 
 import asyncio
-import time
-import uuid
+from collections.abc import Sequence
+from ipaddress import IPv4Network, IPv6Network, collapse_addresses, ip_network
 
-from rosproxy.access.access_policy import AccessPolicy
-from rosproxy.net.addresses import is_inside
+from rosproxy.net.addresses import Network, is_inside
 from rosproxy.net.budget import Budget
 from rosproxy.net.gate import Gate
 from rosproxy.net.interfaces import address_towards, interface_networks
-from rosproxy.net.tasks import Tasks
 from rosproxy.ros1.clients.master import MasterClient
 from rosproxy.ros1.clients.node import NodeClient
-from rosproxy.ros1.protocol.master_methods import KNOWN_METHODS
 from rosproxy.ros1.protocol.xmlrpc import limits
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.selection import Standing, standing
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.settings import MEBIBYTE, Settings
-from rosproxy.telemetry.metrics import Metrics
-from rosproxy.telemetry.problems import Problems
-from rosproxy.telemetry.refusals import Refusals
+from rosproxy.runtime import Runtime
+from rosproxy.settings import MEBIBYTE
 
 REGISTRATION_GRACE = 0.5
 """Seconds that a publisherUpdate waits at most for a registration of the same node."""
@@ -35,28 +30,28 @@ MANY_VALUES = 100
 """Values from which on a document is large; registrations have six."""
 MOST_PASSING = 256
 """Calls and replies that pass unread at once; each takes a thread of the master's."""
+MOST_STANDINGS = 4096
+"""Addresses whose standing is remembered."""
 PASSING_SHARE = 64
 """Those of them from one source."""
 
 
 class Context:
-    """The state and the tools of one proxy that is about to start; needs a running event loop.
+    """The state and the tools of ROS 1 in a proxy that is about to start.
 
     ``retired``: nothing is registered any more, neither for nodes nor by the proxy itself.
-    ``selected``: the addresses that may use the proxy as their master; None: no operator has told.
     ``lease_call`` and ``master_call`` bound what is read of a call from outside and from inside.
     ``gate`` counts connections, ``buffered`` the bytes of requests and replies in memory,
     ``passing`` the calls that pass unread; ``refusals`` tells what is over these and other bounds.
     ``policy``: what outside may see and do.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings, self.instance = settings, uuid.uuid4().hex
-        self.metrics, self.tasks, self.problems = Metrics(KNOWN_METHODS), Tasks(), Problems()
-        self.refusals = Refusals(self.metrics, self.problems, self.now)
-        self.policy = AccessPolicy(
-            settings.policy, settings.policy_layers, self.metrics, self.refusals
-        )
+    def __init__(self, runtime: Runtime) -> None:
+        self.settings = settings = runtime.settings
+        self.instance, self._runtime = runtime.instance, runtime
+        self.metrics, self.tasks = runtime.metrics, runtime.tasks
+        self.problems, self.refusals = runtime.problems, runtime.refusals
+        self.policy = runtime.policy
         self.gate = Gate(
             settings.max_connections_per_source,
             settings.max_connections_per_lease,
@@ -82,13 +77,16 @@ class Context:
         )
         self.nodes = NodeClient(self.upstream, settings.probe_timeout)
         self.retired = False
-        self.selected: frozenset[str] | None = None
+        self._selected: frozenset[str] | None = None
         self._towards: dict[str, str] = {}
+        self._standings: dict[str, Standing] = {}
+        """Of addresses that have called since networks and selection were taken in."""
+        self._near: list[Network] | None = None
         self.read_networks()
 
     def now(self) -> float:
         """Seconds of the monotonic clock."""
-        return time.monotonic()
+        return self._runtime.now()
 
     async def take_turn(self) -> None:
         """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.
@@ -99,9 +97,37 @@ class Context:
         async with self._turn:
             await asyncio.sleep(0)
 
+    @property
+    def selected(self) -> frozenset[str] | None:
+        """The addresses that may use the proxy as their master; None: no operator has told."""
+        return self._selected
+
+    @selected.setter
+    def selected(self, addresses: frozenset[str]) -> None:
+        self._selected = addresses
+        self._standings.clear()
+        self._near = None
+
     def standing(self, address: str) -> Standing:
         """Whether an address may use the proxy as its master, as far as is known now."""
-        return standing(address, self.addressing.networks, self.selected)
+        known = self._standings.get(address)
+        if known is None:
+            if len(self._standings) >= MOST_STANDINGS:
+                self._standings.clear()
+            known = standing(address, self.addressing.networks, self.selected)
+            self._standings[address] = known
+        return known
+
+    def near(self) -> Sequence[Network]:
+        """Who may use the proxy as its master, as networks none of which overlaps another."""
+        if self._near is None:
+            found = self.addressing.networks
+            if self.selected is not None:
+                found = [ip_network(address) for address in self.selected]
+            ipv4 = collapse_addresses(one for one in found if isinstance(one, IPv4Network))
+            ipv6 = collapse_addresses(one for one in found if isinstance(one, IPv6Network))
+            self._near = [*ipv4, *ipv6]
+        return self._near
 
     async def after_registration(self, endpoint: Endpoint) -> None:
         """Let the reply to a registration that is under way reach a node first.
@@ -126,6 +152,8 @@ class Context:
     def read_networks(self) -> None:
         """The same at once."""
         self._towards.clear()
+        self._standings.clear()
+        self._near = None
         self._networks_read = self.now()
         given, both = self.settings.inside_networks, self.stand_ins.both
         self.addressing.networks = given or interface_networks(without_uplink=both)

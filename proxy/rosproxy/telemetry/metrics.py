@@ -1,15 +1,41 @@
-"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.status`."""
+"""Prometheus metrics: the counters that the proxy keeps; its state is in `admin.status`.
+
+Counters of few outcomes begin with 0: Prometheus sees no increase in a series that begins with 1,
+and no alert would tell of what happened once.
+"""
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, Info, ProcessCollector
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Info,
+    ProcessCollector,
+    disable_created_metrics,
+)
 
 from rosproxy import __version__
 
+# A second series for each counter: when it began, which nobody asks for.
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
 MOST_NAMES = 1000
-"""Topics and services with byte counters of their own; the bytes of all others are summed up."""
+"""Topics and services with byte counters of their own; the bytes of all others are summed up.
+
+Nodes that are down, by name, likewise.
+"""
+BOUNDS = (
+    *("long_body", "slow_body", "compressed", "over_budget", "long_name", "too_many_names"),
+    *("connections_per_source", "connections_per_lease", "silent_connections"),
+    *("malformed", "participants", "rate", "stand_ins"),
+)
+"""Reasons of refusals (docs/reference/limits.md) that a system that behaves does not meet."""
+RELAY_ERRORS = ("bad header", "denied", "node unreachable")
+STRANGERS = ("outside", "unselected")
 
 
 class Traffic:
@@ -36,6 +62,23 @@ class Traffic:
         for direction, sums in (("outward", self.sent), ("inward", self.received)):
             for key, size in sums.items():
                 yield [*key, direction], size
+
+
+class NamedNodes:
+    """Numbers of nodes by name, of which only the first MOST_NAMES are kept apart."""
+
+    def __init__(self) -> None:
+        self._known: set[str] = set()
+
+    def tally(self, names: Iterable[str]) -> Mapping[str, int]:
+        """How often each name is there."""
+        found: dict[str, int] = {}
+        for name in names:
+            if len(self._known) < MOST_NAMES:
+                self._known.add(name)
+            key = name if name in self._known else "other"
+            found[key] = found.get(key, 0) + 1
+        return found
 
 
 class Metrics:
@@ -70,6 +113,15 @@ class Metrics:
         self.policy_denied = counter("policy_denied", denied, "kind", "mode")
         strangers = "Calls refused for the address that they came from, by what that is."
         self.strangers = counter("strangers", strangers, "standing")
+        for family, values in (
+            (self.relay_errors, RELAY_ERRORS),
+            (self.refused, BOUNDS),
+            (self.strangers, STRANGERS),
+        ):
+            for value in values:
+                family.labels(value)
+        faults = "What the proxy finds wrong with its own setting-up: address, range."
+        self.setup_faults = Gauge("rosproxy_setup_faults", faults, registry=self.registry)
         self.master_round_trip = Histogram(
             "rosproxy_master_round_trip_seconds",
             "Time for a call of the proxy's own to the master.",

@@ -1,8 +1,8 @@
 """What the proxy has refused because it was over a bound: counted, logged, and shown in the status.
 
 A metric counts every refusal by its reason, a word of those in docs/reference/limits.md. The log
-gets one line for each reason and source, then none for a while; `rosproxy status` shows the last
-one of each reason.
+gets one line for each reason and source, then none for a while, and so many for each reason;
+`rosproxy status` shows the last one of each reason.
 """
 
 import logging
@@ -15,6 +15,8 @@ log = logging.getLogger(__name__)
 
 QUIET = 60.0
 """Seconds in which a source is not logged again for the same reason."""
+LINES = 20
+"""Sources that are logged in that time for one reason: sources of datagrams may be forged."""
 MOST = 1000
 """Sources and reasons that are remembered for that."""
 
@@ -25,6 +27,7 @@ class Refusals:
     def __init__(self, metrics: Metrics, problems: Problems, now: Callable[[], float]) -> None:
         self._metrics, self._problems, self._now = metrics, problems, now
         self._told: dict[tuple[str, str], float] = {}
+        self._lines: dict[str, tuple[float, int]] = {}
 
     def note(self, reason: str, source: str, text: str) -> None:
         """Tell that something from a source was refused, and why."""
@@ -32,6 +35,12 @@ class Refusals:
         now, key = self._now(), (reason, source)
         if now - self._told.get(key, -QUIET) < QUIET:
             return
+        since, lines = self._lines.get(reason, (now, 0))
+        if now - since >= QUIET:
+            since, lines = now, 0
+        if lines >= LINES:
+            return
+        self._lines[reason] = since, lines + 1
         self._told.pop(key, None)
         if len(self._told) >= MOST:
             del self._told[next(iter(self._told))]

@@ -62,16 +62,16 @@ async def test_health_and_readiness_follow_the_master(
 ) -> None:
     await master.stop()
     proxy = await make_proxy()
-    await until(lambda: proxy.app.master_monitor.error, "the master was missed")
+    await until(lambda: proxy.ros1.master_monitor.error, "the master was missed")
     code, text = await ask(proxy, "/readyz")
     assert code == 503
     assert text.startswith(f"master {master.uri}: ")
     assert await ask(proxy, "/healthz") == (200, "ok\n")
     await master.start()
-    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     assert await ask(proxy, "/readyz") == (200, "ok\n")
     await master.stop()
-    await until(lambda: not proxy.app.master_monitor.up, "the master was missed again")
+    await until(lambda: not proxy.ros1.master_monitor.up, "the master was missed again")
     assert (await ask(proxy, "/readyz"))[0] == 503
     assert await ask(proxy, "/healthz") == (200, "ok\n")
 
@@ -86,7 +86,6 @@ async def test_not_ready_before_the_master_was_asked(
 
 
 async def test_paths(proxy: Proxy) -> None:
-    assert await ask(proxy, "/") == (200, "rosproxy: /healthz /readyz /metrics /status\n")
     assert (await ask(proxy, "/nothing"))[0] == 404
     assert (await ask(proxy, "/probe"))[0] == 405
 
@@ -129,6 +128,8 @@ async def test_metrics_of_a_proxy_at_work(
     await until(lambda: not master.holds("publishers", "/dead"), "cleaned up")
     await until(lambda: proxy.metric("cleanups_total"), "counted")
     found = await metrics(proxy)
+    assert not [name for name in found if "_created" in name]
+    assert found["rosproxy_buffered_bytes"] <= found["rosproxy_buffered_bytes_limit"]
     assert found["rosproxy_leases_used"] in (1, 2)
     assert found["rosproxy_leases_used"] + found["rosproxy_leases_free"] == 8
     assert found["rosproxy_leases_blocked"] == 0
@@ -146,6 +147,20 @@ async def test_metrics_of_a_proxy_at_work(
     assert found["rosproxy_relayed_bytes_total{direction=outward,kind=service,name=/add}"] > 0
     assert found["process_open_fds"] > 0
     assert any(name.startswith("rosproxy_build_info{version=") for name in found)
+
+
+async def test_who_does_not_answer_is_named(
+    make_proxy: MakeProxy, make_node: MakeNode, node: FakeNode
+) -> None:
+    proxy, dead = await make_proxy(cleanup_after=60.0), await make_node("/dead")
+    for one in (node, dead):
+        await one.publish(proxy.master)
+    assert not [name for name in await metrics(proxy) if "nodes_down{" in name]
+    await dead.stop()
+    await until(lambda: proxy.metric("nodes_down", node="/dead"), "it is missed")
+    assert [name for name in await metrics(proxy) if "nodes_down{" in name] == [
+        "rosproxy_nodes_down{node=/dead}"
+    ]
 
 
 async def _talk(proxy: Proxy, node: FakeNode) -> None:
@@ -209,12 +224,12 @@ async def test_probe_tries_the_lowest_and_the_highest_free_port(
 ) -> None:
     await node.publish(proxy.master)
     ports = proxy.settings.ports.listen
-    before = proxy.app.context.registry.pool.free
+    before = proxy.ros1.context.registry.pool.free
     found = await probe(proxy)
     assert [p["port"] for p in found] == [ports.first + 1, ports.last]
     assert {(p["from_proxy"], p["from_master"]) for p in found} == {("ok", "ok")}
     assert found[0]["advertised"] == f"{HOST}:{ports.first + 1}"
-    assert proxy.app.context.registry.pool.free == before
+    assert proxy.ros1.context.registry.pool.free == before
     assert not master.params, "a parameter is left behind"
     assert not [name for name in master.nodes if "probe" in name]
 
@@ -233,7 +248,7 @@ async def test_probe_tells_that_the_master_does_not_get_through(
     proxy = await make_proxy()
     (found,) = await probe(proxy)  # the master is not sent into the void twice
     assert (found["from_proxy"], found["from_master"]) == ("ok", "missed")
-    assert proxy.app.context.registry.pool.free == 8
+    assert proxy.ros1.context.registry.pool.free == 8
 
 
 async def test_two_probes_at_once_do_not_meet(proxy: Proxy) -> None:
@@ -300,7 +315,7 @@ async def test_probe_is_not_deceived_by_who_knows_no_secret(
     proxy = await make_proxy(ports=1)
     trying = asyncio.create_task(probe(proxy))
     where = (HOST, proxy.settings.ports.listen.first)
-    await until(lambda: proxy.app.context.registry.pool.free == 0, "the probe has begun")
+    await until(lambda: proxy.ros1.context.registry.pool.free == 0, "the probe has begun")
     async with connect(where) as wire:
         await wire.send(post(xml("paramUpdate", "/master", "/guess", 1)))
         assert await wire.end() in ("closed", "reset")

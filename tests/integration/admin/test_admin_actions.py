@@ -39,7 +39,7 @@ def from_afar(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rosproxy.admin.server.is_loopback", lambda _: False)
 
 
-PATHS = ["/probe", "/containers", "/master-address", "/retire", "/policy"]
+PATHS = ["/probe", "/containers", "/master-address", "/retire", "/policy", "/page-key"]
 
 
 @pytest.mark.usefixtures("from_afar")
@@ -58,7 +58,7 @@ async def test_who_is_not_on_loopback_needs_the_token(make_proxy: MakeProxy, pat
         reply = await post(proxy, path, "{}", *headers)
         assert reply.status == 403
         assert b"ROSPROXY_ADMIN_TOKEN" in reply.body
-    assert not proxy.app.context.retired
+    assert not proxy.ros1.context.retired
     right = await post(proxy, path, '{"x": 1}', f"Authorization: Bearer {TOKEN}")
     assert right.status in (200, 400)
 
@@ -87,7 +87,7 @@ async def test_without_a_token_nobody_from_afar_may(proxy: Proxy) -> None:
 async def test_everybody_may_look(make_proxy: MakeProxy) -> None:
     proxy = await make_proxy(admin_token=TOKEN)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)
-    for path in ("/", "/healthz", "/metrics", "/status"):
+    for path in ("/healthz", "/metrics", "/status"):
         reply = await exchange(where, f"GET {path} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
         assert reply.status == 200
         assert TOKEN.encode() not in reply.body
@@ -96,7 +96,7 @@ async def test_everybody_may_look(make_proxy: MakeProxy) -> None:
 async def test_a_page_in_a_browser_on_this_host_may_not(proxy: Proxy) -> None:
     reply = await post(proxy, "/retire", "{}", "Origin: http://evil.example")
     assert reply.status == 403
-    assert not proxy.app.context.retired
+    assert not proxy.ros1.context.retired
 
 
 @pytest.mark.usefixtures("from_afar")
@@ -139,7 +139,7 @@ async def test_a_bad_body_is_told_apart(proxy: Proxy, path: str, body: str, comp
     reply = await post(proxy, path, body)
     assert reply.status == 400
     assert reply.body.decode().startswith(f"rosproxy: {complaint}")
-    assert not proxy.app.context.retired
+    assert not proxy.ros1.context.retired
 
 
 async def test_a_body_in_no_encoding(proxy: Proxy) -> None:
@@ -196,9 +196,9 @@ async def test_a_node_that_hangs_is_not_waited_for(
     proxy = await make_proxy(**PATIENT, probe_timeout=10.0)
     await node.publish(proxy.master)
     node.hang = True
-    before = proxy.app.context.now()
+    before = proxy.ros1.context.now()
     assert await news(proxy, gone=[NODE]) == (1, 0, 0)
-    assert proxy.app.context.now() - before < 9  # less than its probe may take
+    assert proxy.ros1.context.now() - before < 9  # less than its probe may take
     assert not everything(master)
     node.hang = False  # the news was wrong
     await until(lambda: master.holds("publishers", "/chatter"), "it is registered again")
@@ -249,7 +249,7 @@ async def test_a_port_is_given_up_after_linger_though_the_address_is_silent(
     await node.publish(proxy.master)
     node.hang = True
     await news(proxy, gone=[NODE])
-    await until(lambda: not len(proxy.app.context.registry), "the port is free again")
+    await until(lambda: not len(proxy.ros1.context.registry), "the port is free again")
 
 
 async def test_a_master_that_is_away_hears_of_it_later(
@@ -323,7 +323,7 @@ async def test_it_goes_on_calling_itself_what_it_did(
     await news(proxy, moved={NODE: OTHER_NODE})
     await node.publish(proxy.master, "/more")
     assert master.holds("publishers", "/more") == [proxy.uri(node)]
-    assert len(proxy.app.context.registry) == 1
+    assert len(proxy.ros1.context.registry) == 1
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
     assert not master.holds("publishers", "/chatter")
     neighbour = await make_node("/neighbour", THIRD_NODE)
@@ -407,9 +407,9 @@ async def test_retiring(
         assert triple[0] == -1
         assert "retired" in triple[1]
     assert await tell(proxy, "/retire") == {"unregistered": 0}
-    await proxy.app.master_monitor.look()
-    await proxy.app.registrar.register_lost()
-    await proxy.app.prober.look()
+    await proxy.ros1.master_monitor.look()
+    await proxy.ros1.registrar.register_lost()
+    await proxy.ros1.prober.look()
     assert not everything(master)
     where = (proxy.settings.admin.host, proxy.settings.admin.port)
     ready = await exchange(where, b"GET /readyz HTTP/1.1\r\nHost: x\r\n\r\n")
@@ -422,10 +422,10 @@ async def test_retiring_waits_for_registrations_under_way(
     import asyncio
 
     proxy = await make_proxy(**PATIENT)
-    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     master.delay = 0.3
     registering = asyncio.create_task(node.publish(proxy.master))
-    await until(lambda: len(proxy.app.context.registry), "it is admitted")
+    await until(lambda: len(proxy.ros1.context.registry), "it is admitted")
     await tell(proxy, "/retire")
     await registering
     assert not everything(master)

@@ -143,6 +143,7 @@ async def test_health_of_an_endpoint_that_says_no() -> None:
     "words",
     [
         ("status", "--json", "--watch"),
+        ("status", "--open", "--watch"),
         ("status", "--admin", "nonsense"),
         ("health", "extra"),
         ("nothing",),

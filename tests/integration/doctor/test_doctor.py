@@ -11,8 +11,8 @@ from examples.demo.fake_http import End, FakeHttpServer, FakeRequest, free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode, Header
 from rosproxy.admin.client import AdminClient
+from rosproxy.admin.findings import DoctorFinding, Severity
 from rosproxy.doctor.collect import collect
-from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import diagnose
 from rosproxy.ros1.protocol.tcpros import encode_header
 from tests.integration.commands import admin_url, run

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from examples.demo.fake_http import Where
+from rosproxy.app import ros1 as app
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import policy as decisions
 from rosproxy.forwarding.kernel import syncer
@@ -34,7 +35,7 @@ def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeTools:
     async def nothing(mode: str, tools: Tools) -> None:
         return None
 
-    monkeypatch.setattr(kernel_plane, "Tools", lambda: made)
+    monkeypatch.setattr(app, "Tools", lambda: made)
     monkeypatch.setattr(kernel_plane, "why_not", nothing)
     monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
     monkeypatch.setattr(syncer, "address_towards", lambda address: "192.0.2.1")
@@ -160,7 +161,7 @@ async def test_who_reconnects_after_a_restart_without_the_kernel_is_served(
     host, lease = proxy.lease(node)
     assert await refuses((host, lease + 2))
     await proxy.restart()
-    await until(lambda: len(proxy.app.context.registry), "the node is found")
+    await until(lambda: len(proxy.ros1.context.registry), "the node is found")
     await until(lambda: proxy.serves(node), "the node is served")
     assert (await greet((host, lease + 2), topic_header()))["callerid"] == "/a"
     assert proxy.app.status()["ports"]["free"] == 3
@@ -191,5 +192,5 @@ async def test_what_a_rule_may_deny_goes_through_the_proxy(make_proxy, make_node
     await until(lambda: kernel.forgotten, "its connections are cut")
     assert (await ask(proxy, nodes[0]))[1] == proxy.endpoint(nodes[0]).port
     await proxy.restart()
-    await until(lambda: len(proxy.app.context.registry) == 3, "the nodes are found again")
+    await until(lambda: len(proxy.ros1.context.registry) == 3, "the nodes are found again")
     assert proxy.endpoint(nodes[1]).fast_port is None

@@ -8,15 +8,17 @@ import pytest
 
 from rosproxy.forwarding.kernel import plane as kernel_plane
 from rosproxy.forwarding.kernel import syncer
-from rosproxy.forwarding.kernel.nft import Marks
+from rosproxy.forwarding.kernel.nft import Marks, Table
 from rosproxy.forwarding.kernel.plane import KernelPlane
-from rosproxy.forwarding.kernel.policy import HostForwarding
-from rosproxy.forwarding.kernel.tools import Tools
+from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases import fast_ports
+from rosproxy.leases.fast_ports import BothSides
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
-from tests.integration.kernel_fake import FakeTools
+from rosproxy.ros1.registry.stand_ins import StandIn
+from rosproxy.runtime import Runtime
+from tests.integration.kernel_fake import FakeTools, clear_the_way
 from tests.integration.net import PATIENCE
 from tests.run_options import parse_settings
 
@@ -37,6 +39,8 @@ def settings(mode: str) -> dict[str, Any]:
         "admin_bind": "127.0.0.1:11312",
         "slave_control": "any",
         "data_plane": mode,
+        "direction": "both",
+        "inside_network": ("172.30.0.0/16",),
         "probe_interval": 5.0,
         "probe_timeout": 3.0,
         "cleanup_after": 30.0,
@@ -49,16 +53,17 @@ class Bench:
     """A plane over a made-up kernel; nothing listens."""
 
     def __init__(self, mode: str = "auto", tools: FakeTools | None = None) -> None:
-        self.context = Context(parse_settings(settings(mode)))
+        self.context = Context(Runtime(parse_settings(settings(mode))))
         self.tools = tools or FakeTools()
         self.later = 0.0
         self.plane = KernelPlane(
             self.context.settings,
-            self.context.registry,
+            BothSides(self.context.registry, self.context.stand_ins.by_port),
             self.context.tasks,
             self.context.problems,
             lambda: self.context.now() + self.later,
-            self.tools,
+            KernelTable(Table(11311, self.context.settings.ports.listen), self.tools),
+            self.context.near,
         )
 
     def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
@@ -73,6 +78,20 @@ class Bench:
         assert await self.plane.syncer.forwards(endpoint, 50000)
         return endpoint
 
+    def stand_in(self) -> StandIn:
+        where = HostPort("robot", 40000)
+        local, uri = HostPort("172.30.0.2", 20016), f"http://{where}/"
+        stand_in = StandIn(local, uri, where, kept=False, topic_ports={"/chatter": 50000})
+        stand_in.address = NODE
+        self.context.stand_ins.add(stand_in)
+        assert stand_in.fast_candidate is not None
+        self.context.stand_ins.note_fast_port(stand_in, stand_in.fast_candidate.port)
+        return stand_in
+
+    @property
+    def near(self) -> list[str]:
+        return (self.tools.table or {})["near4"]
+
     def flow(self, port: int, state: str = "ESTABLISHED") -> str:
         return FLOW.format(port=port, state=state, mark=Marks(11311).of(port))
 
@@ -80,12 +99,7 @@ class Bench:
 @pytest.fixture
 def sound(monkeypatch: pytest.MonkeyPatch) -> None:
     """A network namespace in which nothing is in the way."""
-
-    async def nothing(mode: str, tools: Tools) -> None:
-        return None
-
-    monkeypatch.setattr(kernel_plane, "why_not", nothing)
-    monkeypatch.setattr(syncer, "read_forwarding", HostForwarding)
+    clear_the_way(monkeypatch)
 
 
 @pytest.fixture
@@ -162,6 +176,40 @@ async def test_connections_and_bytes_are_taken_in(bench: Bench) -> None:
     assert bench.plane.traffic.sent == {("node", "unnamed"): 1000}
 
 
+async def test_a_node_outside_is_forwarded_to_those_who_may_use_the_proxy(bench: Bench) -> None:
+    stand_in = bench.stand_in()
+    assert bench.plane.syncer.may_forward(stand_in)
+    assert await bench.plane.syncer.forwards(stand_in, 50000)
+    assert bench.tools.forwards == {stand_in.fast_port: (NODE, 50000)}
+    assert bench.tools.table is not None
+    assert bench.tools.table["inward"] == [stand_in.fast_port]
+    assert bench.tools.table["near4"] == ["172.30.0.0/16"]
+    bench.context.selected = frozenset(["172.30.0.5", "172.30.0.4"])
+    await bench.plane.look()
+    await until(lambda: bench.near == ["172.30.0.4/31"])
+
+
+async def test_what_goes_outside_is_counted_as_sent(bench: Bench) -> None:
+    stand_in = bench.stand_in()
+    assert await bench.plane.syncer.forwards(stand_in, 50000)
+    bench.tools.flows = bench.flow(stand_in.port)
+    bench.tools.counted = {"sent": 5000, "received": 70}
+    await bench.plane.look()
+    assert stand_in.fast_peers == {"198.51.100.2": 1}
+    told = bench.plane.status_of(stand_in)
+    assert (told["connections"], told["sent"], told["received"]) == (1, 70, 5000)
+    assert bench.plane.traffic.sent == {("node", "robot"): 70}
+
+
+async def test_a_stand_in_that_has_gone_is_not_forwarded(bench: Bench) -> None:
+    stand_in = bench.stand_in()
+    assert await bench.plane.syncer.forwards(stand_in, 50000)
+    bench.context.stand_ins.remove(stand_in)
+    bench.plane.syncer.note_change(stand_in)
+    await bench.plane.syncer.cleared(stand_in.port)
+    assert bench.tools.forwards == {}
+
+
 async def test_a_table_that_is_gone_is_made_again(bench: Bench) -> None:
     await bench.forwarded()
     bench.tools.table = None
@@ -216,7 +264,8 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
     bench.later = kernel_plane.UNANSWERED_PATIENCE
     await bench.plane.look()
     assert bench.tools.forwards == {}
-    assert (Marks(11311).one(45002), False, "SYN_SENT") in bench.tools.forgotten
+    waiting = False, ("--mark", Marks(11311).one(45002), "--state", "SYN_SENT")
+    assert waiting in bench.tools.forgotten
     assert "nothing came back" in bench.plane.status_of(endpoint)["reason"]
     bench.tools.flows = ""
     bench.later += 6
@@ -226,17 +275,16 @@ async def test_who_is_not_answered_gets_back_to_user_space(bench: Bench) -> None
 async def test_cutting_forgets_the_connections(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     bench.plane.cut(endpoint)
-    await until(lambda: bench.tools.forgotten == [(Marks(11311).one(45002), False, "")])
+    mark = Marks(11311).one(45002)
+    await until(lambda: bench.tools.forgotten == [(False, ("--mark", mark))])
 
 
 async def test_stopping_leaves_nothing(bench: Bench) -> None:
     endpoint = await bench.forwarded()
     await bench.plane.stop()
     assert bench.tools.table is None
-    assert {(mark, ipv6) for mark, ipv6, _ in bench.tools.forgotten} == {
-        (Marks(11311).all, False),
-        (Marks(11311).all, True),
-    }
+    marked = "--mark", Marks(11311).all
+    assert set(bench.tools.forgotten) == {(False, marked), (True, marked)}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
 
 

@@ -99,8 +99,9 @@ async def test_programs_get_their_words_and_document(programs: Path) -> None:
     program(programs, "nft", 'echo "$@"; /bin/cat')
     program(programs, "conntrack", 'echo "$@"')
     assert await Tools().nft("-f", "-", document="{}") == "-f -\n{}"
-    assert await Tools().list_flows("1/2", True) == "-L -f ipv6 -p tcp --mark 1/2\n"
-    await Tools().forget_flows("1/2", False, "SYN_SENT")
+    listed = await Tools().list_flows("udp", True, "--mark", "1/2")
+    assert listed == "-L -f ipv6 -p udp --mark 1/2\n"
+    await Tools().forget_flows("tcp", False, "--state", "SYN_SENT")
 
 
 @pytest.mark.parametrize(
@@ -119,10 +120,10 @@ async def test_complaints_say_what_to_do(programs: Path, script: str, said: str)
 
 async def test_deleting_nothing_is_no_failure(programs: Path) -> None:
     program(programs, "conntrack", "echo 0 flow entries have been deleted. >&2; exit 1")
-    await Tools().forget_flows("1/2", False)
+    await Tools().forget_flows("tcp", False)
     program(programs, "conntrack", "echo something else >&2; exit 1")
     with pytest.raises(ToolError, match="something else"):
-        await Tools().forget_flows("1/2", False)
+        await Tools().forget_flows("tcp", False)
 
 
 async def test_a_program_that_hangs_is_ended(

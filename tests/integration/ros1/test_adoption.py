@@ -173,7 +173,7 @@ async def test_nodes_elsewhere_are_left_alone(
     assert await adopt(proxy, container(NODE, "c1")) == 0  # no node answers there
     assert await adopt(proxy, container(OUTSIDE, "c1")) == 0  # not inside
     assert all_of(master) == before
-    texts = [problem.text for problem in proxy.app.context.problems.all()]
+    texts = [problem.text for problem in proxy.ros1.context.problems.all()]
     assert any("no node answers at" in text for text in texts)
     assert any("in none of the inside networks" in text for text in texts)
 
@@ -243,7 +243,7 @@ async def test_a_node_that_is_subscribed_to_a_parameter_is_left_as_it_was(
     assert await adopt(proxy) == 0
     del before["/rosout_disable_topics_generation"]  # which could not be told apart
     assert all_of(master) == before
-    problems = [p for p in proxy.app.context.problems.all() if p.subject == "/talker"]
+    problems = [p for p in proxy.ros1.context.problems.all() if p.subject == "/talker"]
     assert "Restart its container" in problems[-1].text
     assert not shutdowns(node)
     assert not proxy.endpoint(node).registrations
@@ -293,7 +293,7 @@ async def test_it_does_so_through_a_proxy_that_has_forgotten(
     await register_directly(master, node)
     await adopt(proxy, container(NODE, "c1.invalid"))
     await proxy.restart()
-    await until(lambda: len(proxy.app.context.registry), "it is found at the master")
+    await until(lambda: len(proxy.ros1.context.registry), "it is found at the master")
     await until(lambda: proxy.endpoint(node).trusted, "it is recovered")
     await node.publish(where(master.uri), "/more")
     uri = proxy.uri(node)
@@ -417,7 +417,7 @@ async def test_the_range_is_exhausted(
     before = all_of(master)
     assert await adopt(proxy) == 0
     assert all_of(master) == before
-    texts = [p.text for p in proxy.app.context.problems.all() if p.subject == "/talker"]
+    texts = [p.text for p in proxy.ros1.context.problems.all() if p.subject == "/talker"]
     assert any("no port of the range is left" in text for text in texts)
 
 

@@ -11,7 +11,9 @@ from examples.demo.fake_http import value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from rosproxy.forwarding.datagrams import bind
+from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.tcpros import encode_header
+from tests.integration.admin_calls import tell
 from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import (
     HOST,
@@ -35,12 +37,7 @@ from tests.integration.proxy import Proxy
 from tests.integration.ros1.test_alias import WAYS, look_up, look_up_service
 
 BOTH_LOOPS = True
-
-
-@pytest.fixture(autouse=True)
-def _loopback_is_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All hosts of these tests are on one machine: none of their addresses is another's."""
-    monkeypatch.setattr("rosproxy.ros1.standins.outside.address_towards", lambda address: "")
+pytestmark = pytest.mark.usefixtures("machines_apart")
 
 
 @pytest.fixture
@@ -197,6 +194,43 @@ async def test_nobody_inside_has_the_proxy_connect_to_what_he_names(
     secret.close()
 
 
+async def test_nodes_of_outside_may_run_on_the_proxys_machine(
+    proxy: Proxy, robot: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.standins.outside.is_own", lambda address: address == MASTER)
+    at = where(await look_up(proxy, robot))
+    assert (await rpc(at, "getPid", "/tool", source=NODE)) == [1, "", robot.pid]
+
+
+@pytest.mark.parametrize("port", ["master", "lease"])
+async def test_nothing_leads_to_the_proxys_own_ports(
+    proxy: Proxy, node: FakeNode, master: FakeMaster, monkeypatch: pytest.MonkeyPatch, port: str
+) -> None:
+    """Whoever writes to the master chooses an address of the proxy's machine."""
+    monkeypatch.setattr("rosproxy.ros1.standins.outside.is_own", lambda address: address == MASTER)
+    await node.publish(proxy.master)
+    own = {"master": proxy.settings.master_port, "lease": proxy.lease(node)[1]}
+    uri = f"http://{MASTER}:{own[port]}/"
+    await rpc(where(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
+    told = (await rpc(proxy.master, "lookupNode", "/tool", "/evil", source=NODE))[2]
+    assert await knock(where(told), post(xml("getPid", "/tool")), NODE) == "reset"
+    assert await refuses(where(told), NODE)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.1.1", "0.0.0.0", "localhost"])
+async def test_nothing_leads_to_loopback(
+    proxy: Proxy, master: FakeMaster, monkeypatch: pytest.MonkeyPatch, host: str
+) -> None:
+    monkeypatch.setattr("rosproxy.ros1.standins.outside.is_loopback", is_loopback)
+    listening = await asyncio.start_server(lambda *_: None, "127.0.0.1")
+    port = listening.sockets[0].getsockname()[1]
+    uri = f"http://{host}:{port}/"
+    await rpc(where(master.uri), "registerPublisher", "/evil", "/t", "x/Y", uri)
+    told = (await rpc(proxy.master, "lookupNode", "/tool", "/evil", source=NODE))[2]
+    assert await knock(where(told), post(xml("getPid", "/tool")), NODE) == "reset"
+    listening.close()
+
+
 # UDPROS
 
 
@@ -231,7 +265,7 @@ async def test_udpros_from_outside_comes_in_through_the_range(
         assert (row["topic"], row["port"], row["bytes"]) == ("/chatter", told, 7)
         await node.stop()
         await rpc(proxy.master, "unregisterSubscriber", "/node", "/chatter", node.uri, source=NODE)
-        await proxy.app.stand_ins.tidy()
+        await proxy.ros1.stand_ins.tidy()
         assert not proxy.app.status()["udpros"]
 
 
@@ -278,3 +312,22 @@ async def test_who_asks_for_many_takes_no_udpros_from_others(
             await rpc(at, "requestTopic", "/ear", "/chatter", [offer], source=source)
     peers = [row["peer"] for row in proxy.app.status()["udpros"]]
     assert sorted(peers) == [MASTER] * 3 + [OUTSIDE]
+
+
+async def test_who_is_gone_was_not_cut_by_a_policy(
+    make_proxy: MakeProxy, make_node: MakeNode, robot: FakeNode
+) -> None:
+    proxy = await make_proxy(direction="both", udp=True)
+    nodes = [await make_node("/one"), await make_node("/other", OTHER_NODE)]
+    at = where(await look_up(proxy, robot))
+    for node, source in zip(nodes, (NODE, OTHER_NODE), strict=True):
+        await node.subscribe(proxy.master)
+        offer = udp_offer("/chatter", "node", 40000)
+        await rpc(at, "requestTopic", node.name, "/chatter", [offer], source=source)
+    assert len(proxy.app.status()["udpros"]) == 2
+    gone = nodes[0]
+    await rpc(proxy.master, "unregisterSubscriber", gone.name, "/chatter", gone.uri, source=NODE)
+    rules = {"name": "a", "mode": "enforce", "rules": ["deny subscribe /chatter"]}
+    answer = await tell(proxy, "/policy", layers=[{**rules, "addresses": None}])
+    assert answer["cut"] == 1
+    assert not proxy.app.status()["udpros"]

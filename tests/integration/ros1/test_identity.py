@@ -57,7 +57,7 @@ def problems(proxy: Proxy) -> dict[str, str]:
 
 def address_of(proxy: Proxy, name: str) -> str:
     """Where the proxy takes a node to be."""
-    return proxy.app.context.registry.by_caller[name].place.address
+    return proxy.ros1.context.registry.by_caller[name].place.address
 
 
 # Who may use the proxy as its master
@@ -135,7 +135,7 @@ async def test_a_new_container_waits_for_the_news_and_loses_nothing(
     monkeypatch.setattr(callers, "NEWS_TIMEOUT", 30.0)
     await news(proxy, selected=[])
     call_ = asyncio.create_task(node.publish(proxy.master))
-    waiting = proxy.app._callers
+    waiting = proxy.ros1._callers
     await until(lambda: waiting._waiting.total() == 1, "the call waits")
     await news(proxy, selected=[OTHER_NODE])
     assert not call_.done()
@@ -185,9 +185,9 @@ async def test_an_operator_that_is_away_stops_nobody(
     proxy = await make_proxy(**BY_AN_OPERATOR)
     assert (await node.publish(proxy.master))[0] == 1
     assert monotonic() - began > 0.3
-    began = monotonic()
-    assert (await node.publish(proxy.master))[0] == 1
-    assert monotonic() - began < 0.3
+    monkeypatch.setattr(callers, "NEWS_TIMEOUT", 3600.0)
+    async with asyncio.timeout(60):
+        assert (await node.publish(proxy.master))[0] == 1
     assert (await exchange(proxy.master, request(xml("getPid", "/n")), OUTSIDE)).status == 403
 
 
@@ -199,7 +199,7 @@ async def test_no_more_than_so_many_calls_wait(
     monkeypatch.setattr(callers, "MOST_WAITING_EACH", 2)
     monkeypatch.setattr(callers, "MOST_WAITING", 3)
     await news(proxy, selected=[])
-    waiting, body = proxy.app._callers._waiting, request(xml("getPid", "/n"))
+    waiting, body = proxy.ros1._callers._waiting, request(xml("getPid", "/n"))
     sources = [NODE, NODE, OTHER_NODE]
     calls = [asyncio.create_task(exchange(proxy.master, body, source)) for source in sources]
     await until(lambda: waiting.total() == 3, "the calls wait")
@@ -233,7 +233,7 @@ async def test_a_forged_caller_api_publishes_nobody_else(
     assert address_of(proxy, "/evil") == NODE
     told = [row["text"] for row in proxy.app.status()["problems"] if row["subject"] == "/evil"]
     assert any("gives its address as" in text for text in told)
-    (endpoint,) = proxy.app.context.registry
+    (endpoint,) = proxy.ros1.context.registry
     calls = len(victim.calls)
     for data in (request(xml("getBusStats", "/outside")), topic_header("/rosout")):
         assert await knock((HOST, endpoint.port), data) != "answered"
@@ -295,7 +295,7 @@ async def test_who_comes_first_from_a_hidden_source_keeps_nobody_from_its_uri(
     forged = "/t", "x/Y", node.uri
     await call(proxy.master, "registerPublisher", "/evil", *forged, source=HIDDEN)
     assert address_of(proxy, "/evil") == HIDDEN
-    by_caller = proxy.app.context.registry.by_caller
+    by_caller = proxy.ros1.context.registry.by_caller
     await until(lambda: by_caller["/evil"].never_found, "it is looked for there")
     assert (await publish(node, proxy))[0] == 1
     assert address_of(proxy, "/hidden") == OTHER_NODE
@@ -311,7 +311,7 @@ async def test_a_node_outside_is_left_to_itself(
     far = await make_node("/far", OUTSIDE)
     assert (await publish(far, proxy))[0] == 1
     assert master.nodes["/far"] == far.uri
-    assert list(proxy.app.context.registry) == []
+    assert list(proxy.ros1.context.registry) == []
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")
@@ -320,7 +320,7 @@ async def test_the_selection_counts_for_addresses_that_others_register_too(
 ) -> None:
     await news(proxy, selected=[HIDDEN])
     assert (await publish(await make_node("/other", OTHER_NODE), proxy))[0] == 1
-    assert list(proxy.app.context.registry) == []
+    assert list(proxy.ros1.context.registry) == []
 
 
 # Who gets a port
@@ -407,7 +407,7 @@ async def test_stale_claims_do_not_keep_a_port_from_a_node_that_lives(
     ]
     assert await proxy.serves(node)
     assert master.holds("services", "/late") == [f"rosrpc://{HOST}:{proxy.lease(node)[1]}"]
-    assert len(proxy.app.context.registry) == 8
+    assert len(proxy.ros1.context.registry) == 8
     assert len([name for name in master.nodes if name.startswith("/dead")]) == 7
     assert len([name for name in master.tables["services"] if "/dead" in name]) == 7
 
@@ -469,9 +469,9 @@ async def test_what_an_operator_selects_is_recovered_wherever_it_lies(
         cleanup_after=1.0,
     )
     await until(lambda: proxy.app.status()["master"]["up"], "the master is found")
-    assert list(proxy.app.context.registry) == []
+    assert list(proxy.ros1.context.registry) == []
     await news(proxy, selected=[NODE])
-    await until(lambda: len(proxy.app.context.registry), "the node is found")
+    await until(lambda: len(proxy.ros1.context.registry), "the node is found")
     await until(lambda: proxy.serves(node), "the node is served")
     assert proxy.uri(node) == uri == master.nodes[node.name]
 
@@ -508,8 +508,8 @@ async def test_news_of_a_node_that_is_gone_do_not_close_its_port_to_the_next(
     gone, late = await make_node("/gone"), await make_node("/late")
     await gone.publish(proxy.master)
     endpoint = proxy.endpoint(gone)
-    proxy.app.leases.end(endpoint)
+    proxy.ros1.leases.end(endpoint)
     await late.publish(proxy.master)
     assert proxy.endpoint(late).port == endpoint.port
-    proxy.app.leases.close(endpoint)
+    proxy.ros1.leases.close(endpoint)
     assert await proxy.serves(late)

@@ -23,7 +23,9 @@ from tests.integration.net import (
     xml,
 )
 
-FAST = {"probe_interval": 0.1, "probe_timeout": 0.15, "cleanup_after": 0.25, "linger": 0.2}
+FAST = {"probe_interval": 0.1, "probe_timeout": 2.0, "cleanup_after": 0.25, "linger": 0.2}
+IMPATIENT = {**FAST, "probe_timeout": 0.15}
+"""For nodes that are to be found hanging: any may be on a machine that is busy."""
 
 
 def descriptors() -> int:
@@ -60,8 +62,8 @@ async def test_a_dead_node_is_cleaned_up_and_its_port_given_back(make_proxy, mas
     tables = master.tables.values()
     await until(lambda: not any(tables), "the master forgets it")
     assert master.nodes == {}
-    await until(lambda: not len(proxy.app.context.registry), "the lease ends")
-    assert proxy.app.context.registry.pool.free == len(proxy.settings.ports.listen)
+    await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
+    assert proxy.ros1.context.registry.pool.free == len(proxy.settings.ports.listen)
     assert proxy.metric("cleanups_total") == 1
 
 
@@ -87,7 +89,7 @@ async def test_clean_up_waits_for_a_master_that_is_down(make_proxy, master, node
 
 
 async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
-    proxy = await make_proxy(**{**FAST, "cleanup_after": 0})
+    proxy = await make_proxy(**{**IMPATIENT, "cleanup_after": 0})
     hung, fine = await make_node("/hung"), await make_node("/fine", OTHER_NODE)
     await hung.publish(proxy.master)
     await fine.publish(proxy.master)
@@ -104,18 +106,19 @@ async def test_a_hanging_node_blocks_nobody(make_proxy, make_node):
 
 
 async def test_probes_of_a_hanging_node_leak_nothing(start_process, make_node):
-    process, hung = start_process(**{**FAST, "cleanup_after": 0}), await make_node("/hung")
+    process, hung = start_process(**{**IMPATIENT, "cleanup_after": 0}), await make_node("/hung")
     await hung.publish(process.master)
     hung.hang = True
     await until(lambda: "does not answer" in process.text, "the node counts as silent")
     before, threads, probes = process.descriptors(), process.threads(), hung.slave.connections
     await until(lambda: hung.slave.connections >= probes + 6, "six more probes")
-    assert process.descriptors() <= before + 1
-    assert process.threads() <= threads
+    # A call that is under way has one: what leaks would stay.
+    await until(lambda: process.descriptors() <= before, "no more is open than before")
+    await until(lambda: process.threads() <= threads, "no more threads than before")
 
 
 async def test_a_node_that_answers_again_is_served_again(make_proxy, master, node):
-    proxy = await make_proxy(**{**FAST, "cleanup_after": 0})
+    proxy = await make_proxy(**{**IMPATIENT, "cleanup_after": 0})
     await node.publish(proxy.master)
     lease = proxy.lease(node)
     node.hang = True
@@ -137,7 +140,7 @@ async def rpc_works(address) -> bool:
 async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
     make_proxy, master, node
 ):
-    proxy = await make_proxy(**FAST)
+    proxy = await make_proxy(**IMPATIENT)
     await node.publish(proxy.master)
     await node.subscribe(proxy.master, "/news")
     await node.serve(proxy.master)
@@ -158,7 +161,7 @@ async def test_a_node_that_was_cleaned_up_and_comes_back_is_registered_again(
 
 
 async def test_another_process_at_a_cleaned_uri_gets_only_what_it_has(make_proxy, master, node):
-    proxy = await make_proxy(**FAST)
+    proxy = await make_proxy(**IMPATIENT)
     await node.publish(proxy.master)
     await node.publish(proxy.master, "/gone")
     await node.serve(proxy.master)
@@ -273,7 +276,7 @@ async def test_a_lease_does_not_end_while_its_registration_is_on_its_way(make_pr
     master.delay = 0.0
     assert await rpc_works(proxy.lease(node))
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-    await until(lambda: not len(proxy.app.context.registry), "the lease ends")
+    await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
 
 
 async def test_a_registration_that_the_master_refuses_holds_no_port(make_proxy, master, node):
@@ -282,18 +285,22 @@ async def test_a_registration_that_the_master_refuses_holds_no_port(make_proxy, 
     async with connect(proxy.master, NODE) as wire:
         await wire.send(post(xml("registerPublisher", "/talker", "/t", "x/Y", node.uri)))
         assert await wire.end() == "reset"
-    await until(lambda: not len(proxy.app.context.registry), "the lease ends")
-    assert proxy.app.context.registry.pool.free == len(proxy.settings.ports.listen)
+    await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
+    assert proxy.ros1.context.registry.pool.free == len(proxy.settings.ports.listen)
 
 
 async def test_many_short_lives_leak_nothing(make_proxy, make_node):
     proxy = await make_proxy(**{**FAST, "linger": 0.0})
     node = await make_node()
-    for round_ in range(2):
-        before = descriptors()
+
+    async def live() -> None:
         for _ in range(8):
             await node.publish(proxy.master)
             await rpc(proxy.uri(node), "getPid", "/outside")
             await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
-            await until(lambda: not len(proxy.app.context.registry), "the lease ends")
-        assert not round_ or descriptors() <= before + 2
+            await until(lambda: not len(proxy.ros1.context.registry), "the lease ends")
+
+    await live()
+    before = descriptors()
+    await live()
+    await until(lambda: descriptors() <= before + 2, "nothing is left open")

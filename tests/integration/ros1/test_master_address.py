@@ -44,7 +44,7 @@ async def test_the_name_is_not_resolved_but_told(
 
 
 async def test_without_it_the_status_tells_where_the_name_led(proxy: Proxy) -> None:
-    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     found = await master_status(proxy)
     assert (found["address"], found["pinned"]) == (MASTER, False)
 
@@ -54,7 +54,7 @@ async def test_a_name_that_was_resolved(make_proxy: MakeProxy, master: FakeMaste
     port = where(master.uri)[1]
     await master.start("127.0.0.1")
     proxy = await make_proxy(master_uri=f"http://localhost:{port}")
-    await until(lambda: proxy.app.master_monitor.up, "the master is seen")
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
     assert (await master_status(proxy))["address"] in ("127.0.0.1", "::1")
 
 
@@ -65,9 +65,9 @@ async def test_the_master_moves(
     await node.publish(proxy.master)
     await master.stop()
     await master.start(ELSEWHERE)
-    await until(lambda: not proxy.app.master_monitor.up, "the master is missed")
+    await until(lambda: not proxy.ros1.master_monitor.up, "the master is missed")
     assert await tell(proxy, "/master-address", address=ELSEWHERE) == {"address": ELSEWHERE}
-    await until(lambda: proxy.app.master_monitor.up, "the master is found again")
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is found again")
     assert (await master_status(proxy))["address"] == ELSEWHERE
     late = await make_node("/late")
     assert (await late.publish(proxy.master))[0] == 1
@@ -99,7 +99,7 @@ async def test_no_address(proxy: Proxy, body: str) -> None:
     reply = await post(proxy, "/master-address", body)
     assert reply.status == 400
     assert b"address" in reply.body or b"the body: must be JSON" in reply.body
-    assert proxy.app.context.upstream.master_address is None
+    assert proxy.ros1.context.upstream.master_address is None
 
 
 async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(

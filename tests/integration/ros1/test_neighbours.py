@@ -98,7 +98,7 @@ async def test_a_tool_inside_can_unregister_whatever_it_was_told_of(proxy, maste
         )
         assert gone[2] == 1, (name, api)
     assert master.nodes == {}
-    assert not any(e.registrations for e in proxy.app.context.registry)
+    assert not any(e.registrations for e in proxy.ros1.context.registry)
 
 
 async def test_an_offer_of_udpros_passes_unharmed(proxy, node):

@@ -397,7 +397,7 @@ async def test_the_file_is_read_again(make_proxy, master, make_node, tmp_path):
     file.write_text("deny publish /chatter\n")
     await until(lambda: not master.holds("publishers", "/chatter"), "the file is read again")
     file.write_text("deny everything\n")
-    problems = proxy.app.context.problems.all
+    problems = proxy.ros1.context.problems.all
     await until(lambda: "--policy-file" in [p.subject for p in problems()], "it is told")
     assert master.holds("publishers", "/chatter") == []
     file.write_text("allow publish *\n")
@@ -417,7 +417,7 @@ async def test_a_bad_policy_names_what_is_wrong(proxy, body, says):
     reply = await post(proxy, "/policy", body)
     assert reply.status == 400
     assert says in reply.body
-    assert proxy.app.context.policy.layers == ()
+    assert proxy.ros1.context.policy.layers == ()
 
 
 # 6. Restarts

@@ -24,7 +24,7 @@ async def populate(proxy: Proxy, nodes: list[FakeNode]) -> None:
 
 
 def all_served(proxy: Proxy) -> bool:
-    registry = proxy.app.context.registry
+    registry = proxy.ros1.context.registry
     return len(registry) == NODES and all(endpoint.trusted for endpoint in registry)
 
 

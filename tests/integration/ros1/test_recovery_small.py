@@ -266,7 +266,7 @@ async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_them(
     assert uri_of(master, "/a") == successor.uri
     assert "shutdown" not in dict(successor.calls)
     slave = HostPort(nodes[0].address, nodes[0].slave.address[1])
-    assert not [e for e in proxy.app.context.registry if e.slave == slave and e.registrations]
+    assert not [e for e in proxy.ros1.context.registry if e.slave == slave and e.registrations]
 
 
 async def test_a_node_that_is_down_is_not_registered_at_a_new_master(make_proxy, master, nodes):

@@ -12,7 +12,7 @@ from examples.demo.fake_http import End
 from examples.demo.fake_http import value as answer
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy import app
+from rosproxy.app import ros1 as app
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.upkeep import resubscriber
 from tests.integration.net import (
@@ -73,7 +73,7 @@ async def served(proxy: Proxy, *nodes: FakeNode) -> None:
 
 
 def known(proxy: Proxy, node: FakeNode) -> bool:
-    slaves = [e.slave for e in proxy.app.context.registry if e.trusted]
+    slaves = [e.slave for e in proxy.ros1.context.registry if e.trusted]
     return HostPort(node.address, node.slave.address[1]) in slaves
 
 

@@ -5,11 +5,19 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.admin.status_bounds import MOST, MOST_HIDDEN, bounded, fair_shares, first_hidden
+from rosproxy.admin.status_bounds import (
+    MOST,
+    MOST_HIDDEN,
+    bounded,
+    bounded_names,
+    fair_shares,
+    first_hidden,
+)
 from rosproxy.admin.status_document import (
     ConnectionStatus,
     EndpointStatus,
     HiddenStatus,
+    ParticipantStatus,
     ProxyStatus,
     to_json,
 )
@@ -68,3 +76,23 @@ def test_what_is_hidden_is_bounded_too() -> None:
     assert 0 < sum(len(json.dumps(to_json(one))) for one in shown) < 1.1 * MOST_HIDDEN
     assert shown == many[: len(shown)]
     assert first_hidden(many[:3]) == many[:3]
+
+
+@given(st.lists(st.lists(st.integers(0, 30), max_size=9), max_size=5), st.integers(0, 300))
+def test_names_of_participants_fit(lengths: list[list[int]], most: int) -> None:
+    """Sixty participants with the longest names had megabytes of them."""
+    before = [
+        ParticipantStatus(
+            publishes=tuple("p" * one for one in own),
+            subscribes=tuple("s" * one for one in own),
+            services=tuple("v" * one for one in own),
+        )
+        for own in lengths
+    ]
+    after = bounded_names(before, most)
+    shown = [(*one.publishes, *one.subscribes, *one.services) for one in after]
+    assert sum(len(name) + 3 for names in shown for name in names) <= most
+    for had, one, names in zip(before, after, shown, strict=True):
+        everything = (*had.publishes, *had.subscribes, *had.services)
+        assert everything[: len(names)] == names
+        assert one.left_out == len(everything) - len(names)

@@ -47,13 +47,14 @@ def test_head_names_stand_ins() -> None:
     status["stand_ins"] = []
     assert "reached from inside" not in shown(status, 120)
     status["stand_ins"] = [
-        {"port": port, "uri": f"http://r:{port}/", "connections": 2} for port in range(4001, 4008)
+        {"port": port, "uri": f"http://r:{port}/", "connections": 2, "received_rate": 500.0}
+        for port in range(4001, 4008)
     ]
     assert (
-        "outside  reached from inside at 7 ports (14 connections): 4001 for http://r:4001/, "
-        "4002 for http://r:4002/, 4003 for http://r:4003/, 4004 for http://r:4004/, "
-        "4005 for http://r:4005/ and 2 more"
-    ) in shown(status, 200).split("\n")
+        "outside  reached from inside at 7 ports (14 connections, 3.5 kB/s in): "
+        "4001 for http://r:4001/, 4002 for http://r:4002/, 4003 for http://r:4003/, "
+        "4004 for http://r:4004/, 4005 for http://r:4005/ and 2 more"
+    ) in shown(status, 250).split("\n")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from typing import Any
 
+from rosproxy.admin.findings import DoctorFinding, Severity
 from rosproxy.admin.requests import read_probe
 from rosproxy.admin.status_document import read_status
 from rosproxy.doctor.facts import (
@@ -14,7 +15,6 @@ from rosproxy.doctor.facts import (
     SlaveReport,
     SystemState,
 )
-from rosproxy.doctor.findings import DoctorFinding, Severity
 from tests.unit.status_json import HOST, make_node, make_status
 
 ANSWERED = Attempt(Reach.ANSWERED)

@@ -1,6 +1,7 @@
 """How findings are shown."""
 
-from rosproxy.doctor.findings import DoctorFinding, Severity, as_json, failed, render
+from rosproxy.admin.findings import DoctorFinding, Severity, failed
+from rosproxy.doctor.findings import as_json, render
 from rosproxy.doctor.rules import diagnose
 from tests.unit.doctor.cases import make_facts
 
@@ -27,7 +28,7 @@ def test_the_worst_stands_last_each_with_what_mends_it() -> None:
         "ERROR    /talker: gone",
         "         > rosnode cleanup",
         "",
-        "2 errors, 1 warning.",
+        "2 errors, 1 warning. Begin with /talker: the others may follow from it.",
     ]
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from rosproxy.admin.findings import DoctorFinding, Severity
 from rosproxy.doctor.facts import (
     Attempt,
     DoctorFacts,
@@ -14,7 +15,6 @@ from rosproxy.doctor.facts import (
     SystemState,
     scope,
 )
-from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import pair as pair_rules
 from tests.unit.doctor.cases import (
     INSIDE_URI,
@@ -202,7 +202,7 @@ def test_a_subscriber_outside_that_does_not_come() -> None:
     assert found.fix.startswith("on the machine of /listener: nc -vz robot-host 45000")
 
 
-def subscriber_inside(**settings: str) -> DoctorFinding:
+def subscriber_inside(**settings: str | bool) -> DoctorFinding:
     """A publisher outside that serves its topic, and a subscriber behind the proxy."""
     giver = silent_talker(uri=OUTSIDE_URI, attempt=Attempt(Reach.ANSWERED))
     ports = {("/talker", "/chatter"): ("192.168.0.9:5000", Attempt(Reach.ANSWERED))}
@@ -221,6 +221,8 @@ def test_a_subscriber_inside_that_has_the_proxy_as_its_way() -> None:
     found = subscriber_inside(direction="both")
     assert f"has not come to the proxy's port for {OUTSIDE_URI}" in found.text
     assert "--direction" not in found.fix
+    assert "if it wants UDP alone: --udp" in found.fix
+    assert "--udp" not in subscriber_inside(direction="both", udp=True).fix
 
 
 def outside_pair(data_port: tuple[str, Attempt]) -> DoctorFinding:

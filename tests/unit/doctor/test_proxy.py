@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from rosproxy.admin.findings import DoctorFinding, Severity
 from rosproxy.doctor.facts import Attempt, DoctorFacts, Reach
-from rosproxy.doctor.findings import DoctorFinding, Severity
 from rosproxy.doctor.rules import proxy as proxy_rules
 from tests.unit.doctor.cases import (
     make_facts,

@@ -34,6 +34,14 @@ def test_words() -> None:
     assert slave_report(None, "x", 3) == SlaveReport()
 
 
+def test_a_connection_that_is_none_is_not_counted() -> None:
+    """A boolean is read as its text."""
+    rows = [
+        [n, "/x", "o", "TCPROS", f"/{n}", said] for n, said in enumerate((True, 1, "1", 0, "0"))
+    ]
+    assert {topic for _, topic, _ in slave_report([], [], rows).peers} == {"/0", "/1", "/2"}
+
+
 @pytest.mark.parametrize(
     ("answer", "where"),
     [

@@ -1,11 +1,14 @@
 """Whose connections the kernel forwards, and how many bytes went through them."""
 
+from collections.abc import Iterable
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.forwarding.kernel import accounting
 from rosproxy.forwarding.kernel.accounting import Account, CounterDeltas, KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.nft import Counts
 from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
@@ -33,33 +36,41 @@ def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
     return Flow("ESTABLISHED", HostPort(peer, 1), port, HostPort(endpoint.place.address, 50000))
 
 
-@given(st.lists(st.tuples(st.integers(0, 1000), st.integers(0, 1000))))
-def test_no_byte_is_lost_or_counted_twice(steps: list[tuple[int, int]]) -> None:
-    ledger, counter, counted = CounterDeltas(), (0, 0), (0, 0)
-    for sent, received in steps:
-        counter = counter[0] + sent, counter[1] + received
-        more = ledger.take({45050: counter}).get(45050, (0, 0))
-        counted = counted[0] + more[0], counted[1] + more[1]
+STEPS = st.tuples(st.integers(0, 1000), st.integers(0, 1000), st.integers(0, 10))
+
+
+def added(one: Counts, other: Iterable[int]) -> Counts:
+    return Counts(*map(sum, zip(one, other, strict=True)))
+
+
+@given(st.lists(STEPS))
+def test_nothing_is_lost_or_counted_twice(steps: list[tuple[int, int, int]]) -> None:
+    ledger, counter, counted = CounterDeltas(), Counts(), Counts()
+    for step in steps:
+        counter = added(counter, step)
+        counted = added(counted, ledger.take({45050: counter}).get(45050, Counts()))
     assert counted == counter
 
 
 def test_counters_that_begin_anew_are_added() -> None:
     ledger = CounterDeltas()
-    assert ledger.take({1: (100, 10)}) == {1: (100, 10)}
-    assert ledger.take({1: (100, 10)}) == {}
-    assert ledger.take({1: (30, 3)}) == {1: (30, 3)}
-    assert ledger.take({1: (31, 3), 2: (5, 0)}) == {1: (1, 0), 2: (5, 0)}
+    assert ledger.take({1: Counts(100, 10)}) == {1: Counts(100, 10)}
+    assert ledger.take({1: Counts(100, 10)}) == {}
+    assert ledger.take({1: Counts(30, 3)}) == {1: Counts(30, 3)}
+    assert ledger.take({1: Counts(31, 3), 2: Counts(5)}) == {1: Counts(1), 2: Counts(5)}
+    assert ledger.take({1: Counts(31, 3, 7)}) == {1: Counts(packets=7)}
 
 
 def test_bytes_go_to_who_holds_the_port_and_to_its_name() -> None:
     _, book, (endpoint,) = a_book(1)
-    assert book.count({1002: (400, 40), 1003: (5, 6)}, 10.0) == [
-        ("/node1", 400, 40),
-        ("unnamed", 5, 6),
+    assert book.count({1002: Counts(400, 40, 2), 1003: Counts(5, 6)}, 10.0) == [
+        ("/node1", Counts(400, 40, 2)),
+        ("unnamed", Counts(5, 6)),
     ]
-    assert book.count({1002: (600, 40), 1003: (5, 6)}, 12.0) == [("/node1", 200, 0)]
-    assert book.account(endpoint) == Account(600, 40, (100.0, 0.0))
-    book.count({1002: (600, 40)}, 14.0)
+    more = book.count({1002: Counts(600, 40, 3), 1003: Counts(5, 6)}, 12.0)
+    assert more == [("/node1", Counts(200, 0, 1))]
+    assert book.account(endpoint) == Account(600, 40, 3, (100.0, 0.0))
+    book.count({1002: Counts(600, 40, 3)}, 14.0)
     assert book.account(endpoint).rates == (0.0, 0.0)
 
 
@@ -92,25 +103,25 @@ def test_peers_are_those_of_the_nodes_own_address() -> None:
 
 def test_what_comes_in_and_is_not_answered_twice_in_a_row_is_silent() -> None:
     silence = accounting.UnansweredPorts()
-    assert silence.look({1: (0, 60), 2: (0, 60), 3: (5, 60)}, 10.0) == []
-    assert silence.look({1: (0, 60), 2: (40, 60), 3: (0, 60)}, 13.0) == [1]
-    assert silence.look({3: (0, 60), 1: (0, 0)}, 16.0) == [3]
+    assert silence.look({1: Counts(0, 60), 2: Counts(0, 60), 3: Counts(5, 60)}, 10.0) == []
+    assert silence.look({1: Counts(0, 60), 2: Counts(40, 60), 3: Counts(0, 60)}, 13.0) == [1]
+    assert silence.look({3: Counts(0, 60), 1: Counts(0, 0)}, 16.0) == [3]
     assert silence.look({}, 19.0) == []
-    assert silence.look({3: (0, 60)}, 22.0) == []
+    assert silence.look({3: Counts(0, 60)}, 22.0) == []
 
 
 def test_looks_that_follow_each_other_at_once_are_one_window() -> None:
     silence = accounting.UnansweredPorts()
-    assert silence.look({1: (0, 60), 2: (0, 60)}, 10.0) == []
-    assert silence.look({1: (0, 60), 2: (0, 60)}, 10.1) == []
-    assert silence.look({1: (40, 0)}, 11.9) == []
+    assert silence.look({1: Counts(0, 60), 2: Counts(0, 60)}, 10.0) == []
+    assert silence.look({1: Counts(0, 60), 2: Counts(0, 60)}, 10.1) == []
+    assert silence.look({1: Counts(40, 0)}, 11.9) == []
     assert silence.look({}, 12.0) == [2]
 
 
 def test_silent_ports_are_noted_with_the_bytes() -> None:
     _, book, _ = a_book(1)
     for size in (60, 120):
-        book.count({1002: (0, size)}, float(size))
+        book.count({1002: Counts(0, size)}, float(size))
     assert book.unanswered == [1002]
-    book.count({1002: (40, 180)}, 200.0)
+    book.count({1002: Counts(40, 180)}, 200.0)
     assert book.unanswered == []

@@ -48,7 +48,7 @@ BOTH = HostForwarding()
     ("endpoint", "world", "why"),
     [
         (an_endpoint(trusted=False), BOTH, "does not answer"),
-        (an_endpoint(tcpros_port=None), BOTH, "nobody outside has asked"),
+        (an_endpoint(tcpros_port=None), BOTH, "nobody has asked"),
         (an_endpoint(topic_ports={"/a": 50001}), BOTH, "several TCPROS ports"),
         (an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None), BOTH, "several"),
         (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),

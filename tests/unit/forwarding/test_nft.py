@@ -3,17 +3,28 @@
 import contextlib
 import json
 import re
+from ipaddress import ip_network
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.forwarding.kernel.nft import Marks, NftError, Table, TableState, dropping_chains
+from rosproxy.forwarding.kernel.nft import (
+    Counts,
+    Marks,
+    NftError,
+    Table,
+    TableState,
+    Transport,
+    dropping_chains,
+)
 from rosproxy.forwarding.kernel.policy import Changes
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 
-TABLE = Table(11311)
+TABLE = Table(11311, PortRange(45000, 45999))
+UDP = Table(45000, PortRange(45000, 45999), Transport.UDP)
 FOUR, SIX = HostPort("10.0.0.5", 50000), HostPort("fd00::5", 50001)
 
 
@@ -72,6 +83,25 @@ def test_forwards_become_elements() -> None:
     }
 
 
+def test_what_leads_outside_is_open_to_those_who_are_near_alone() -> None:
+    near = [ip_network("172.30.0.0/16"), ip_network("fd30::/64")]
+    made = TABLE.made({45050: FOUR, 26400: SIX}, near=near)
+    assert elements(made, "add")["inward"] == ["26400"]
+    rules = re.search(r"chain prerouting {(.*?)}", made, re.S)
+    assert rules is not None
+    first, second, third = rules[1].strip().splitlines()[1:4]
+    assert first.strip() == "tcp dport @inward ip saddr != @near4 return"
+    assert second.strip() == "tcp dport @inward ip6 saddr != @near6 return"
+    assert "tcp dport map @marks" in third
+    opened = TABLE.opened(near)
+    assert opened.count("flush set inet rosproxy-11311 near") == 2
+    for document in (made, opened):
+        assert elements(document, "add")["near4"] == ["172.30.0.0/16"]
+        assert elements(document, "add")["near6"] == ["fd30::/64"]
+    assert elements(TABLE.changed(Changes({26400: SIX}, {})), "delete")["inward"] == ["26400"]
+    assert "near4" not in elements(TABLE.opened([]), "add")
+
+
 @pytest.mark.parametrize("host", ["robot", "10.0.0.5 }; flush ruleset", "fe80::1%}\nflush ruleset"])
 def test_nothing_but_addresses_gets_into_a_document(host: str) -> None:
     document = TABLE.made({45050: HostPort(host, 50000)})
@@ -95,12 +125,39 @@ def test_what_is_no_longer_forwarded_is_still_counted() -> None:
     assert {"sent", "received"}.isdisjoint(elements(document, "delete"))
 
 
+def test_connections_that_are_cut_are_reset_for_who_has_connected() -> None:
+    reset = "ct direction original ct mark @cut reject with tcp reset"
+    assert reset in TABLE.made({})
+    assert "reset" not in UDP.made({})
+    marks = [str(TABLE.marks.of(port)) for port in (26400, 45050)]
+    assert elements(TABLE.cut({45050, 26400}), "add") == {"cut": marks}
+    assert elements(TABLE.cut({45050, 26400}, "delete"), "delete") == {"cut": marks}
+
+
 def test_ending_forwards_nothing_new_and_resets_what_comes() -> None:
     *flushed, rule = TABLE.ended().splitlines()
     maps = ("marks", "hosts4", "hosts6", "ports")
     assert flushed == [f"flush map inet rosproxy-11311 {name}" for name in maps]
     assert rule.startswith("add rule inet rosproxy-11311 forward ct status dnat")
     assert rule.endswith(" reject with tcp reset")
+
+
+@pytest.mark.parametrize(("table", "other"), [(TABLE, "udp"), (UDP, "tcp")])
+def test_a_table_leaves_the_other_transport_alone(table: Table, other: str) -> None:
+    made = table.made({45050: FOUR})
+    assert not re.search(rf"\b{other} dport|l4proto {other}", made)
+    chains = dict(re.findall(r"chain (\w+) {\n(.*?)\n  }", made, re.S))
+    for name in ("postrouting", "forward"):
+        rules = [line for line in chains[name].splitlines() if "ct status dnat" in line]
+        assert rules
+        assert all(f"meta l4proto {table.transport} " in line for line in rules)
+    prerouting = chains["prerouting"].splitlines()[1:]
+    assert all(f"{table.transport} dport" in line for line in prerouting)
+
+
+def test_tables_of_both_transports_have_names_of_their_own() -> None:
+    same = Table(11311, PortRange(11311, 11399), Transport.UDP)
+    assert (TABLE.name, same.name) == ("rosproxy-11311", "rosproxy-udp-11311")
 
 
 def test_removing() -> None:
@@ -137,7 +194,11 @@ def test_counters_are_read_by_port() -> None:
         sent=[counter(mark(45050), 700), counter(mark(45051), 5), counter(7, 9)],
         received=[counter(mark(45050), 80), {"elem": {"val": mark(45052)}}, "odd", 4],
     )
-    assert TABLE.read(text).counters == {45050: (700, 80), 45051: (5, 0), 45052: (0, 0)}
+    assert TABLE.read(text).counters == {
+        45050: Counts(700, 80, 3),
+        45051: Counts(5),
+        45052: Counts(),
+    }
 
 
 def test_elements_that_do_not_fit_together_are_left_out() -> None:

@@ -201,3 +201,14 @@ def test_other_methods_pass_unparsed() -> None:
     assert direct(dump_fault(1, "robot")) == dump_fault(1, "robot")
     with pytest.raises(XmlRpcError):
         direct(b"whatever")
+
+
+def test_of_many_topics_the_latest_are_remembered() -> None:
+    where = HostPort("robot", 40001)
+    stand_in = book.StandIn(HostPort("172.30.0.2", 20001), f"http://{where}/", where, kept=False)
+    for number in range(book.MOST_TOPICS + 10):
+        stand_in.note_topic_port(f"/topic{number}", 40000 + number % 7)
+        stand_in.note_topic_port("/asked_often", 40002)
+    assert len(stand_in.topic_ports) == book.MOST_TOPICS
+    assert stand_in.topic_ports["/asked_often"] == 40002
+    assert "/topic0" not in stand_in.topic_ports

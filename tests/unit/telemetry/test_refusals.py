@@ -4,7 +4,7 @@ import pytest
 
 from rosproxy.telemetry.metrics import Metrics
 from rosproxy.telemetry.problems import Problems
-from rosproxy.telemetry.refusals import MOST, QUIET, Refusals
+from rosproxy.telemetry.refusals import LINES, MOST, QUIET, Refusals
 
 
 def test_each_refusal_counts_and_the_first_of_a_source_is_told(
@@ -31,5 +31,17 @@ def test_each_refusal_counts_and_the_first_of_a_source_is_told(
 def test_many_sources_are_forgotten() -> None:
     refusals = Refusals(Metrics(), Problems(), lambda: 0.0)
     for number in range(MOST + 10):
-        refusals.note("long_body", str(number), "x")
+        refusals.note(f"reason_{number // LINES}", str(number), "x")
     assert len(refusals._told) == MOST
+
+
+def test_forged_sources_do_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    clock = [0.0]
+    refusals = Refusals(Metrics(), Problems(), lambda: clock[0])
+    for number in range(1000):
+        refusals.note("rate", str(number), "x")
+    refusals.note("malformed", "10.0.0.5", "another reason")
+    assert len(caplog.records) == LINES + 1
+    clock[0] = QUIET
+    refusals.note("rate", "10.0.0.5", "x")
+    assert len(caplog.records) == LINES + 2

@@ -1,11 +1,26 @@
 """The rules of ``rosproxy doctor``: pure functions from gathered facts to findings."""
 
+from rosproxy.admin.findings import DoctorFinding, warning
 from rosproxy.doctor.facts import DoctorFacts
-from rosproxy.doctor.findings import DoctorFinding
-from rosproxy.doctor.rules import node, pair
+from rosproxy.doctor.rules import node, pair, ros2
 from rosproxy.doctor.rules import proxy as proxy_rules
 
 
 def diagnose(facts: DoctorFacts) -> list[DoctorFinding]:
     """Everything that can be said: about the proxy, the nodes, and the names asked for."""
-    return [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts)]
+    domains = ros2.check(facts)
+    if not facts.proxy.settings.for_ros1:
+        return [*proxy_rules.alive(facts), *proxy_rules.setup(facts), *domains]
+    return [*proxy_rules.check(facts), *node.check(facts), *pair.check(facts), *domains]
+
+
+def diagnose_running(facts: DoctorFacts) -> list[DoctorFinding]:
+    """What can be said again and again while the proxy runs, but for pairs and domains."""
+    if not facts.proxy.settings.for_ros1:
+        return []
+    return [*proxy_rules.running(facts), *node.check(facts)]
+
+
+def unknown_variable(name: str, text: str) -> DoctorFinding:
+    """A variable that is set where the doctor runs and that nothing reads."""
+    return warning("variable", name, text, f"unset {name}, and set the one that was meant")

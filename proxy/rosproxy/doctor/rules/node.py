@@ -4,25 +4,38 @@ import re
 from collections.abc import Iterator
 from ipaddress import ip_network
 
+from msgspec.structs import replace
+
+from rosproxy.admin.findings import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, Reach
-from rosproxy.doctor.findings import DoctorFinding, Severity, error, note, ok, warning
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
 
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
+TWO_PROXIES = "two proxies"
 CLEANUP = "rosnode cleanup (answer y)"
 _CONTAINER_ID = re.compile(r"[0-9a-f]{12}")
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about nodes; about those asked for only, if there are names."""
-    found = [*_inside(facts), *_registered(facts), *_services(facts), *_clock(facts)]
+    found = _cause_first([*_inside(facts), *_registered(facts), *_services(facts), *_clock(facts)])
     if not facts.names:
         yield from _counts(facts, found)
     wanted = facts.scope.nodes
     yield from (f for f in found if not facts.names or not f.subject or f.subject in wanted)
+
+
+def _cause_first(found: list[DoctorFinding]) -> list[DoctorFinding]:
+    """While two proxies take each other's nodes away, none that seems dead is cleaned up."""
+    first = [one for one in found if one.check == TWO_PROXIES]
+    if not first:
+        return found
+    others = [one for one in found if one.check != TWO_PROXIES]
+    wait = "part the two proxies first, then ask again"
+    return first + [replace(one, fix=wait) if CLEANUP in one.fix else one for one in others]
 
 
 def _counts(facts: DoctorFacts, found: list[DoctorFinding]) -> Iterator[DoctorFinding]:
@@ -96,13 +109,29 @@ def _registered(facts: DoctorFacts) -> Iterator[DoctorFinding]:
 def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     """A node whose address is in this proxy's range."""
     lease = facts.lease(node.where)
-    if lease is None:
+    if lease is None and _of_another(facts, node):
+        text = (
+            f"lives, registered as {node.uri}, and this proxy knows no such node: another rosproxy "
+            "advertises the same host and ports, and nodes get now the one's, now the other's"
+        )
+        fix = (
+            "end one of the two proxies, or give it another --port-range (ROSPROXY_PORT_RANGE), "
+            "published as well. No rosnode cleanup: it takes away nodes that live"
+        )
+        yield error(TWO_PROXIES, node.name, text, fix)
+    elif lease is None:
         text = f"registered as {node.uri}, a port that no node holds any more"
         yield error(STALE, node.name, text, CLEANUP)
     elif lease.advertised_uri != node.uri and node.name not in lease.nodes:
         holder = ", ".join(lease.nodes) or lease.uri
         text = f"registered as {node.uri}, a port that {holder} holds by now"
         yield error(STALE, node.name, text, f"restart it, or {CLEANUP}")
+
+
+def _of_another(facts: DoctorFacts, node: NodeFacts) -> bool:
+    """Whether a node at a port of this proxy's that nobody here holds has answered all the same."""
+    answered = node.attempt.reach is Reach.ANSWERED
+    return answered and facts.ours(node.where) and facts.lease(node.where) is None
 
 
 def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
@@ -185,6 +214,8 @@ def _services(facts: DoctorFacts) -> Iterator[DoctorFinding]:
         where = parse_service_uri(uri)
         if facts.ours(where) and not facts.lease(where):
             subject = next(iter(facts.system.services.get(service, ())), service)
+            if subject in facts.nodes and _of_another(facts, facts.nodes[subject]):
+                continue
             text = f"its service {service} is registered as {uri}, a port that no node holds"
             yield error(STALE, subject, text, f"restart it, or {CLEANUP}")
 

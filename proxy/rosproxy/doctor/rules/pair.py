@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from difflib import get_close_matches
 
+from rosproxy.admin.findings import DoctorFinding, error, note, ok
 from rosproxy.doctor.facts import Attempt, DoctorFacts, NodeFacts, Reach
-from rosproxy.doctor.findings import DoctorFinding, error, note, ok
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import is_loopback, parse_host_port
 from rosproxy.telemetry.text import listed, size
@@ -23,7 +23,7 @@ def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     scope = facts.scope
     yield from (_unknown(facts, name) for name in scope.unknown)
     yield from (_lonely(facts, topic) for topic in scope.lonely)
-    yield from (_pair(facts, *pair) for pair in scope.pairs)
+    yield from (judge_pair(facts, *pair) for pair in scope.pairs)
     yield from (_service(facts, service) for service in scope.services)
     together = [name for name in facts.names if name not in {*scope.services, *scope.unknown}]
     if scope.named and len(together) > 1 and not scope.pairs:
@@ -55,7 +55,8 @@ def _lonely(facts: DoctorFacts, topic: str) -> DoctorFinding:
     return (error if topic in facts.names else note)(PAIR, topic, text, fix)
 
 
-def _pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
+def judge_pair(facts: DoctorFacts, topic: str, publisher: str, subscriber: str) -> DoctorFinding:
+    """Whether a publisher and a subscriber are connected, else why not."""
     giver, taker = facts.nodes[publisher], facts.nodes[subscriber]
     label = f"{topic} from {publisher} to {subscriber}"
     if connected(topic, giver, taker):
@@ -142,7 +143,10 @@ def _why_not_from_inside(
     log = f"look into the log of {taker.name}"
     if facts.proxy.settings.direction == "both":
         text = f"{text} the proxy's port for {giver.uri}, {differ}"
-        return text, f"{log} and of the proxy; restart {taker.name}"
+        fix = f"{log} and of the proxy; restart {taker.name}"
+        if not facts.proxy.settings.udp:
+            fix += "; if it wants UDP alone: --udp (label rosproxy.udp=true, spec.udp: true)"
+        return text, fix
     where = parse_host_port(address)
     test = f"nc -vz {where.host} {where.port}" if where else f"a connection to {giver.uri}"
     return (

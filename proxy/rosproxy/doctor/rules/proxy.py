@@ -3,36 +3,38 @@
 from collections.abc import Iterator
 from urllib.parse import urlsplit
 
+from rosproxy.admin.findings import DoctorFinding, Severity, error, note, ok, warning
+from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, few_ports, published_range
 from rosproxy.doctor.facts import DoctorFacts, MasterFacts, Reach
-from rosproxy.doctor.findings import DoctorFinding, error, note, ok, warning
 from rosproxy.net.addresses import is_loopback
-from rosproxy.telemetry.text import duration, plural
+from rosproxy.telemetry.text import duration
 
-FEW_FREE = 0.1
-"""Share of the range that should be free at least."""
-
-RANGE = "published range"
-_BY_ADDRESS = "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
 _OTHER_URI = "give the real master's address: --master-uri http://HOST:11311 (ROS_MASTER_URI)"
-_NO_WAY_BACK = ("refused", "silent", "unreachable")
-"""How the proxy's own try may end although outside gets through: NAT has no hairpin."""
-_TRIES = {
-    "refused": "nothing listens there: the range is not published, or the host is another machine",
-    "silent": "no answer: a firewall drops it, or the host is not this one",
-    "unreachable": "no way leads there",
-    "unresolvable": "the host name is unknown here",
-    "closed": "something takes the connection and drops it: published to another port or container",
-    "stranger": "something else answers there, not this proxy",
-}
 
 
 def check(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     """All findings about the proxy."""
-    for rule in (_admin, _master, _advertised_host, _range, _ports, _published_master):
+    yield from alive(facts)
+    yield from setup(facts)
+    yield from _published_master(facts)
+
+
+def setup(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    """Whether it is set up as it has to be, the first cause first."""
+    if facts.proxy.settings.for_ros1:
+        yield from _master(facts)
+    for rule in (_advertised_host, _range, _ports):
         yield from rule(facts)
 
 
-def _admin(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+def running(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    """What can be said again and again, without a try of the range (`rosproxy.app.self_check`)."""
+    yield from _master(facts)
+    yield from _ports(facts)
+
+
+def alive(facts: DoctorFacts) -> Iterator[DoctorFinding]:
+    """Whether the proxy answers."""
     if facts.status is not None:
         up = duration(facts.status.uptime)
         yield ok("admin", "proxy", f"rosproxy {facts.status.version} at {facts.admin}, up {up}")
@@ -96,17 +98,18 @@ def _unanswered(master: MasterFacts) -> tuple[str, str]:
 
 
 def _advertised_host(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    host, check = facts.advertise_host, "advertised host"
+    host = facts.advertise_host
     if not host:
         if facts.admin_error:
             fix = "give --advertise-host (ROSPROXY_ADVERTISE_HOST)"
-            yield note(check, check, "not checked: it is not known", fix)
-    elif is_loopback(host) and facts.master and not local_master(facts):
-        text = f"{host} is a loopback address: to every other machine it means that machine itself"
-        fix = "--advertise-host ADDRESS, the address of this host in the network of the robots"
-        yield error(check, check, text, f"{fix} (ROSPROXY_ADVERTISE_HOST)")
-    elif not facts.advertised_addresses and facts.status is None:
-        yield error(check, check, f"the host name {host} can't be resolved here", _BY_ADDRESS)
+            yield note(HOST, HOST, "not checked: it is not known", fix)
+        return
+    tried = facts.probe.probes if facts.probe else ()
+    if not is_loopback(host) and any(probe.from_master == "ok" for probe in tried):
+        return  # others find this host by it, whatever it means here
+    if facts.master or not facts.proxy.settings.for_ros1 or not is_loopback(host):
+        all_here = facts.all_here or local_master(facts)
+        yield from advertised_host(host, facts.advertised_addresses, all_here)
 
 
 def local_master(facts: DoctorFacts) -> bool:
@@ -123,79 +126,15 @@ def _range(facts: DoctorFacts) -> Iterator[DoctorFinding]:
     if facts.probe is None:
         yield warning(RANGE, RANGE, f"not tried: {facts.probe_error}")
         return
-    outcomes: dict[tuple[str, str], list[str]] = {}
-    for probe in facts.probe.probes:
-        port = probe.advertised.rpartition(":")[2]
-        outcomes.setdefault((probe.from_proxy, probe.from_master), []).append(port)
-    for (mine, masters), ports in outcomes.items():
-        at = f"{facts.advertise_host}, port {' and '.join(ports)}"
-        if mine == "ok" or masters == "ok":
-            yield _reached(facts, mine, masters, at)
-        else:
-            yield _not_reached(facts, mine, masters, at, len(outcomes) == 1)
-
-
-def _reached(facts: DoctorFacts, mine: str, masters: str, at: str) -> DoctorFinding:
-    """What tries at free ports mean of which one came through, the proxy's own or the master's."""
-    if masters == "ok":
-        back = "" if mine == "ok" else f" (the proxy itself does not, {mine}: no harm)"
-        return ok(RANGE, RANGE, f"the master reaches {at}{back}")
-    if masters == "unknown":
-        return ok(RANGE, RANGE, f"the proxy reaches {at}; the master could not be asked to try")
-    text = (
-        f"{at}: reached from here, but not from the master's machine. For that it is another "
-        "machine, an address that only this side has, or behind a firewall"
-    )
-    fix = (
-        "--advertise-host ADDRESS: this host as the master's machine knows it "
-        "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
-    )
-    return error(RANGE, RANGE, text, f"{fix} {facts.advertise_host} {at.rpartition(' ')[2]}")
-
-
-def _not_reached(
-    facts: DoctorFacts, mine: str, masters: str, at: str, whole: bool
-) -> DoctorFinding:
-    ports = facts.proxy.ports
-    fix = f"docker run -p {ports.advertise}:{ports.listen}"
-    if mine == "unresolvable":
-        fix = _BY_ADDRESS
-    elif whole:
-        fix += ", and let it through the firewall; or correct --advertise-host, now "
-        fix += facts.advertise_host
-    else:
-        fix = f"publish the whole range: {fix}"
-    text = f"{at}: {_TRIES.get(mine, mine)}"
-    if masters == "missed":
-        return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
-    if mine in _NO_WAY_BACK:
-        text += ". Or only the way back is missing; the master, which could tell, is not there"
-        return warning(RANGE, RANGE, text, fix)
-    return error(RANGE, RANGE, text, fix)
+    known = bool(facts.advertised_addresses)
+    for found in published_range(facts.probe, facts.advertise_host, facts.proxy.ports):
+        if known or found.severity is Severity.OK:  # else it has been told that it is unknown
+            yield found
 
 
 def _ports(facts: DoctorFacts) -> Iterator[DoctorFinding]:
-    if facts.status is None:
-        return
-    ports = facts.status.ports
-    used, free, blocked = ports.used, ports.free, ports.blocked
-    larger = (
-        "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
-        "was refused"
-    )
-    if blocked:
-        first, _, last = ports.listen.partition("-")
-        text = f"{plural(blocked, 'port')} of the range {ports.listen} held by other programs"
-        fix = f"ss -ltnp 'sport >= :{first} and sport <= :{last}'; or another --port-range"
-        yield warning("ports", "ports", text, fix)
-    if not free:
-        text = f"none is free, {used} used: no further node gets in"
-        yield error("ports", "ports", text, larger)
-    elif free < FEW_FREE * (used + free + blocked):
-        yield warning("ports", "ports", f"only {free} left, {used} used", larger)
-    else:
-        text = f"{ports.listen} as {ports.advertise}, {used} used, {free} free"
-        yield ok("ports", "ports", text)
+    if facts.status is not None:
+        yield from few_ports(facts.status.ports)
 
 
 def _published_master(facts: DoctorFacts) -> Iterator[DoctorFinding]:

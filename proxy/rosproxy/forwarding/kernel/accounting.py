@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.nft import Counters
+from rosproxy.forwarding.kernel.nft import Counters, Counts
 from rosproxy.leases.fast_ports import Holder, Holders
 
 SILENCE_WINDOW = 2.0
@@ -14,30 +14,32 @@ SILENCE_WINDOW = 2.0
 
 @dataclass(slots=True)
 class Account:
-    """Bytes of IP packets of one endpoint: sent outside, and received from there.
+    """Bytes of IP packets of one node's connections: sent outside, and received from there.
 
-    ``rates`` are both in bytes per second, as of the last count.
+    ``packets`` are those that came to its port; ``rates`` are both in bytes per second, as of the
+    last count.
     """
 
     sent: int = 0
     received: int = 0
+    packets: int = 0
     rates: tuple[float, float] = (0.0, 0.0)
 
 
 class CounterDeltas:
-    """Bytes by port, from counters that begin anew whenever their table is made again."""
+    """What was counted by port, from counters that begin anew when their table is made again."""
 
     def __init__(self) -> None:
         self._last: Counters = {}
 
-    def take(self, counters: Counters) -> dict[int, tuple[int, int]]:
+    def take(self, counters: Counters) -> dict[int, Counts]:
         """What has been counted since the last time, by port; ports without anything left out."""
         grown = {}
-        for port, (sent, received) in counters.items():
-            before = self._last.get(port, (0, 0))
-            if sent < before[0] or received < before[1]:
-                before = 0, 0
-            grown[port] = sent - before[0], received - before[1]
+        for port, now in counters.items():
+            before = self._last.get(port, Counts())
+            if any(one < former for one, former in zip(now, before, strict=True)):
+                before = Counts()
+            grown[port] = Counts(*(one - b for one, b in zip(now, before, strict=True)))
         self._last = counters
         return {port: more for port, more in grown.items() if any(more)}
 
@@ -56,7 +58,7 @@ class UnansweredPorts:
 
     def look(self, grown: Counters, now: float) -> list[int]:
         """The ports that were silent in two windows in a row, by what was counted of late."""
-        for port, (sent, received) in grown.items():
+        for port, (sent, received, _) in grown.items():
             out, into = self._bytes.get(port, (0, 0))
             self._bytes[port] = out + sent, into + received
         if now - self._began < SILENCE_WINDOW:
@@ -89,19 +91,25 @@ class KernelAccounts:
         known = set(self.owners.values())
         self._accounts = {e: account for e, account in self._accounts.items() if e in known}
 
-    def count(self, counters: Counters, now: float) -> list[tuple[str, int, int]]:
+    def owns(self, endpoint: Holder) -> bool:
+        """Whether an endpoint had a fast port when that was last looked at."""
+        return any(owner is endpoint for owner in self.owners.values())
+
+    def count(self, counters: Counters, now: float) -> list[tuple[str, Counts]]:
         """Take in counters; what was sent and received since the last time, by node name."""
         passed, self._counted_at = now - self._counted_at, now
         for account in self._accounts.values():
             account.rates = 0.0, 0.0
         grown, by_port = [], self._deltas.take(counters)
         self.unanswered = self._silence.look(by_port, now)
-        for port, (sent, received) in by_port.items():
+        for port, (back, there, packets) in by_port.items():
             endpoint = self.owners.get(port)
+            outwards = endpoint is not None and not endpoint.inside
+            more = Counts(*((there, back) if outwards else (back, there)), packets)
             if endpoint is not None:
-                self._add(endpoint, sent, received, passed)
+                self._add(endpoint, more, passed)
             names = endpoint.caller_ids if endpoint else []
-            grown.append((names[0] if names else "unnamed", sent, received))
+            grown.append((names[0] if names else "unnamed", more))
         return grown
 
     def note_peers(self, flows: Sequence[Flow]) -> None:
@@ -126,10 +134,11 @@ class KernelAccounts:
         """The fast ports that connections to an endpoint may go through."""
         return [port for port, owner in self.owners.items() if owner is endpoint]
 
-    def _add(self, endpoint: Holder, sent: int, received: int, passed: float) -> None:
+    def _add(self, endpoint: Holder, more: Counts, passed: float) -> None:
         account = self._accounts.setdefault(endpoint, Account())
-        account.sent += sent
-        account.received += received
+        account.sent += more.sent
+        account.received += more.received
+        account.packets += more.packets
         out, into = account.rates
         if passed > 0:
-            account.rates = out + sent / passed, into + received / passed
+            account.rates = out + more.sent / passed, into + more.received / passed

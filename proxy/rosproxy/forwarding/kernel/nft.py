@@ -1,34 +1,62 @@
-"""nftables: the proxy's table and its changes as nft takes them, its state as nft prints it.
+"""nftables: the proxy's tables and their changes as nft takes them, their state as nft prints it.
 
-One table per proxy, named after its master port, so that two of them in one network namespace
-leave each other alone. It holds maps from fast port to mark, address and port; sets that count
-bytes by mark; and three chains, which stay as they are however many forwards there are:
+One table per proxy and transport, with a number in its name that no other proxy in the same network
+namespace has: for TCP the master port, for UDP the first port of the range. It holds maps from port
+to mark, address and port; sets that count bytes by mark; the marks of connections that are being
+cut (``cut``); the ports of nodes outside (``inward``) and who may use those (``near``); and three
+chains, which stay as they are however many forwards there are:
 
 - prerouting: what comes in for an address of this machine gets its port's mark (on the
   connection) and is sent on to the node;
 - postrouting: it leaves with this machine's address, so that the node's replies come back;
 - forward: bytes of IP packets are counted, in each direction, before any filter: what one drops
-  is counted as well, so that it is known to have come.
+  is counted as well, so that it is known to have come. Datagrams that came in fragments are whole
+  there.
 
 Documents are in nft's own language (nft(8)), output is JSON (libnftables-json(5)).
 """
 
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from enum import StrEnum
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from rosproxy.forwarding.kernel.policy import Changes, Forwards
-from rosproxy.net.addresses import HostPort, is_address, parse_address
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort, Network, is_address, parse_address
 
 Json = Any
-Counters = Mapping[int, tuple[int, int]]
-"""Bytes of IP packets by port: sent outside, received from there."""
+Near = Sequence[Network]
+"""Who may use the fast ports of nodes outside, IPv4 and IPv6; none overlaps another."""
+
+
+class Transport(StrEnum):
+    """What a table forwards."""
+
+    TCP = "tcp"
+    UDP = "udp"
+
+
+class Counts(NamedTuple):
+    """Bytes of IP packets from the node to who has connected to it, and back; the latter's packets.
+
+    A packet of UDP is a datagram.
+    """
+
+    sent: int = 0
+    received: int = 0
+    packets: int = 0
+
+
+Counters = Mapping[int, Counts]
+"""What was counted, by port."""
 
 _MAPS = ("marks", "hosts4", "hosts6", "ports")
 _SETS = ("sent", "received")
+_NOTHING = 0, 0
 _MADE = Template("""\
 add table inet $name
 delete table inet $name
@@ -39,23 +67,31 @@ table inet $name {
   map ports { type inet_service : inet_service; }
   set sent { type mark; counter; }
   set received { type mark; counter; }
+  set cut { type mark; }
+  set inward { type inet_service; }
+  set near4 { type ipv4_addr; flags interval; }
+  set near6 { type ipv6_addr; flags interval; }
   chain prerouting {
     type nat hook prerouting priority -100; policy accept;
-    fib daddr type local ct mark set tcp dport map @marks
-    fib daddr type local dnat ip to tcp dport map @hosts4 : tcp dport map @ports
-    fib daddr type local dnat ip6 to tcp dport map @hosts6 : tcp dport map @ports
+    $transport dport @inward ip saddr != @near4 return
+    $transport dport @inward ip6 saddr != @near6 return
+    fib daddr type local ct mark set $transport dport map @marks
+    fib daddr type local dnat ip to $transport dport map @hosts4 : $transport dport map @ports
+    fib daddr type local dnat ip6 to $transport dport map @hosts6 : $transport dport map @ports
   }
   chain postrouting {
     type nat hook postrouting priority 100; policy accept;
-    ct status dnat ct mark @sent masquerade
+    meta l4proto $transport ct status dnat ct mark @sent masquerade
   }
   chain forward {
     type filter hook forward priority -300; policy accept;
-    ct status dnat ct direction reply ct mark @sent
-    ct status dnat ct direction original ct mark @received
+$reset
+    meta l4proto $transport ct status dnat ct direction reply ct mark @sent
+    meta l4proto $transport ct status dnat ct direction original ct mark @received
   }
 }
 """)
+_RESET = "    ct direction original ct mark @cut reject with tcp reset"
 _ENDED = Template("""\
 flush map inet $name marks
 flush map inet $name hosts4
@@ -77,17 +113,17 @@ class TableState(msgspec.Struct, frozen=True):
 
 
 class Marks(msgspec.Struct, frozen=True):
-    """The connection marks of a proxy: its master port above, the fast port below."""
+    """The marks of a table's connections: its number above, the port below."""
 
-    master_port: int
+    number: int
 
     def of(self, port: int) -> int:
-        """The mark of a fast port."""
-        return self.master_port << 16 | port
+        """The mark of a port."""
+        return self.number << 16 | port
 
     def port(self, mark: int) -> int | None:
-        """The fast port of a mark; None if it is none of this proxy's."""
-        return mark & 0xFFFF if mark >> 16 == self.master_port else None
+        """The port of a mark; None if it is none of this table's."""
+        return mark & 0xFFFF if mark >> 16 == self.number else None
 
     @property
     def all(self) -> str:
@@ -100,23 +136,45 @@ class Marks(msgspec.Struct, frozen=True):
 
 
 class Table:
-    """The table of the proxy with a master port."""
+    """A table of a proxy with a number that no other table for that transport has.
 
-    def __init__(self, master_port: int) -> None:
-        self.name, self.marks = f"rosproxy-{master_port}", Marks(master_port)
+    ``leases`` are the ports whose forwards lead to nodes inside; all others lead outside.
+    """
 
-    def made(self, forwards: Forwards, counted: Collection[int] = ()) -> str:
+    def __init__(
+        self, number: int, leases: PortRange, transport: Transport = Transport.TCP
+    ) -> None:
+        self.transport, self.marks, self._leases = transport, Marks(number), leases
+        self.name = f"rosproxy-{number}" if self.has_connections else f"rosproxy-udp-{number}"
+
+    @property
+    def has_connections(self) -> bool:
+        """Whether what it forwards are connections: answered, and ended by a reset."""
+        return self.transport is Transport.TCP
+
+    def made(self, forwards: Forwards, counted: Collection[int] = (), near: Near = ()) -> str:
         """The whole table, in place of one that may be there.
 
         ``counted`` are further ports whose connections are counted, though no new ones come.
         """
-        made = _MADE.substitute(name=self.name)
+        reset = _RESET if self.has_connections else ""
+        made = _MADE.substitute(name=self.name, transport=self.transport, reset=reset)
+        made += self._near("add", near)
         return made + self._counting({*counted, *forwards}) + self._forwarding("add", forwards)
+
+    def opened(self, near: Near) -> str:
+        """Others that may use the fast ports of nodes outside from now on."""
+        flushed = (f"flush set inet {self.name} {name}\n" for name in ("near4", "near6"))
+        return "".join(flushed) + self._near("add", near)
 
     def changed(self, change: Changes) -> str:
         """Forwards taken out and put in."""
         removed = self._forwarding("delete", change.removed)
         return removed + self._counting(change.added) + self._forwarding("add", change.added)
+
+    def cut(self, ports: Collection[int], verb: str = "add") -> str:
+        """Whoever sends something to a node through these ports gets a reset; or no more."""
+        return self._elements(verb, "cut", [str(self.marks.of(port)) for port in sorted(ports)])
 
     def ended(self) -> str:
         """No forwards any more, and whoever sends something from outside gets a reset.
@@ -150,7 +208,11 @@ class Table:
         }
         out, into = _counted(elements["sent"]), _counted(elements["received"])
         counted = {mark: self.marks.port(mark) for mark in out | into}
-        counters = {p: (out.get(m, 0), into.get(m, 0)) for m, p in counted.items() if p is not None}
+        counters = {
+            port: Counts(out.get(mark, _NOTHING)[0], *into.get(mark, _NOTHING))
+            for mark, port in counted.items()
+            if port is not None
+        }
         return TableState(forwards, counters)
 
     def _forwarding(self, verb: str, forwards: Forwards) -> str:
@@ -161,7 +223,12 @@ class Table:
             pairs["marks"].append(f"{port} : {self.marks.of(port)}")
             pairs["hosts6" if ":" in host else "hosts4"].append(f"{port} : {host}")
             pairs["ports"].append(f"{port} : {where.port}")
+        pairs["inward"] = [str(port) for port in forwards if port not in self._leases]
         return "".join(self._elements(verb, name, held) for name, held in pairs.items() if held)
+
+    def _near(self, verb: str, near: Near) -> str:
+        by_set = {f"near{v}": [str(one) for one in near if one.version == v] for v in (4, 6)}
+        return "".join(self._elements(verb, name, held) for name, held in by_set.items() if held)
 
     def _counting(self, ports: Iterable[int]) -> str:
         marks = [str(self.marks.of(port)) for port in sorted(ports)]
@@ -198,13 +265,15 @@ def _pairs(elements: Json) -> dict[int, Json]:
     return {key: value for key, value in pairs if isinstance(key, int)}
 
 
-def _counted(elements: Json) -> dict[int, int]:
+def _counted(elements: Json) -> dict[int, tuple[int, int]]:
+    """Bytes and packets by mark."""
     counted = {}
     for item in elements if isinstance(elements, list) else []:
         body = _dict(_dict(item).get("elem"))
-        mark, size = body.get("val"), _dict(body.get("counter")).get("bytes", 0)
-        if isinstance(mark, int) and isinstance(size, int):
-            counted[mark] = size
+        counter = _dict(body.get("counter"))
+        mark, size, count = body.get("val"), counter.get("bytes", 0), counter.get("packets", 0)
+        if isinstance(mark, int) and isinstance(size, int) and isinstance(count, int):
+            counted[mark] = size, count
     return counted
 
 

@@ -1,23 +1,27 @@
-"""Topics forwarded by the kernel, as the rest of the proxy sees it: started, asked, looked at.
+"""What the kernel forwards, as the rest of the proxy sees it: started, asked, looked at.
 
 An endpoint's *fast port* (`rosproxy.leases.fast_ports`) is what the kernel may forward straight to
-the node's TCPROS port. `policy` decides where to, `syncer` keeps the kernel's `table` so, and
-`accounting` tells what went through it. It is an acceleration only: whatever the kernel does not
-forward arrives at the listening socket of the same port, and is relayed.
+the node's TCPROS port; for ROS 2 a lease's own port, straight to a participant's locator. `policy`
+decides where to, `syncer` keeps the kernel's `table` so, and `accounting` tells what went through
+it. It is an acceleration only: whatever the kernel does not forward arrives at the socket of the
+same port, and is relayed.
+
+There is a plane for TCP and one for UDP, alike but for this: nobody answers a datagram. So nothing
+tells that a filter on the way drops what is forwarded, and nobody has to be told of an end.
 """
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
-from rosproxy.forwarding.kernel.nft import Table
+from rosproxy.forwarding.kernel.nft import Counts, Near
+from rosproxy.forwarding.kernel.policy import Forwards
 from rosproxy.forwarding.kernel.preflight import why_not
 from rosproxy.forwarding.kernel.syncer import OPTION, Clock, ForwardSyncer
 from rosproxy.forwarding.kernel.table import KernelTable
-from rosproxy.forwarding.kernel.tools import Tools
 from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import Holder, Holders
 from rosproxy.net.tasks import Tasks
@@ -36,7 +40,8 @@ UNANSWERED_PATIENCE = 3.0
 class KernelPlane:
     """What the kernel forwards for the endpoints, and why it doesn't.
 
-    ``traffic`` are the bytes of IP packets by node.
+    ``traffic`` are the bytes of IP packets by node, ``total`` is what was counted in all. ``near``
+    tells who may use the forwards that lead outside. ``user_plane`` is what forwards all else.
     """
 
     def __init__(
@@ -46,19 +51,20 @@ class KernelPlane:
         tasks: Tasks,
         problems: Problems,
         clock: Clock,
-        tools: Tools | None = None,
+        table: KernelTable,
+        near: Callable[[], Near] = tuple,
     ) -> None:
-        self._settings, self._endpoints = settings, endpoints
+        self._settings, self.holders = settings, endpoints
         self._tasks, self._problems, self._clock = tasks, problems, clock
-        self._tools = tools or Tools()
-        self._table = KernelTable(Table(settings.master_port), self._tools)
+        self._table = table
         self._accounts = KernelAccounts()
-        self.syncer = ForwardSyncer(endpoints, self._table, self._accounts, problems, clock)
+        self.syncer = ForwardSyncer(endpoints, table, self._accounts, problems, clock, near)
         self._unanswered = conntrack.Watch(UNANSWERED_PATIENCE)
-        self.traffic = Traffic()
+        self.traffic, self.total = Traffic(), Counts()
         self._wanted = settings.data_plane in ("auto", "kernel")
-        copies = settings.data_plane == "copy" or not hasattr(os, "splice")
-        self._user_plane = "copy" if copies else "splice"
+        connections = table.table.has_connections
+        copies = settings.data_plane == "copy" or not hasattr(os, "splice") or not connections
+        self.user_plane = "copy" if copies else "splice"
 
     async def start(self) -> None:
         """Make the table if that is possible; to be called before any port listens.
@@ -71,13 +77,13 @@ class KernelPlane:
         if not self._wanted:
             self.syncer.why_not = f"{OPTION} {mode}"
             return
-        if why := await why_not(mode, self._tools):
+        if why := await why_not(mode, self._table.tools):
             self.syncer.why_not = why
         else:
             await self.syncer.begin()
         self._report()
         if self.syncer.usable:
-            self._tasks.repeat(self.syncer.run_once, 0, "forwarding in the kernel")
+            self._tasks.repeat(self.syncer.run_once, 0, f"forwarding {self.syncer.what}")
             self._tasks.repeat(self.look, LOOK_INTERVAL, "looking at the kernel's counters")
 
     async def stop(self) -> None:
@@ -87,9 +93,14 @@ class KernelPlane:
         """
         was = self.syncer.usable
         self.syncer.why_not = "the proxy has stopped"
-        await self._tools.settled()
+        await self._table.tools.settled()
         if was:
             await self._table.remove()
+
+    @property
+    def forwards(self) -> Forwards:
+        """What the kernel forwards now, as far as is known."""
+        return self._table.forwards if self.syncer.usable else {}
 
     def recovered(self, endpoints: Sequence[Holder]) -> None:
         """Note that the registry is rebuilt; what it holds gets the fast ports that it had.
@@ -98,7 +109,7 @@ class KernelPlane:
         """
         if self._wanted:
             for endpoint in endpoints:
-                fast_ports.claim(self._endpoints.pool, endpoint)
+                fast_ports.claim(self.holders.pool, endpoint)
         self.syncer.recovered = True
         self.syncer.note_change()
 
@@ -121,7 +132,7 @@ class KernelPlane:
 
     def status(self) -> dict[str, Any]:
         """The plane as a whole, as JSON."""
-        plane = "kernel" if self.syncer.usable else self._user_plane
+        plane = "kernel" if self.syncer.usable else self.user_plane
         mode = self._settings.data_plane
         return {"mode": mode, "plane": plane, "reason": self.syncer.why_not or ""}
 
@@ -130,12 +141,13 @@ class KernelPlane:
         account = self._accounts.account(endpoint)
         reason, port = self.syncer.reason(endpoint), endpoint.fast_port
         return {
-            "plane": self._user_plane if reason else "kernel",
-            "port": None if port is None else self._settings.ports.advertised(port),
+            "plane": self.user_plane if reason else "kernel",
+            "port": self._settings.ports.advertised(port) if endpoint.inside and port else port,
             "reason": reason,
             "connections": endpoint.fast_connections,
             "sent": account.sent,
             "received": account.received,
+            "received_packets": account.packets,
             "sent_rate": round(account.rates[0], 1),
             "received_rate": round(account.rates[1], 1),
         }
@@ -145,8 +157,11 @@ class KernelPlane:
         if seen is None:
             return
         counters, flows = seen
-        for name, sent, received in self._accounts.count(counters, self._clock()):
-            self.traffic.add("node", name, sent, received)
+        for name, more in self._accounts.count(counters, self._clock()):
+            self.traffic.add("node", name, more.sent, more.received)
+            self.total = Counts(*map(sum, zip(self.total, more, strict=True)))
+        if not self._table.table.has_connections:
+            return
         self._accounts.note_peers(flows)
         unanswered = self._unanswered.look(flows, self._clock())
         await self.syncer.take_back(
@@ -154,13 +169,13 @@ class KernelPlane:
         )
 
     def _report(self) -> None:
-        plane, why = self._user_plane, self.syncer.why_not
+        plane, why, what = self.user_plane, self.syncer.why_not, self.syncer.what
         if why is None:
-            log.info("the kernel forwards topics: nftables table %s", self._table.table.name)
-            self._problems.solved(OPTION)
+            log.info("the kernel forwards %s: nftables table %s", what, self._table.table.name)
+            self._problems.solved(self.syncer.subject)
         elif self._settings.data_plane == "kernel":
-            text = f"the kernel forwards no topics, the proxy does ({plane}): {why}"
+            text = f"the kernel forwards no {what}, the proxy does ({plane}): {why}"
             log.error("%s kernel: %s", OPTION, text)
-            self._problems.add(OPTION, text)
+            self._problems.add(self.syncer.subject, text)
         else:
-            log.info("the proxy forwards topics (%s), not the kernel: %s", plane, why)
+            log.info("the proxy forwards %s (%s), not the kernel: %s", what, plane, why)

@@ -13,7 +13,7 @@ from rosproxy.leases.fast_ports import Holder
 from rosproxy.net.addresses import HostPort, is_loopback
 
 Forwards = Mapping[int, HostPort]
-"""Fast ports with the TCPROS addresses of the nodes that they are forwarded to."""
+"""Ports with the addresses of the nodes that they are forwarded to."""
 
 FIRST_PAUSE = 5.0
 LONGEST_PAUSE = 3600.0
@@ -35,11 +35,11 @@ def destination(endpoint: Holder, host: HostForwarding) -> HostPort | str:
     The address is the one that the proxy found the node at, the port the one that the node itself
     named: a forged registration can't make the kernel forward to another host.
     """
-    ports, address = endpoint.tcpros_ports, endpoint.address
+    ports, address = endpoint.node_ports, endpoint.address
     if endpoint.is_down or not endpoint.trusted:
         return "the node does not answer"
     if not ports:
-        return "nobody outside has asked for a topic of it yet"
+        return "nobody has asked for a topic of it yet"
     if len(ports) > 1:
         return "its topics are on several TCPROS ports"
     if is_loopback(address) or address in host.own:

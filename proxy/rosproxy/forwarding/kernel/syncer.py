@@ -15,14 +15,14 @@ import asyncio
 import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 
 from msgspec.structs import replace
 
 from rosproxy.forwarding.kernel import policy
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.nft import Counters, NftError
+from rosproxy.forwarding.kernel.nft import Counters, Near, NftError
 from rosproxy.forwarding.kernel.policy import Changes, HostForwarding
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
@@ -51,7 +51,9 @@ class ForwardSyncer:
     """The one worker that changes and reads the kernel's table.
 
     ``why_not`` tells why the kernel may forward nothing at all; None while it may. ``recovered``
-    is False until the registry is rebuilt: what a former process left then stays.
+    is False until the registry is rebuilt: what a former process left then stays. ``near`` tells
+    who may use the forwards that lead outside. ``what`` is forwarded, in a word; ``subject`` is
+    that of the problems with it.
     """
 
     def __init__(
@@ -61,9 +63,10 @@ class ForwardSyncer:
         accounts: KernelAccounts,
         problems: Problems,
         clock: Clock,
+        near: Callable[[], Near],
     ) -> None:
         self._endpoints, self._table, self._accounts = endpoints, table, accounts
-        self._problems, self._clock = problems, clock
+        self._problems, self._clock, self._near = problems, clock, near
         self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
         self._changed: set[Holder] = set()
         self._all = True
@@ -71,6 +74,9 @@ class ForwardSyncer:
         self._own: dict[str, bool] = {}
         self._own_until, self._retry_at = 0.0, float("inf")
         self._logged: dict[Holder, str] = {}
+        connections = table.table.has_connections
+        self.what = "topics" if connections else "datagrams"
+        self.subject = OPTION if connections else f"{OPTION} for UDP"
         self.why_not: str | None = "the proxy has not started yet"
         self.recovered = False
 
@@ -107,10 +113,12 @@ class ForwardSyncer:
 
     def note_change(self, endpoint: Holder | None = None) -> None:
         """Note that an endpoint has changed, or any."""
-        if endpoint is not None and self.usable:
-            self._changed.add(endpoint)
-        else:
+        if endpoint is None or not self.usable:
             self._all = True
+        elif endpoint.fast_port is None and not self._accounts.owns(endpoint):
+            return  # nothing of it is forwarded, nor may be
+        else:
+            self._changed.add(endpoint)
         self._wake.set()
 
     async def run_once(self) -> None:
@@ -161,7 +169,7 @@ class ForwardSyncer:
             self._accounts.note_owners(self._endpoints)
             ipv6 = any(":" in endpoint.address for endpoint in self._accounts.owners.values())
             try:
-                return await self._table.look(), await self._table.flows(ipv6)
+                return await self._table.look(ipv6)
             except (ToolError, NftError) as error:
                 log.warning("%s; making the table again", error)
                 self._all = True
@@ -181,10 +189,10 @@ class ForwardSyncer:
             families = itertools.product(ports, (False, True))
             await self._table.forget(families, "SYN_SENT")
 
-    async def cut(self, ports: Iterable[tuple[int, bool]]) -> None:
-        """Have the kernel forget the connections through ports, each of IPv6 or not."""
+    async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
+        """End the connections through ports, each of IPv6 or not."""
         await self._sync()
-        await self._table.forget(ports)
+        await self._table.cut(ports)
 
     def _target(self, endpoint: Holder) -> HostPort | str:
         """Where an endpoint's topics may be forwarded to, or why they may not."""
@@ -219,7 +227,7 @@ class ForwardSyncer:
     async def _change(self) -> None:
         wanted = self._wanted()
         try:
-            self._log(await self._table.change(wanted))
+            self._log(await self._table.change(wanted, self._near()))
         except ToolError as error:
             log.warning("%s; making the table again", error)
             await self._make(wanted)
@@ -231,9 +239,9 @@ class ForwardSyncer:
             self._all, self.why_not = True, str(error)
             self._retry_at = self._clock() + RETRY_LOST
             self._accounts.note_peers([])
-            text = f"topics are no longer forwarded by the kernel: {error}"
+            text = f"{self.what} are no longer forwarded by the kernel: {error}"
             log.error("%s", text)
-            self._problems.add(OPTION, text)
+            self._problems.add(self.subject, text)
 
     def _wanted(self) -> dict[int, HostPort]:
         now = self._table.forwards
@@ -243,11 +251,12 @@ class ForwardSyncer:
             wanted = policy.kept(now, changed, self.recovered)
         else:
             wanted = policy.unchanged(now, self._accounts.owners, changed)
+        by_port = self._endpoints.by_port
         for endpoint in changed:
-            where = self._target(endpoint) if endpoint.fast_port else ""
-            held = self._endpoints.by_port.get(endpoint.port) is endpoint
-            if held and endpoint.fast_port and isinstance(where, HostPort):
-                wanted[endpoint.fast_port] = where
+            if endpoint.fast_port and by_port.get(endpoint.port) is endpoint:
+                where = self._target(endpoint)
+                if isinstance(where, HostPort):
+                    wanted[endpoint.fast_port] = where
         return wanted
 
     def _log(self, change: Changes) -> None:

@@ -2,29 +2,34 @@
 
 import asyncio
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
-from rosproxy.forwarding.kernel.nft import Counters, NftError, Table, TableState
+from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Table, TableState
 from rosproxy.forwarding.kernel.policy import Changes, Forwards, changes
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
+from rosproxy.net.interfaces import address_towards
 
 ENDING = 0.3
-"""Seconds for which connections are reset before the table goes."""
+"""Seconds for which connections are reset before the kernel forgets them."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class KernelTable:
-    """What the kernel has, as far as is known: ``forwards``, and the ports that are ``counted``."""
+    """What the kernel has, as far as is known: ``forwards``, and the ports that are ``counted``.
+
+    ``near`` are those who may use the forwards that lead outside.
+    """
 
     table: Table
     tools: Tools
     forwards: Forwards = field(default_factory=dict)
     counted: set[int] = field(default_factory=set)
+    near: Near = ()
 
     async def begin(self) -> None:
         """Make the table with what a former process left in it. Raises ToolError.
@@ -37,63 +42,102 @@ class KernelTable:
             log.debug("no table of a former process: %s", error)
             before = TableState()
         self.counted = set(before.counters)
-        await self.tools.list_flows(self.table.marks.all, False)
+        await self._list_flows(False, "--mark", self.table.marks.all)
         await self.make(before.forwards)
 
     async def make(self, wanted: Forwards) -> None:
         """Put the whole table in place of the one that may be there. Raises ToolError."""
-        await self._apply(self.table.made(wanted, self.counted), wanted)
+        await self._apply(self.table.made(wanted, self.counted, self.near), wanted)
 
-    async def change(self, wanted: Forwards) -> Changes:
+    async def change(self, wanted: Forwards, near: Near) -> Changes:
         """Have it forward what is wanted, and tell what that changed. Raises ToolError."""
         change = changes(self.forwards, wanted)
-        if change:
-            await self._apply(self.table.changed(change), wanted)
+        document = self.table.opened(near) if near != self.near else ""
+        self.near = near
+        if change or document:
+            await self._apply(document + self.table.changed(change), wanted)
         return change
 
-    async def look(self) -> Counters:
-        """Take in what the kernel really has; the bytes by port. Raises ToolError, NftError."""
-        state = await self._read()
-        self.forwards = state.forwards
-        return state.counters
+    async def look(self, ipv6: bool) -> tuple[Counters, list[Flow]]:
+        """Take in what the kernel really has: what was counted by port, and connections.
 
-    async def flows(self, ipv6: bool) -> list[Flow]:
-        """The connections that it forwards, of IPv4 and maybe IPv6. Raises ToolError."""
-        marks = self.table.marks
-        text = await self.tools.list_flows(marks.all, False)
-        if ipv6:
-            text += await self.tools.list_flows(marks.all, True)
-        return conntrack.read(text, marks)
+        Datagrams have no connections; those that go astray are put right. Raises ToolError,
+        NftError.
+        """
+        state, marks = await self._read(), self.table.marks
+        self.forwards = state.forwards
+        if not self.table.has_connections:
+            await self._put_right(ipv6)
+            return state.counters, []
+        text = await self._list_flows(ipv6, "--mark", marks.all)
+        return state.counters, conntrack.read(text, marks)
 
     async def forget(self, ports: Iterable[tuple[int, bool]], state: str = "") -> None:
         """Forget connections through ports, each of IPv6 or not; those of one state if given."""
+        more = ("--state", state) if state else ()
         for port, ipv6 in ports:
-            await self._forget(self.table.marks.one(port), ipv6, state)
+            await self._forget(ipv6, "--mark", self.table.marks.one(port), *more)
+
+    async def cut(self, ports: Collection[tuple[int, bool]]) -> None:
+        """End the connections through ports, each of IPv6 or not, so that both ends learn of it.
+
+        Who connected gets a reset for what it sends next, even if that only confirms what came: a
+        subscriber says nothing else, and some (rospy) try again only when they see their connection
+        end. After that whoever sends gets one, since the kernel knows the connection no more.
+        """
+        numbers = {port for port, _ in ports}
+        try:
+            await self.tools.nft("-f", "-", document=self.table.cut(numbers))
+            await asyncio.sleep(ENDING)
+            await self.forget(ports)
+            await self.tools.nft("-f", "-", document=self.table.cut(numbers, "delete"))
+        except ToolError as error:
+            log.warning("connections can't be ended: %s", error)
 
     async def remove(self) -> None:
         """End what goes through the table, remove it, and forget all connections through it."""
         try:
-            if self.forwards:
+            if self.forwards and self.table.has_connections:
                 await self.tools.nft("-f", "-", document=self.table.ended())
                 await asyncio.sleep(ENDING)
             await self.tools.nft("-f", "-", document=self.table.removed())
         except ToolError as error:
             log.warning("table %s can't be removed: %s", self.table.name, error)
         for ipv6 in (False, True):
-            await self._forget(self.table.marks.all, ipv6)
+            await self._forget(ipv6, "--mark", self.table.marks.all)
         self.forwards = {}
 
     async def _apply(self, document: str, forwards: Forwards) -> None:
         await self.tools.nft("-f", "-", document=document)
+        hosts = {where.host for where in (*self.forwards.values(), *forwards.values())}
         self.forwards = dict(forwards)
         self.counted |= set(forwards)
+        if not self.table.has_connections:
+            await self._put_right(any(":" in host for host in hosts))
+
+    async def _put_right(self, ipv6: bool) -> None:
+        """Have all datagrams go by the rules that there are now. Raises ToolError."""
+        text = await self._list_flows(ipv6)
+        unled, misled = conntrack.astray(text, self.forwards, self.table.marks)
+        for at in unled:
+            if address_towards(at.host) == at.host:
+                port = str(at.port)
+                which = "--orig-dst", at.host, "--orig-port-dst", port, "--reply-port-src", port
+                await self._forget(":" in at.host, *which)
+        await self.forget((port, six) for port in misled for six in {False, ipv6})
+
+    async def _list_flows(self, ipv6: bool, *which: str) -> str:
+        """The connections of IPv4 and maybe IPv6, as conntrack prints them. Raises ToolError."""
+        families, transport = (False, True) if ipv6 else (False,), self.table.transport
+        texts = [await self.tools.list_flows(transport, family, *which) for family in families]
+        return "".join(texts)
 
     async def _read(self) -> TableState:
         listed = await self.tools.nft("-j", "list", "table", "inet", self.table.name)
         return self.table.read(listed)
 
-    async def _forget(self, mark: str, ipv6: bool, state: str = "") -> None:
+    async def _forget(self, ipv6: bool, *which: str) -> None:
         try:
-            await self.tools.forget_flows(mark, ipv6, state)
+            await self.tools.forget_flows(self.table.transport, ipv6, *which)
         except ToolError as error:
             log.warning("connections can't be ended: %s", error)

@@ -42,15 +42,14 @@ class Tools:
         """Run nft, with a document on its standard input; what it prints. Raises ToolError."""
         return await self._run("nft", *words, document=document)
 
-    async def list_flows(self, mark: str, ipv6: bool) -> str:
-        """The TCP connections with a mark (``value/mask``). Raises ToolError."""
-        return await self._run("conntrack", "-L", *_selection(mark, ipv6))
+    async def list_flows(self, transport: str, ipv6: bool, *which: str) -> str:
+        """The tracked connections of TCP, or of UDP: all, or which. Raises ToolError."""
+        return await self._run("conntrack", "-L", *_selection(transport, ipv6), *which)
 
-    async def forget_flows(self, mark: str, ipv6: bool, state: str = "") -> None:
-        """Delete the TCP connections with a mark, of one state if given. Raises ToolError."""
-        more = ["--state", state] if state else []
+    async def forget_flows(self, transport: str, ipv6: bool, *which: str) -> None:
+        """Delete the same. Raises ToolError."""
         try:
-            await self._run("conntrack", "-D", *_selection(mark, ipv6), *more)
+            await self._run("conntrack", "-D", *_selection(transport, ipv6), *which)
         except ToolError as error:
             if "0 flow entries" not in str(error):
                 raise
@@ -70,8 +69,8 @@ class Tools:
             run.exception()
 
 
-def _selection(mark: str, ipv6: bool) -> list[str]:
-    return ["-f", "ipv6" if ipv6 else "ipv4", "-p", "tcp", "--mark", mark]
+def _selection(transport: str, ipv6: bool) -> list[str]:
+    return ["-f", "ipv6" if ipv6 else "ipv4", "-p", transport]
 
 
 def _find(name: str) -> str:

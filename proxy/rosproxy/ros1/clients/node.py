@@ -1,6 +1,7 @@
 """Asking a node who it is: does it answer, as which process, with which topics, on which port?
 
-There are four questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over.
+There are four questions. `NodeClient.probe` is the cheap one (``getPid``), asked over and over; of
+nodes that are well by `rosproxy.ros1.clients.kept`.
 `NodeClient.inspect` has the node describe itself; whoever is about to believe what somebody else
 said of a node (the master after a restart, an operator, the node's former process) inspects it
 first. `NodeClient.name` asks what it is called, before it is registered for somebody who calls from
@@ -10,20 +11,31 @@ the endpoint is decided in `upkeep`.
 
 import asyncio
 import logging
+import socket
 
 import msgspec
 
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
+from rosproxy.ros1.clients.master import (
+    CALLER_ID,
+    MasterClient,
+    MasterError,
+    Unreachable,
+    read_value,
+)
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry.graph import NodeInfo, read_types
 from rosproxy.ros1.registry.health import ProbeResult
 
 log = logging.getLogger(__name__)
 
+GET_PID = "getPid"
 TOPICS_ASKED = 3
 """How many of its topics a node is asked for at most before its TCPROS port counts as unknown."""
+
+_PID_CALL = xmlrpc.dump_call(GET_PID, CALLER_ID)
 
 
 class ProbeAnswer(msgspec.Struct, frozen=True):
@@ -43,12 +55,25 @@ class NodeClient:
     async def probe(self, where: HostPort, within: float | None = None) -> ProbeAnswer:
         """Call ``getPid``; anything but a ROS triple with a number is no node."""
         try:
-            pid = await self._upstream.call_node(where, within or self._within, "getPid")
+            pid = await self._upstream.call_node(where, within or self._within, GET_PID)
         except Unreachable as error:
             return ProbeAnswer(error.probe, reason=str(error))
         except MasterError as error:
             return ProbeAnswer(ProbeResult.SILENT, reason=str(error))
         return ProbeAnswer(ProbeResult.ANSWERED, pid if isinstance(pid, int) else None)
+
+    def connect(self, where: HostPort) -> socket.socket:
+        """A connection to the slave API at an address that is about to be made. Raises OSError."""
+        return sockets.begin_to_dial(self._upstream.reach(where))
+
+    def pid_question(self, where: HostPort) -> bytes:
+        """The HTTP request by which the node at an address is asked for its pid."""
+        return self._upstream.node_request(where, _PID_CALL)
+
+    def read_pid(self, body: bytes) -> int | None:
+        """The pid that a reply's body gives. Raises Unreachable, MasterError if there is none."""
+        pid = read_value(GET_PID, body)
+        return pid if isinstance(pid, int) else None
 
     async def inspect(self, where: HostPort) -> NodeInfo | None:
         """What the node at an address says of itself; None if it gives no proper answer."""

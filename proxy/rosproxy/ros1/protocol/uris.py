@@ -2,7 +2,8 @@
 
 An *advertised* URI carries the inside address in its path, ``http://HOST:PORT/10.0.0.5:40001/``.
 Where the node calls itself by a name, a second segment holds the address that it was found at:
-``http://HOST:PORT/c1:40001/10.0.0.5/``. roscpp drops
+``http://HOST:PORT/c1:40001/10.0.0.5/``. Where its own URI has a path, as one has that another proxy
+behind this one advertises, a third segment holds that. roscpp drops
 the path and rospy sends it back; the port alone always suffices. The path is what lets a
 restarted proxy rebuild its table from what the master holds.
 """
@@ -18,14 +19,17 @@ LONGEST_URI = 2048
 """Characters of a URI at most: a host's name has 253 at most, and it stands twice in an advertised
 URI. What is longer is no URI to the proxy: it is neither rewritten nor remembered."""
 
+LONGEST_PATH = 512
+"""Characters of a node's own path that an advertised URI carries at most."""
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
 class InsidePath(msgspec.Struct, frozen=True):
-    """What the path of an advertised URI says: the node's own host and port, and its address."""
+    """What an advertised URI says: the node's own host, port and path, and its address."""
 
     node: HostPort
     address: str | None = None
+    path: str = "/"
 
     @property
     def slave(self) -> HostPort:
@@ -53,10 +57,23 @@ def service_uri(where: HostPort) -> str:
     return f"rosrpc://{where}"
 
 
-def inside_path(node: HostPort, address: str) -> str:
-    """The path that carries an inside address; see the module's text."""
-    segment = _quoted(str(node))
-    return f"/{segment}/" if node.host == address else f"/{segment}/{_quoted(address)}/"
+def path_of(uri: str) -> str:
+    """The path of a slave URI, as a request has it."""
+    try:
+        return urlsplit(uri).path or "/"
+    except ValueError:
+        return "/"
+
+
+def inside_path(uri: str, node: HostPort, address: str) -> str:
+    """The path that carries a node's own URI and its address; see the module's text."""
+    segments, path = [_quoted(str(node))], path_of(uri)
+    carried = path if len(path) <= LONGEST_PATH else "/"
+    if node.host != address or carried != "/":
+        segments.append(_quoted(address))
+    if carried != "/":
+        segments.append(quote(carried, safe=""))
+    return f"/{'/'.join(segments)}/"
 
 
 @cached
@@ -72,9 +89,12 @@ def parse_inside_path(uri: str) -> InsidePath | None:
     except ValueError:
         return None
     node = parse_host_port(parts[0])
-    if node is None or len(parts) > 2 or (len(parts) == 2 and not is_address(parts[1])):
+    if node is None or len(parts) > 3 or (len(parts) > 1 and not is_address(parts[1])):
         return None
-    return InsidePath(node, parts[1] if len(parts) == 2 else None)
+    path = parts[2] if len(parts) > 2 else "/"
+    if not path.startswith("/"):
+        return None
+    return InsidePath(node, parts[1] if len(parts) > 1 else None, path)
 
 
 def _fits(uri: str) -> bool:

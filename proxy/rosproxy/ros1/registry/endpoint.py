@@ -113,6 +113,7 @@ class Endpoint:
     settles_at: float = 0.0
     fast_port: int | None = None
     fast_peers: Mapping[str, int] = field(default_factory=dict)
+    inside: bool = True
     restored: bool = False
     """Whether a former process of the proxy knew it, which may have known more of it."""
 
@@ -241,7 +242,7 @@ class Endpoint:
         return self.health.failures > 0 or not (self.trusted or self.health.answered is None)
 
     @property
-    def tcpros_ports(self) -> set[int]:
+    def node_ports(self) -> set[int]:
         """The TCPROS ports that the node has named."""
         return {port for port in (self.tcpros_port, *self.topic_ports.values()) if port}
 

@@ -30,6 +30,7 @@ class Health:
     has ended gives; one that hangs or is cut off is silent. ``cleaned``: its registrations were
     taken back at the master, at ``cleaned_at``, and are kept only for the case that it answers
     again. ``over``: it is known to have ended for good, even if its address is just silent.
+    ``hung_up`` is the process that ended the last connection that was to be kept.
     """
 
     answered: float | None = None
@@ -41,6 +42,7 @@ class Health:
     over: bool = False
     pid: int | None = None
     checked: float | None = None
+    hung_up: int | None = None
 
     @property
     def down(self) -> bool:
@@ -61,6 +63,21 @@ class Health:
     def probe_soon(self) -> None:
         """Have the node probed at once."""
         self.checked = None
+
+    def note_hung_up(self) -> None:
+        """Have the node probed at once: it has ended a connection that was to be kept."""
+        self.checked, self.hung_up = None, self.pid
+
+    @property
+    def steady(self) -> bool:
+        """Whether it has answered whenever it was asked of late, always as the same process."""
+        well = self.answered is not None and not (self.failures or self.cleaned or self.over)
+        return well and self.checked is not None and self.pid not in UNKNOWN_PID
+
+    @property
+    def hangs_up(self) -> bool:
+        """Whether the process that answers has ended a connection that was to be kept."""
+        return self.hung_up is not None and self.hung_up == self.pid
 
     def note_cleaned(self, at: float) -> None:
         """Note that its registrations were taken back at the master, as they were at a time."""

@@ -30,7 +30,8 @@ class Registry:
     """All endpoints, found by port, by address, by URI, by service and by node name.
 
     ``by_port``, ``by_slave``, ``by_caller``, ``services`` and ``hidden`` (what the master does not
-    know, by kind and name) are for others to read only.
+    know, by kind and name) are for others to read only. ``changes`` grows with each registration
+    that comes or goes.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -40,10 +41,13 @@ class Registry:
         self.by_caller: dict[str, Endpoint] = {}
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
         self.hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
+        self.changes = 0
         self._by_uri: dict[str, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[str, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
+        self._unproven: dict[str, dict[Endpoint, None]] = {}
+        """Those of each source that had not answered when that was last asked."""
 
     def __iter__(self) -> Iterator[Endpoint]:
         """All endpoints; safe against changes while iterating."""
@@ -99,6 +103,10 @@ class Registry:
             del self._admitted[admission]
         self._former[endpoint.port] = endpoint
         self.pool.give_back(endpoint.port)
+        known = self._unproven.get(endpoint.source, {})
+        known.pop(endpoint, None)
+        if not known:
+            self._unproven.pop(endpoint.source, None)
 
     def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
         """Note that nodes are at other addresses now; ports and registrations stay.
@@ -145,7 +153,11 @@ class Registry:
 
     def unproven(self, source: str) -> list[Endpoint]:
         """The endpoints that a source has registered whose nodes have never answered."""
-        return [e for e in self if e.source == source and not e.proven]
+        known = self._unproven.get(source, {})
+        for endpoint in list(known):
+            if endpoint.proven or self.by_port.get(endpoint.port) is not endpoint:
+                del known[endpoint]
+        return list(known)
 
     @property
     def most_unproven(self) -> int:
@@ -160,6 +172,7 @@ class Registry:
         is left out: a node that registers it is refused before; what is read from the master or
         from a node may be anything.
         """
+        self.changes += 1
         former = endpoint.registrations.get(held.key)
         if held.characters > LONGEST_REGISTRATION or (endpoint.full and former is None):
             return
@@ -237,6 +250,7 @@ class Registry:
 
     def _add(self, uri: str, node: HostPort, place: Place, port: int, source: str) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port, source=source)
+        self._unproven.setdefault(source, {})[endpoint] = None
         self.by_port[port] = self.by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
         self._by_uri.setdefault(uri, {})[port] = endpoint
@@ -281,6 +295,7 @@ class Registry:
         held = endpoint.registrations.pop(key, None)
         if held is None:
             return
+        self.changes += 1
         endpoint.characters -= held.characters
         self._index_hidden(endpoint, replace(held, hidden=False))
         kind, name, caller_id = key

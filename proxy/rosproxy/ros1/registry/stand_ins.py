@@ -16,18 +16,22 @@ The port of a URI follows from its text, so that a proxy which has lost all memo
 one again: subscribers come back to the port that they were connected to, by themselves. Only where
 two texts meet at one port does the order count; then the master's list, which subscribers get after
 a restart, leads them on.
+
+A slave URI gets a second port with the first, the *fast port*: topics are had there where the
+kernel forwards (`rosproxy.forwarding.kernel`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from urllib.parse import quote, unquote, urlsplit
+from urllib.parse import quote, unquote
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import (
     LONGEST_URI,
     parse_service_uri,
     parse_slave_uri,
+    path_of,
     service_uri,
     slave_uri,
 )
@@ -36,9 +40,13 @@ from rosproxy.settings import Settings
 MOST_STAND_INS = 1024
 """How many ports stand in for nodes at most."""
 PORTS = range(20_000, 32_768)
-"""Where they are chosen from: below those that Linux gives to outgoing connections."""
+"""Where they are chosen from: below those that Linux gives to outgoing connections. The first half
+is for the ports themselves, the second for their fast ports."""
+_HALF = len(PORTS) // 2
 TRIES = 16
 """How many ports are tried for a URI."""
+MOST_TOPICS = 512
+"""How many topics of a node are remembered with their port."""
 _PREFIX = "/outside/"
 
 
@@ -48,7 +56,11 @@ class StandIn:
 
     ``local`` is where it listens, ``uri`` what the master has. ``kept``: inside is told the URI as
     it is, which leads to ``local``. ``topic_ports`` are the TCPROS ports by topic that the node has
-    named.
+    named. ``address`` is where the node was reached, empty before.
+
+    ``fast_port`` is a second port, for topics alone, which the kernel forwards where it may (None:
+    it has none). ``fast_peers`` tells how many connections it forwards now, by the inside address.
+    ``fast_try`` counts the candidates for it that other stand-ins had.
     """
 
     local: HostPort
@@ -56,6 +68,59 @@ class StandIn:
     where: HostPort
     kept: bool
     topic_ports: dict[str, int] = field(default_factory=dict)
+    address: str = ""
+    fast_port: int | None = None
+    fast_peers: Mapping[str, int] = field(default_factory=dict)
+    fast_try: int = 0
+    inside: bool = False
+    trusted: bool = True
+    is_down: bool = False
+
+    @property
+    def port(self) -> int:
+        """What the kernel plane knows it by: the port that may be its fast port; 0 if none may."""
+        return self.fast_candidate.port if self.fast_candidate else 0
+
+    @property
+    def fast_connections(self) -> int:
+        """How many connections the kernel forwards now."""
+        return sum(self.fast_peers.values())
+
+    @property
+    def label(self) -> str:
+        """How messages name the node."""
+        return self.uri
+
+    @property
+    def node_ports(self) -> set[int]:
+        """The TCPROS ports that the node has named."""
+        return set(self.topic_ports.values())
+
+    @property
+    def caller_ids(self) -> list[str]:
+        """What metrics call the node: by its host, since its URI is another at each start."""
+        return [self.where.host]
+
+    @property
+    def fast_candidate(self) -> HostPort | None:
+        """Where its fast port is to listen; None for a service, and where URIs are kept.
+
+        The kernel tells ports apart and no addresses: one of each of the proxy's addresses.
+        """
+        if self.kept or parse_service_uri(self.uri):
+            return None
+        number = _number(f"{self.local.host} {self.uri}") + self.fast_try**2
+        return HostPort(self.local.host, PORTS[_HALF + number % _HALF])
+
+    def note_topic_port(self, topic: str, port: int) -> None:
+        """Note the TCPROS port that the node has named for a topic, and the latest such alone.
+
+        roscpp names its port for any topic: whoever asks could have names remembered without end.
+        """
+        self.topic_ports.pop(topic, None)
+        self.topic_ports[topic] = port
+        while len(self.topic_ports) > MOST_TOPICS:
+            del self.topic_ports[next(iter(self.topic_ports))]
 
     @property
     def told(self) -> str:
@@ -80,6 +145,8 @@ class StandIns:
         self.by_local: dict[HostPort, StandIn] = {}
         """The one that was of no use for longest first."""
         self._by_uri: dict[tuple[str, str], StandIn] = {}
+        self.by_port: dict[int, StandIn] = {}
+        """Those with a fast port, by that."""
 
     def target(self, uri: str) -> HostPort | None:
         """What a stand-in for a URI of the master's has to lead to; None if it needs none.
@@ -96,9 +163,9 @@ class StandIns:
         if not self.both:
             yield StandIn(HostPort(address, where.port), uri, where, kept=True)
             return
-        seed = int.from_bytes(blake2b(uri.encode(), digest_size=8).digest(), "big")
+        seed = _number(uri)
         for number in range(TRIES):
-            port = PORTS[(seed + number * number) % len(PORTS)]
+            port = PORTS[(seed + number * number) % _HALF]
             yield StandIn(HostPort(address, port), uri, where, kept=False)
 
     def address(self, towards: str) -> str:
@@ -116,6 +183,23 @@ class StandIns:
         """The stand-in for a URI at one of the proxy's addresses."""
         return self._by_uri.get((address, uri))
 
+    def choose_fast_candidate(self, stand_in: StandIn) -> HostPort | None:
+        """Go on to the first of its candidates that no other stand-in has; None if it needs none.
+
+        That is one which may have no fast port, or has it. None as well if all are taken.
+        """
+        if stand_in.fast_port is not None or stand_in.fast_candidate is None:
+            return None
+        for stand_in.fast_try in range(TRIES):
+            if stand_in.port not in self.by_port:
+                return stand_in.fast_candidate
+        return None
+
+    def is_proxys(self, port: int) -> bool:
+        """Whether the proxy itself listens at a port, or may."""
+        stands_in = port in self.by_port or any(port == local.port for local in self.by_local)
+        return stands_in or obstacle(port, self._settings) is not None
+
     def add(self, stand_in: StandIn) -> None:
         """Take in one that listens now."""
         self.by_local[stand_in.local] = stand_in
@@ -125,6 +209,17 @@ class StandIns:
         """Forget one that listens no more."""
         del self.by_local[stand_in.local]
         del self._by_uri[stand_in.local.host, stand_in.uri]
+        self.note_fast_port(stand_in, None)
+
+    def note_fast_port(self, stand_in: StandIn, port: int | None) -> None:
+        """Note that a stand-in has a fast port, or none any more."""
+        stand_in.fast_port = port
+        if port is not None:
+            self.by_port[stand_in.port] = stand_in
+            return
+        stand_in.fast_peers = {}  # nobody counts them any more
+        if self.by_port.get(stand_in.port) is stand_in:
+            del self.by_port[stand_in.port]
 
     def note_used(self, stand_in: StandIn) -> None:
         """Note that it is of use."""
@@ -163,14 +258,6 @@ def aliased_host(master_uri: str) -> str | None:
     return where.host.lower()
 
 
-def path_of(uri: str) -> str:
-    """The path of a slave URI, as a request has it."""
-    try:
-        return urlsplit(uri).path or "/"
-    except ValueError:
-        return "/"
-
-
 def obstacle(port: int, settings: Settings) -> str | None:
     """What the proxy itself needs a port for, so that it can't stand in; None if nothing."""
     if port in settings.ports.listen:
@@ -183,13 +270,15 @@ def obstacle(port: int, settings: Settings) -> str | None:
     return f"is that of {own[port]}" if port in own else None
 
 
+def _number(text: str) -> int:
+    """A number that follows from a text, and looks like any other."""
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "big")
+
+
 def _original(uri: str) -> str | None:
     """What the path of a slave URI carries; None if it carries no URI."""
     if parse_slave_uri(uri) is None:
         return None
-    try:
-        path = urlsplit(uri).path
-    except ValueError:
-        return None
+    path = path_of(uri)
     original = unquote(path.removeprefix(_PREFIX)) if path.startswith(_PREFIX) else ""
     return original if parse_slave_uri(original) else None

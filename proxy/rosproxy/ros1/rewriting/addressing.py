@@ -52,7 +52,7 @@ class Addressing:
     ports: PortMap
     stand_ins: StandIns
     networks: Sequence[Network] = field(default_factory=tuple)
-    _advertised: dict[int, tuple[HostPort, Place, str]] = field(default_factory=dict)
+    _advertised: dict[int, tuple[str, Place, str]] = field(default_factory=dict)
     """What `advertised_uri` said last of each port, and what it was made of."""
 
     def outside(self, port: int) -> HostPort:
@@ -61,10 +61,10 @@ class Addressing:
 
     def advertised_uri(self, endpoint: Endpoint) -> str:
         """The slave URI that stands for an endpoint at the master and outside."""
-        node, place, uri = self._advertised.get(endpoint.port, (None, None, ""))
-        if node is not endpoint.node or place is not endpoint.place:
+        own, place, uri = self._advertised.get(endpoint.port, ("", None, ""))
+        if own != endpoint.uri or place is not endpoint.place:
             uri = slave_uri(self.outside(endpoint.port), self._path(endpoint))
-            self._advertised[endpoint.port] = endpoint.node, endpoint.place, uri
+            self._advertised[endpoint.port] = endpoint.uri, endpoint.place, uri
         return uri
 
     def advertised_service(self, endpoint: Endpoint) -> str:
@@ -152,7 +152,7 @@ class Addressing:
         return endpoint.place.named and is_inside(endpoint.place.address, shared)
 
     def _path(self, endpoint: Endpoint) -> str:
-        return inside_path(endpoint.node, endpoint.place.address)
+        return inside_path(endpoint.uri, endpoint.node, endpoint.place.address)
 
     def stands_for(self, uri: str) -> Endpoint | None:
         """The endpoint that an advertised slave URI stands for."""

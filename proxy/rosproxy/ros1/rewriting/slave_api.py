@@ -1,6 +1,6 @@
 """The slave API: what is rewritten in a call that passes the proxy, and in its reply.
 
-It is the same both ways. What an address becomes on its way is told by a `View`: `from_outside`
+It is the same both ways. What an address becomes on its way is told by a `CallView`: `from_outside`
 where outside or the master calls a node inside, `from_inside` where a node inside calls one
 outside.
 
@@ -30,7 +30,7 @@ _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
 
 
-class View(msgspec.Struct, frozen=True):
+class CallView(msgspec.Struct, frozen=True):
     """How the two ends of a call see the nodes that they name.
 
     ``asked`` is what a slave URI in the call becomes, ``answered`` one in the reply, ``master_uri``
@@ -42,16 +42,16 @@ class View(msgspec.Struct, frozen=True):
     master_uri: str
 
 
-def from_outside(node: Asker, master_uri: str, addressing: Addressing) -> View:
+def from_outside(node: Asker, master_uri: str, addressing: Addressing) -> CallView:
     """The view of a call from outside at a node inside."""
     imported = partial(addressing.import_slave, asker=node)
-    return View(imported, partial(addressing.export_slave, asker=node), master_uri)
+    return CallView(imported, partial(addressing.export_slave, asker=node), master_uri)
 
 
-def from_inside(asker: Asker, master_uri: str, addressing: Addressing) -> View:
+def from_inside(asker: Asker, master_uri: str, addressing: Addressing) -> CallView:
     """The view of a call from a node inside at one outside."""
     exported = partial(addressing.export_slave, asker=asker)
-    return View(exported, partial(addressing.import_slave, asker=asker), master_uri)
+    return CallView(exported, partial(addressing.import_slave, asker=asker), master_uri)
 
 
 def rewritten(call: Call) -> bool:
@@ -59,7 +59,7 @@ def rewritten(call: Call) -> bool:
     return call.method in _REWRITTEN
 
 
-def rewrite_call(body: bytes, call: Call, view: View) -> bytes:
+def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
     """The call for the node: the publishers of a ``publisherUpdate`` as it sees them.
 
     Their order is kept; a publisher that is named twice is left out the second time.
@@ -72,7 +72,7 @@ def rewrite_call(body: bytes, call: Call, view: View) -> bytes:
     return xmlrpc.apply(body, edits)
 
 
-def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: View) -> bytes:
+def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -> bytes:
     """The reply for the caller: addresses as it sees them.
 
     ``reached`` is the address and port at which it is to find the node's topics.
@@ -200,7 +200,7 @@ def _peers(triple: Value) -> list[Value]:
     return [peer for peer in named if parse_slave_uri(peer.string() or "")]
 
 
-def _rewrite_uri(method: str, triple: Value, view: View) -> list[Edit]:
+def _rewrite_uri(method: str, triple: Value, view: CallView) -> list[Edit]:
     held = triple.items[2].string()
     if not held:
         return []

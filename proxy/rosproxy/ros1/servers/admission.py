@@ -166,7 +166,7 @@ class NodeAdmission:
 
         Only one that ``answers`` displaces others. Raises Unreachable.
         """
-        if self._leases.give_up_fast_port():
+        if self._leases.give_up_spare():
             return True
         if answers and await self._give_up_dead():
             return True

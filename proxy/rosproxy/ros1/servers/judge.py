@@ -185,6 +185,10 @@ class PolicyJudge:
                 return verdict.reason
         return None
 
+    def inside_may_bypass(self) -> bool:
+        """Whether nodes inside may have topics of outside where no header is read."""
+        return not self._policy.may_deny((RuleKind.SUBSCRIBE,), (), None)
+
     def inside_may_not_keep(self, relay: Relay) -> bool:
         """Whether a node inside may not have any more what it has of a node outside.
 

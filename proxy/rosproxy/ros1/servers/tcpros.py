@@ -108,6 +108,12 @@ class TcprosServer:
             await self._refuse(conn, why, "denied")
             return
         node = await target.connect(kind, name)
+        if node is not None and kind == "topic" and sockets.has_ended(conn):
+            # A subscriber that is told of a publisher twice keeps the later connection, and rospy's
+            # publishers the one whose header comes last: were this one handed on, none was left.
+            node.close()
+            conn.close()
+            return
         if node is None or not await hand_on(header, node):
             self._fail(target, conn, name)
             return

@@ -63,11 +63,15 @@ class IncomingCall:
     def __init__(self, request: web.BaseRequest, hold: Callable[[int], None]) -> None:
         protocol = request.protocol
         self.body, self.hold, self._request = b"", hold, request
-        self.path = request.path_qs
         self.source = _source(request)
         self.local = _address(protocol.sockname)
         self.host_header = request.headers.get("Host", "")
         self.loop_id = request.headers.get(LOOP_HEADER, "")
+
+    @property
+    def path(self) -> str:
+        """The path that is called, with what follows a question mark."""
+        return self._request.path_qs
 
     def comes_from(self, instance: str) -> bool:
         """Whether a proxy itself made this call."""

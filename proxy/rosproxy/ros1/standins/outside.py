@@ -1,6 +1,8 @@
 """Nodes outside as those inside reach them through a stand-in: asked, connected to, refusing.
 
 Nothing leads to the proxy itself or to inside: whoever writes to the master names the addresses.
+Nodes of outside may run beside the proxy, though: at an address of its own machine only the proxy's
+own ports are refused. Loopback is everywhere, as it means another machine to whoever gave it.
 """
 
 import logging
@@ -10,13 +12,13 @@ from dataclasses import dataclass
 
 from rosproxy.access.rules import RuleKind
 from rosproxy.net import sockets
-from rosproxy.net.addresses import HostPort, is_inside
-from rosproxy.net.interfaces import address_towards
+from rosproxy.net.addresses import HostPort, is_inside, is_loopback
+from rosproxy.net.interfaces import is_own
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.uris import parse_service_uri
-from rosproxy.ros1.registry.stand_ins import StandIn, path_of
+from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
+from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.judge import PolicyJudge
 
 log = logging.getLogger(__name__)
@@ -66,7 +68,7 @@ class Outside:
             log.debug("%s gives no TCPROS port for %s: %s", stand_in.uri, topic, error)
             return None
         if port is not None:
-            stand_in.topic_ports[topic] = port
+            stand_in.note_topic_port(topic, port)
         return port
 
     async def connect(self, stand_in: StandIn, port: int | None) -> socket.socket | None:
@@ -92,15 +94,18 @@ class Outside:
         found = await resolve(reached.host, NODES)
         if not found:
             raise OSError(f"{where.host} can't be resolved")
-        outside = [address for address in found if not self._leads_back(address)]
+        outside = [one for one in found if not self._leads_back(HostPort(one, reached.port))]
         if not outside:
-            raise ConnectionRefusedError(f"{', '.join(found)} is not outside")
+            raise ConnectionRefusedError(f"{', '.join(found)} port {where.port} is not outside")
         return HostPort(outside[0], where.port)
 
-    def _leads_back(self, address: str) -> bool:
-        """Whether an address is the proxy's own, or one inside."""
-        own, both = address_towards(address) == address, self._context.stand_ins.both
-        return own or (both and is_inside(address, self._context.addressing.networks))
+    def _leads_back(self, where: HostPort) -> bool:
+        """Whether an address and port are inside, or the proxy's own."""
+        stand_ins, address = self._context.stand_ins, where.host
+        inside = stand_ins.both and is_inside(address, self._context.addressing.networks)
+        if inside or is_loopback(address):
+            return True
+        return is_own(address) and stand_ins.is_proxys(where.port)
 
 
 @dataclass(slots=True)

@@ -8,17 +8,21 @@ Slave API calls are forwarded to the node, TCPROS connections relayed. Where the
 because the master's name leads here (`registry.stand_ins`), topics flow without the proxy: the
 node's reply to ``requestTopic`` leads to its address. Nothing is relayed that does not begin with a
 TCPROS header.
+
+A slave URI's stand-in has a fast port as well, if the kernel forwards and no rule of the policy
+could be passed by there. It listens for as long, and what the kernel does not forward is relayed.
 """
 
 import asyncio
 import logging
 import socket
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
+from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.sockets import Acceptor
@@ -42,6 +46,8 @@ from rosproxy.ros1.standins.udpros import UdprosRelays
 
 log = logging.getLogger(__name__)
 
+TRIED_AT_ONCE = 32
+"""Nodes that refused and are tried again at the same time."""
 PORTS_PER_TURN = 50
 """How many are opened before all connections are looked at again."""
 TIDY_INTERVAL = 30.0
@@ -55,13 +61,19 @@ class StandInPorts:
     """Opens and closes the ports that stand in for nodes outside, and serves them."""
 
     def __init__(
-        self, context: Context, callers: Callers, tcpros: TcprosServer, judge: PolicyJudge
+        self,
+        context: Context,
+        callers: Callers,
+        tcpros: TcprosServer,
+        judge: PolicyJudge,
+        plane: KernelPlane,
     ) -> None:
         self._context, self._callers, self._stand_ins = context, callers, context.stand_ins
-        self._tcpros, self._judge = tcpros, judge
+        self._tcpros, self._judge, self._plane = tcpros, judge, plane
         self._acceptors: dict[HostPort, Acceptor] = {}
-        self._refused: set[str] = set()
-        """URIs of nodes that refused when they were last tried."""
+        self._refused: dict[str, None] = {}
+        """URIs of nodes that refused when they were last tried, the oldest first; not too many."""
+        self._trying = asyncio.Semaphore(TRIED_AT_ONCE)
         greeting = "rosproxy: a ROS node outside\n"
         self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
         self._outside = Outside(context, self._note_refused)
@@ -79,9 +91,13 @@ class StandInPorts:
         The URIs are the master's own word.
         """
         wanted = self._needed(uris)
-        again = self._refused & wanted.keys()
-        still = await asyncio.gather(*(self._outside.refuses(wanted[uri]) for uri in again))
-        self._refused -= {uri for uri, gone in zip(again, still, strict=True) if not gone}
+        if not wanted:
+            return
+        again = self._refused.keys() & wanted.keys()
+        still = await asyncio.gather(*(self._refuses(wanted[uri]) for uri in again))
+        for uri, gone in zip(again, still, strict=True):
+            if not gone:
+                self._refused.pop(uri, None)
         for number, (uri, where) in enumerate(wanted.items(), start=1):
             if number % PORTS_PER_TURN == 0:
                 await asyncio.sleep(0)
@@ -127,13 +143,38 @@ class StandInPorts:
 
     def status(self) -> list[dict[str, Any]]:
         """The ports with their nodes and open connections, for ``/status``."""
-        counts = self._connections()
-        found = sorted(self._stand_ins.by_local.values(), key=lambda one: (one.local.port, one.uri))
-        return [
-            {"port": port, "uri": one.uri[:LONGEST_TOLD], "connections": counts[port]}
-            for one in found
-            for port in [one.local.port]
-        ]
+        counts, told = self._connections(), []
+        sent: defaultdict[int, float] = defaultdict(float)
+        received: defaultdict[int, float] = defaultdict(float)
+        for relay in self._tcpros.relays:
+            sent[relay.port] += relay.sent_rate
+            received[relay.port] += relay.received_rate
+        for one in sorted(
+            self._stand_ins.by_local.values(), key=lambda one: (one.local.port, one.uri)
+        ):
+            plane = self._plane.status_of(one) if one.fast_candidate else None
+            told.append(
+                {
+                    "port": one.local.port,
+                    "uri": one.uri[:LONGEST_TOLD],
+                    "connections": counts[one.local.port],
+                    "sent_rate": sent[one.local.port] + (plane["sent_rate"] if plane else 0.0),
+                    "received_rate": received[one.local.port]
+                    + (plane["received_rate"] if plane else 0),
+                    "data_plane": plane,
+                }
+            )
+        return told
+
+    def take_fast_ports(self) -> int:
+        """Have no topic go where no header is read; how many connections that has cut."""
+        count = 0
+        for stand_in in self._stand_ins.by_local.values():
+            if stand_in.fast_port is not None:
+                count += stand_in.fast_connections
+                self._plane.cut(stand_in)
+                self._close_fast_port(stand_in)
+        return count
 
     def close(self) -> None:
         """Stop listening, for good."""
@@ -149,7 +190,7 @@ class StandInPorts:
 
     def _needed(self, uris: Iterable[str]) -> dict[str, HostPort]:
         """Those of the URIs that need a stand-in, with what it has to lead to."""
-        if self._closed or not self._active:
+        if not self._active or self._closed:
             return {}
         found = ((uri, self._context.addressing.foreign(uri)) for uri in uris)
         return {uri: where for uri, where in found if where}
@@ -187,6 +228,7 @@ class StandInPorts:
         problems = self._context.problems
         if known := self._stand_ins.find(address, uri):
             self._stand_ins.note_used(known)
+            self._open_fast_port(known)
             return
         why = self._make_room()
         if why is None:
@@ -226,14 +268,56 @@ class StandInPorts:
         serve, gate = partial(self._serve, stand_in), self._context.gate
         self._acceptors[local] = Acceptor(self._context.tasks, sock, serve, gate)
         self._stand_ins.add(stand_in)
+        self._open_fast_port(stand_in)
         log.debug("%s stands in for %s", local, stand_in.uri)
         return None
+
+    def _open_fast_port(self, stand_in: StandIn) -> None:
+        """Open a stand-in's second port where that can be of use, and can be had."""
+        usable = self._plane.syncer.usable
+        there = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
+        if there is None:
+            return
+        if not self._judge.inside_may_bypass() or stand_ins.obstacle(
+            there.port, self._context.settings
+        ):
+            return
+        try:
+            sock = sockets.listen(there.host, there.port)
+        except OSError as error:
+            log.debug("%s can't be opened: %s", there, error)
+            return
+        serve, gate = partial(self._serve, stand_in), self._context.gate
+        self._acceptors[there] = Acceptor(self._context.tasks, sock, serve, gate)
+        self._stand_ins.note_fast_port(stand_in, there.port)
+
+    def _close_fast_port(self, stand_in: StandIn) -> None:
+        if stand_in.fast_port is not None:
+            self._acceptors.pop(HostPort(stand_in.local.host, stand_in.fast_port)).close()
+            self._stand_ins.note_fast_port(stand_in, None)
+            self._plane.syncer.note_change(stand_in)
+
+    async def _topics_at(self, stand_in: StandIn, said: int) -> HostPort:
+        """Where a node's topics are to be had, which has named its TCPROS port."""
+        syncer, fast_port = self._plane.syncer, stand_in.fast_port
+        if fast_port is None:
+            return stand_in.local
+        try:
+            stand_in.address = (await self._outside.reach(stand_in.where)).host
+        except OSError as error:
+            log.debug("%s: %s", stand_in.where, error)
+            return stand_in.local
+        if syncer.may_forward(stand_in) and await syncer.forwards(stand_in, said):
+            return HostPort(stand_in.local.host, fast_port)
+        syncer.log_reason(stand_in)
+        return stand_in.local
 
     def _close(self, stand_in: StandIn) -> None:
         """Let a port refuse; relays that are open stay."""
         acceptor = self._acceptors.pop(stand_in.local, None)
         if acceptor is not None:
             acceptor.close()
+            self._close_fast_port(stand_in)
             self._stand_ins.remove(stand_in)
             self.server.close_port(stand_in.local.port)
 
@@ -241,12 +325,18 @@ class StandInPorts:
         """A node that refuses has ended: its port refuses as well, until it is found again."""
         log.debug("%s refuses; so does %s", stand_in.uri, stand_in.local)
         self._close(stand_in)
-        self._refused.add(stand_in.uri)
+        self._refused[stand_in.uri] = None
+        if len(self._refused) > stand_ins.MOST_STAND_INS:
+            del self._refused[next(iter(self._refused))]
+
+    async def _refuses(self, where: HostPort) -> bool:
+        async with self._trying:
+            return await self._outside.refuses(where)
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._tcpros.relays if relay.inside_asks)
-        ports = {one.local.port for one in self._stand_ins.by_local.values()}
-        counts.update({port: self.server.count(port) for port in ports})
+        for one in self._stand_ins.by_local.values():
+            counts[one.local.port] += self.server.count(one.local.port) + one.fast_connections
         return counts
 
     async def _serve(self, stand_in: StandIn, conn: socket.socket, peer: str) -> None:
@@ -288,8 +378,9 @@ class StandInPorts:
         if stand_in.kept:
             address = self._context.upstream.master_address or stand_in.where.host
             return slave_api.sent_directly(parsed, reply, stand_in.where.host.lower(), address)
-        said = slave_api.topic_port(parsed, reply)
+        reached, said = stand_in.local, slave_api.topic_port(parsed, reply)
         if said is not None:
-            stand_in.topic_ports[parsed.string(1) or ""] = said
+            stand_in.note_topic_port(parsed.string(1) or "", said)
+            reached = await self._topics_at(stand_in, said)
         await self.listen_for(slave_api.told_uris(parsed, reply), asker)
-        return slave_api.rewrite_reply(parsed, reply, stand_in.local, view)
+        return slave_api.rewrite_reply(parsed, reply, reached, view)

@@ -6,8 +6,8 @@ is told (transport_udp.cpp). So the offer is all that has to be rewritten. rospy
 
 With ``--direction both`` neither side can send to the other:
 
-  * an outside subscriber's offer to a node inside leads to a port on the proxy's inside address,
-    and from there to the subscriber (`lead_outwards`);
+  * an offer to a node inside, from outside or from another inside network, leads to a UDP port of
+    the stand-ins on the proxy's inside address, and from there to the subscriber (`lead_outwards`);
   * an inside subscriber's offer to a node outside leads to a UDP port of the range as outside sees
     it, if the range is published for UDP (``--udp``), and from there inside (`lead_inwards`).
 
@@ -15,13 +15,14 @@ An offer that can't be had is taken out of the call: the publisher then chooses 
 offered, too. So is one whose connection header names another topic than the call: that header is
 what roscpp serves (topic_manager.cpp), and the policy has been asked for the other.
 
-A relay lasts as long as its subscriber: until that refuses, is not registered any more, or may not
-have the topic any more (`sweep`).
+A relay lasts as long as both ends of it: until the subscriber refuses, or one of them is not
+registered any more (`sweep`), or the subscriber may not have the topic any more (`cut_denied`).
 """
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
 from hashlib import blake2b
 
 import msgspec
@@ -35,7 +36,8 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.stand_ins import StandIn
+from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
 from rosproxy.ros1.rewriting.udpros import lead_to, read_offers
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.standins.outside import Outside
@@ -47,7 +49,7 @@ MOST_RELAYS_EACH = 64
 """Relays of one proxy, and of subscribers at one address; with one more the oldest of those that
 have most goes: who asks for many takes none from others."""
 TRIES = 64
-"""Ports of the range that are tried for one."""
+"""Ports that are tried for one."""
 
 
 class UdprosSubscription(msgspec.Struct, frozen=True):
@@ -65,12 +67,24 @@ class UdprosSubscription(msgspec.Struct, frozen=True):
     inside_asks: bool
 
 
+@dataclass(frozen=True, slots=True)
+class _Right:
+    """Asked anew each time: whether both ends are there still, and whether the policy lets them."""
+
+    there: Callable[[], bool]
+    allowed: Callable[[], bool]
+
+    def holds(self) -> bool:
+        """Whether a relay may be."""
+        return self.there() and self.allowed()
+
+
 class UdprosRelays:
     """Opens relays for the offers that pass, and ends them."""
 
     def __init__(self, context: Context, judge: PolicyJudge, outside: Outside) -> None:
         self._context, self._judge, self._outside = context, judge, outside
-        self._open: dict[UdprosSubscription, tuple[DatagramRelay, Callable[[], bool]]] = {}
+        self._open: dict[UdprosSubscription, tuple[DatagramRelay, _Right]] = {}
 
     def __iter__(self) -> Iterator[tuple[UdprosSubscription, DatagramRelay]]:
         """All that are open."""
@@ -87,91 +101,93 @@ class UdprosRelays:
     async def lead_outwards(
         self, endpoint: Endpoint, call: Call, body: bytes, source: str
     ) -> bytes:
-        """The call of a subscriber outside as a node inside is to have it."""
+        """The call of a subscriber that asks through the proxy as a node inside is to have it."""
         proxy = self._context.node_asker(endpoint).proxy
-        topic, caller_id, edits = call.string(1) or "", call.string(0) or "", list[Edit]()
+        topic, caller_id = call.string(1) or "", call.string(0) or ""
 
-        def may() -> bool:
-            there = self._context.registry.by_port.get(endpoint.port) is endpoint
-            publishes = topic in endpoint.names(Kind.PUBLISHER)
+        def there() -> bool:
+            known = self._context.registry.by_port.get(endpoint.port) is endpoint
+            return known and topic in endpoint.names(Kind.PUBLISHER)
+
+        def allowed() -> bool:
             kind = RuleKind.PUBLISH
-            return (
-                there
-                and publishes
-                and not self._judge.outside_may_not(kind, topic, endpoint, source, caller_id)
-            )
+            return not self._judge.outside_may_not(kind, topic, endpoint, source, caller_id)
 
-        for offer in read_offers(call):
-            led = None
-            if offer.where and offer.topic == topic and may():
-                target = await self._reachable(offer.where)
-                if target is not None:
-                    port, sources = endpoint.port, [endpoint.place.address]
-                    one = UdprosSubscription(port, topic, caller_id, source, target, False)
-                    led = self._lead(one, may, proxy, [0], sources)
-            edits += lead_to(offer, HostPort(proxy, led) if led else None)
-        return xmlrpc.apply(body, edits)
+        right = _Right(there, allowed)
+
+        async def lead(where: HostPort) -> HostPort | None:
+            target = await self._reachable(where, source)
+            if target is None:
+                return None
+            port, sources = endpoint.port, [endpoint.place.address]
+            one = UdprosSubscription(port, topic, caller_id, source, target, False)
+            led = self._lead(one, right, proxy, _tried(one, PORTS), sources)
+            return HostPort(proxy, led) if led else None
+
+        return await _rewritten(call, body, right, lead)
 
     async def lead_inwards(self, stand_in: StandIn, call: Call, body: bytes, source: str) -> bytes:
         """The call of a subscriber inside as a node outside is to have it."""
-        topic, caller_id, edits = call.string(1) or "", call.string(0) or "", list[Edit]()
+        topic, caller_id = call.string(1) or "", call.string(0) or ""
         settings, registry = self._context.settings, self._context.registry
 
-        def may() -> bool:
+        def there() -> bool:
             endpoint = registry.by_caller.get(caller_id)
-            itself = endpoint is not None and endpoint.address == source
-            subscribes = (Kind.SUBSCRIBER, topic, caller_id) in (
-                endpoint.registrations if endpoint else ()
-            )
-            kind = RuleKind.SUBSCRIBE
-            return (
-                itself
-                and subscribes
-                and not self._judge.inside_may_not(kind, topic, source, caller_id)
-            )
+            if not settings.udp or endpoint is None or endpoint.address != source:
+                return False
+            return (Kind.SUBSCRIBER, topic, caller_id) in endpoint.registrations
 
-        for offer in read_offers(call):
-            led = None
-            if settings.udp and offer.where and offer.topic == topic and may():
-                target, port = HostPort(source, offer.where.port), stand_in.local.port
-                one = UdprosSubscription(port, topic, caller_id, source, target, True)
-                publisher = self._context.upstream.reach(stand_in.where).host
-                sources = await resolve(publisher, NODES)
-                led = self._lead(one, may, settings.bind, self._range_for(one), sources)
-            edits += lead_to(offer, self._context.addressing.outside(led) if led else None)
-        return xmlrpc.apply(body, edits)
+        def allowed() -> bool:
+            return not self._judge.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
 
-    def sweep(self) -> int:
-        """End those whose subscribers are gone, or may not have the topic any more; how many."""
-        over = [one for one, (_, may) in self._open.items() if not may()]
-        for one in over:
+        right = _Right(there, allowed)
+
+        async def lead(where: HostPort) -> HostPort | None:
+            target, port = HostPort(source, where.port), stand_in.local.port
+            one = UdprosSubscription(port, topic, caller_id, source, target, True)
+            publisher = self._context.upstream.reach(stand_in.where).host
+            sources = await resolve(publisher, NODES)
+            ports = _tried(one, settings.ports.listen.ports())
+            led = self._lead(one, right, settings.bind, ports, sources)
+            return self._context.addressing.outside(led) if led else None
+
+        return await _rewritten(call, body, right, lead)
+
+    def sweep(self) -> None:
+        """End those of which an end is gone."""
+        for one in [one for one, (_, right) in self._open.items() if not right.there()]:
             self._end(one)
-        return len(over)
+
+    def cut_denied(self) -> int:
+        """End those whose subscribers may not have the topic any more; how many."""
+        self.sweep()
+        denied = [one for one, (_, right) in self._open.items() if not right.allowed()]
+        for one in denied:
+            self._end(one)
+        return len(denied)
 
     def close(self) -> None:
         """End all."""
         for one in list(self._open):
             self._end(one)
 
-    async def _reachable(self, where: HostPort) -> HostPort | None:
-        """Where an address outside is; None if it is not outside, or not to be found."""
+    async def _reachable(self, where: HostPort, source: str) -> HostPort | None:
+        """Where a subscriber wants its datagrams that asks from an address; None: not to be had.
+
+        That is outside or, on another inside network, at the very address that asks.
+        """
+        if self._context.standing(source) is Standing.ADMITTED:
+            return HostPort(source, where.port)
         try:
             return await self._outside.reach(where)
         except OSError as error:
             log.debug("no datagrams to %s: %s", where, error)
             return None
 
-    def _range_for(self, one: UdprosSubscription) -> list[int]:
-        """The ports of the range to try: after a restart the same comes first."""
-        ports = list(self._context.settings.ports.listen.ports())
-        seed = blake2b(f"{one.port} {one.topic} {one.caller_id}".encode(), digest_size=8).digest()
-        first = int.from_bytes(seed, "big") % len(ports)
-        return [*ports[first:], *ports[:first]][:TRIES]
-
     def _lead(
         self,
         one: UdprosSubscription,
-        may: Callable[[], bool],
+        right: _Right,
         address: str,
         ports: Iterable[int],
         sources: Collection[str],
@@ -190,7 +206,7 @@ class UdprosRelays:
             except OSError as error:
                 log.debug("no datagrams for %s at port %d: %s", one.topic, port, error)
                 continue
-            self._open[one] = relay, may
+            self._open[one] = relay, right
             log.debug("datagrams of %s at port %d go to %s", one.topic, relay.port, one.target)
             return relay.port
         return None
@@ -208,3 +224,26 @@ class UdprosRelays:
         relay, _ = self._open.pop(one, (None, None))
         if relay is not None:
             relay.close()
+
+
+def _tried(one: UdprosSubscription, ports: range) -> list[int]:
+    """The ports to try for a subscription: after a restart the same comes first."""
+    seed = blake2b(f"{one.port} {one.topic} {one.caller_id}".encode(), digest_size=8).digest()
+    first, count = int.from_bytes(seed, "big"), len(ports)
+    return [ports[(first + number) % count] for number in range(min(TRIES, count))]
+
+
+async def _rewritten(
+    call: Call,
+    body: bytes,
+    right: _Right,
+    lead: Callable[[HostPort], Awaitable[HostPort | None]],
+) -> bytes:
+    """A call with each of its offers led elsewhere, or taken out if it may not or can't be had."""
+    topic, edits = call.string(1) or "", list[Edit]()
+    for offer in read_offers(call):
+        led = None
+        if offer.where and offer.topic == topic and right.holds():
+            led = await lead(offer.where)
+        edits += lead_to(offer, led)
+    return xmlrpc.apply(body, edits)

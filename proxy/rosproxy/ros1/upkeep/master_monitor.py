@@ -26,13 +26,14 @@ class MasterMonitor:
     """Polls the master, and has restored what it has lost.
 
     ``up`` is None before the first look; ``since`` is the time of the last change, ``round_trip``
-    in seconds.
+    in seconds. ``answered`` is set once the master has answered.
     """
 
     def __init__(self, context: Context, recovery: Recovery, registrar: Registrar) -> None:
         self._context, self._recovery, self._registrar = context, recovery, registrar
         self._looks = 0
         self.up: bool | None = None
+        self.answered = asyncio.Event()
         self.error = ""
         self.pid: int | None = None
         self.round_trip: float | None = None
@@ -62,6 +63,7 @@ class MasterMonitor:
         if up != self.up:
             self.since = self._context.now()
             if up:
+                self.answered.set()
                 log.info("master %s answers (pid %s)", self._context.settings.master_uri, self.pid)
                 self._context.problems.solved("master")
             else:

@@ -2,9 +2,9 @@
 
 What is denied now is taken back at the master and hidden; the nodes inside that use it stay
 connected. What is allowed again is registered. Connections from outside to what outside may not
-have are cut, and a node of which anything may be denied loses its fast port: what the kernel
-forwards nobody looks at. Nothing else is touched, so that it may be done at any time, and is done
-again until it has worked.
+have are cut, and a node of which anything may be denied loses its fast port, as do all stand-ins
+for nodes outside where a rule is about those: what the kernel forwards nobody looks at. Nothing
+else is touched, so that it may be done at any time, and is done again until it has worked.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import UNREGISTERED, TcprosServer
-from rosproxy.ros1.standins.udpros import UdprosRelays
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 
@@ -51,7 +51,7 @@ class PolicyEnforcer:
     _tcpros: TcprosServer
     _plane: KernelPlane
     _judge: PolicyJudge
-    _udpros: UdprosRelays
+    _stand_ins: StandInPorts
     _enforced: int = -1
     _again: bool = False
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -72,7 +72,7 @@ class PolicyEnforcer:
         """Make everything fit the policy. Raises Unreachable, MasterError; what is cut is cut."""
         async with self._one_at_a_time:
             version, self._again = self._context.policy.version, False
-            cut = self._cut_relays() + self._udpros.sweep() + self._take_fast_ports()
+            cut = self._cut_relays() + self._stand_ins.udpros.cut_denied() + self._take_fast_ports()
             try:
                 await self._recovery.ensure()
                 hidden, shown = await self._registrar.apply_policy()
@@ -108,7 +108,9 @@ class PolicyEnforcer:
 
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""
-        count = 0
+        count = 0 if self._judge.inside_may_bypass() else self._stand_ins.take_fast_ports()
+        if count:
+            self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:
             if endpoint.fast_port is not None and not self._judge.may_bypass(endpoint):
                 count += endpoint.fast_connections

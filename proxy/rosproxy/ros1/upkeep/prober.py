@@ -1,9 +1,11 @@
 """Looking after each node by its pulse: probe, unregister the dead, free the ports of the unused.
 
-Every few seconds a node that nobody called is asked for its pid. Two failures in a row make its
-port refuse, so that a dead node looks dead; after the time of ``--cleanup-after`` it is
-unregistered at the master. A node that answers again is served again, and registered again if need
-be. Another pid than before means another process: what the former one left is taken back.
+Every few seconds a node that nobody called is asked for its pid: one that is well over a connection
+that is kept (`rosproxy.ros1.clients.kept`), any other by a call; so is, at once, one that has ended
+that connection. Two failures in a row make its port refuse, so that a dead node looks dead; after
+the time of ``--cleanup-after`` it is unregistered at the master. A node that answers again is
+served again, and registered again if need be. Another pid than before means another process: what
+the former one left is taken back.
 
 What follows from a probe: `Health.note` says how the node is, `liveness` what is due, and the
 `Registrar` and the rooms beside this one do it.
@@ -14,7 +16,9 @@ import logging
 from dataclasses import dataclass, field
 
 from rosproxy.leases.leases import Leases
+from rosproxy.ros1.clients.kept import KeptConnections
 from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.node import ProbeAnswer
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
@@ -28,6 +32,9 @@ log = logging.getLogger(__name__)
 PROBE_TICK = 0.25
 """Seconds between looks at all endpoints."""
 PARALLEL_PROBES = 64
+OVERDUE = "no answer in time"
+SWEEP_INTERVAL = 5.0
+"""Seconds between looks for kept connections whose endpoint has gone."""
 
 
 @dataclass(slots=True, eq=False)
@@ -39,34 +46,66 @@ class Prober:
     _registrar: Registrar
     _resubscriber: Resubscriber
     _recovery: Recovery
+    kept: KeptConnections[Endpoint] = field(init=False)
     _probing: set[Endpoint] = field(default_factory=set)
+    _sweep_at: float = 0.0
     _limit: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(PARALLEL_PROBES))
+
+    def __post_init__(self) -> None:
+        """Begin with no connection."""
+        self.kept = KeptConnections(self._context.nodes, self._context.settings.probe_timeout)
 
     async def look(self) -> None:
         """Look after all endpoints once."""
-        if self._context.retired:
+        context = self._context
+        if context.retired:
             return
-        now, interval = self._context.now(), self._context.settings.probe_interval
+        now, interval = context.now(), context.settings.probe_interval
+        for endpoint, result in self.kept.collect(now).items():
+            self._heard(endpoint, result, now)
         busy = self._probing | self._recovery.verifying
-        for endpoint in self._context.registry:
+        for endpoint in liveness.to_look_at(context.registry, now, interval):
             if endpoint not in busy and liveness.is_due(endpoint, now, interval):
-                self._probing.add(endpoint)
-                self._context.tasks.spawn(self._probe(endpoint), f"probe of {endpoint.uri}")
+                self._ask(endpoint, now)
             self._end_if_unused(endpoint)
+        if now >= self._sweep_at:
+            self._sweep_at = now + SWEEP_INTERVAL
+            self.kept.keep(set(context.registry))
 
-    async def _probe(self, endpoint: Endpoint) -> None:
+    def _ask(self, endpoint: Endpoint, now: float) -> None:
+        """Find out how a node is, in the cheapest way that there is."""
+        pid = endpoint.health.pid if liveness.may_be_kept(endpoint) else None
+        if pid is None or not self.kept.ask(endpoint, endpoint.slave, pid, now):
+            self._begin(endpoint)
+
+    def _heard(self, endpoint: Endpoint, result: ProbeResult | None, now: float) -> None:
+        """Take in what has become of a kept connection."""
+        if result is None:
+            endpoint.health.note_hung_up()
+        elif endpoint in self._probing or not liveness.may_be_kept(endpoint):
+            return  # somebody suspects it meanwhile: it is asked by a call
+        elif result is ProbeResult.ANSWERED:
+            endpoint.health.note(result, now)
+        else:
+            self._begin(endpoint, ProbeAnswer(result, reason=f"{endpoint.slave}: {OVERDUE}"))
+
+    def _begin(self, endpoint: Endpoint, answer: ProbeAnswer | None = None) -> None:
+        self._probing.add(endpoint)
+        self._context.tasks.spawn(self._probe(endpoint, answer), f"probe of {endpoint.uri}")
+
+    async def _probe(self, endpoint: Endpoint, answer: ProbeAnswer | None) -> None:
         try:
             async with self._limit:
-                await self._look_after(endpoint)
+                await self._look_after(endpoint, answer)
         except (Unreachable, MasterError) as error:
             log.debug("upkeep of %s has to wait: %s", endpoint.label, error)
         finally:
             self._probing.discard(endpoint)
 
-    async def _look_after(self, endpoint: Endpoint) -> None:
-        """Probe an endpoint's node and act on the result."""
+    async def _look_after(self, endpoint: Endpoint, answer: ProbeAnswer | None) -> None:
+        """Act on how a node has answered, or answers when it is called."""
         where, health = endpoint.slave, endpoint.health
-        answer = await self._context.nodes.probe(where)
+        answer = answer or await self._context.nodes.probe(where)
         if endpoint.slave != where:
             return  # it has moved meanwhile
         failing = health.failures > 0

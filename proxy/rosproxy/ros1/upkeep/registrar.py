@@ -39,6 +39,9 @@ class Registrar:
 
     def __init__(self, context: Context, matchmaker: Matchmaker) -> None:
         self._context, self._matchmaker = context, matchmaker
+        self._complete: tuple[bytes, int, frozenset[int]] = b"", -1, frozenset()
+        """The master's state, our own and the ports of nodes that answered, when nothing of theirs
+        was missing."""
 
     async def register(self, held: Sequence[Held]) -> None:
         """Register again what the master has lost. Raises Unreachable, MasterError.
@@ -91,21 +94,27 @@ class Registrar:
             await self.register([(endpoint, held) for held in found])
 
     async def register_lost(self) -> None:
-        """Register what the master no longer has of live nodes. Raises Unreachable, MasterError."""
-        started = self._context.now()
-        state = await self._context.upstream.read_registrations()
-        ours = {
-            held: endpoint
-            for endpoint, held in self._context.registry.registrations()
-            if endpoint.answers and not endpoint.health.cleaned
-        }
-        lost = policy.lost(list(ours), state, started)
-        unsettled = [e for e in self._context.registry if e.unsettled and not e.health.down]
+        """Register what the master no longer has of live nodes. Raises Unreachable, MasterError.
+
+        Where neither the master's state nor ours has changed since nothing was missing, nothing is.
+        """
+        registry, started = self._context.registry, self._context.now()
+        alive = [e for e in registry if e.answers and not e.health.cleaned]
+        ours = registry.changes, frozenset(e.port for e in alive)
+        seen = self._complete[0] if self._complete[1:] == ours else b""
+        digest, state = await self._context.upstream.read_changes(seen)
+        unsettled = [e for e in registry if e.unsettled and not e.health.down]
         if unsettled:
             await self.resettle(unsettled)
+        if state is None:
+            return
+        held = {one: e for e in alive for one in e.registrations.values()}
+        lost = policy.lost(list(held), state, started)
         if lost:
             log.warning("the master has lost %d registrations; making them again", len(lost))
-            await self.register([(ours[held], held) for held in lost])
+            await self.register([(held[one], one) for one in lost])
+        elif ours[0] == registry.changes:
+            self._complete = digest, *ours
 
     async def clean_up(self, endpoint: Endpoint) -> None:
         """Unregister a node that is gone at the master. Raises Unreachable."""

@@ -25,10 +25,11 @@ from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Held
+from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.tcpros import TcprosServer
-from rosproxy.ros1.standins.udpros import UdprosRelays
+from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.matchmaker import PARALLEL_CALLS, Matchmaker
 from rosproxy.ros1.upkeep.policy import resubscription as policy
 from rosproxy.ros1.upkeep.policy.registration import one_publisher_per_topic
@@ -48,6 +49,8 @@ RESUBSCRIBE_TICK = 1.0
 """Seconds between checks whether it is time to look at any."""
 Missed = tuple[str, str, str]
 """A topic, a subscriber's name, and the URI at the master of a publisher that it does not hear."""
+Way = tuple[StandIn | None, str]
+"""What stands in for a node outside, and the address of a node inside."""
 
 
 class Resubscriber:
@@ -60,10 +63,10 @@ class Resubscriber:
         matchmaker: Matchmaker,
         tcpros: TcprosServer,
         plane: KernelPlane,
-        udpros: UdprosRelays,
+        stand_ins: StandInPorts,
     ) -> None:
         self._context, self._registrar, self._matchmaker = context, registrar, matchmaker
-        self._tcpros, self._plane, self._udpros = tcpros, plane, udpros
+        self._tcpros, self._plane, self._stand_ins = tcpros, plane, stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
 
@@ -128,7 +131,12 @@ class Resubscriber:
         graph = Graph(held, await self._context.upstream.look_up("lookupNode", held))
         left = self._through_proxy(graph, left)
         bus = await self._read_buses(left) if ask else {}
-        if any(one.endpoint.fast_port or one.endpoint.fast_peers for one in left):
+        outside = self._outside_publishers(graph, endpoints)
+        for endpoint, _, uris in outside:
+            await self._stand_ins.listen_for(uris, self._context.node_asker(endpoint))
+        if self._context.stand_ins.by_port or any(
+            one.endpoint.fast_port or one.endpoint.fast_peers for one in left
+        ):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, left)
         left = policy.without_relay(left, self._tcpros.topic_connections())
@@ -136,7 +144,7 @@ class Resubscriber:
             (one.topic, one.caller_id, self._context.addressing.advertised_uri(one.endpoint))
             for one in policy.unconnected(left, bus, addresses)
         ]
-        return await self._send_without(graph, missed + self._without_outside(graph, endpoints))
+        return await self._send_without(graph, missed + self._without_outside(outside))
 
     def _through_proxy(
         self, graph: Graph, left: Iterable[TopicSubscription]
@@ -186,22 +194,46 @@ class Resubscriber:
         found = await asyncio.gather(*(find(graph.uris[node]) for node in nodes))
         return dict(zip(nodes, found, strict=True))
 
-    def _without_outside(self, graph: Graph, endpoints: Iterable[Endpoint]) -> list[Missed]:
-        """The publishers outside that subscribers inside have no relay to, but ought to have."""
+    def _outside_publishers(
+        self, graph: Graph, endpoints: Iterable[Endpoint]
+    ) -> list[tuple[Endpoint, Registration, list[str]]]:
+        """What the nodes of some endpoints subscribe to, with the URIs of publishers outside.
+
+        Nothing where these are reached without the proxy.
+        """
+        both, publishers = self._context.stand_ins.both, graph.by_topic(Kind.PUBLISHER)
+        foreign = self._context.addressing.foreign
+        return [
+            (endpoint, held, list(filter(foreign, publishers.get(held.name, ()))))
+            for endpoint in (endpoints if both else ())
+            for held in endpoint.registrations.values()
+            if held.kind is Kind.SUBSCRIBER and not held.hidden
+        ]
+
+    def _without_outside(
+        self, outside: Iterable[tuple[Endpoint, Registration, list[str]]]
+    ) -> list[Missed]:
+        """The publishers outside that subscribers inside are not connected to, but ought to be.
+
+        What the kernel forwards is known by addresses alone: unless there are as many connections
+        as a node inside has subscriptions to one outside, all of these count.
+        """
         context = self._context
-        relays = self._tcpros.topic_connections() | self._udpros.connections()
-        publishers, found = graph.by_topic(Kind.PUBLISHER), list[Missed]()
-        for endpoint in endpoints if context.stand_ins.both else ():
+        relays = self._tcpros.topic_connections() | self._stand_ins.udpros.connections()
+        left: dict[Way, list[Missed]] = {}
+        for endpoint, held, uris in outside:
             proxy = context.node_asker(endpoint).proxy
-            for held in endpoint.registrations.values():
-                if held.kind is not Kind.SUBSCRIBER or held.hidden:
-                    continue
-                for uri in filter(context.addressing.foreign, publishers.get(held.name, ())):
-                    there = context.stand_ins.find(proxy, uri)
-                    port = there.local.port if there else 0
-                    if (port, held.name, held.caller_id) not in relays:
-                        found.append((held.name, held.caller_id, uri))
-        return found
+            for uri in uris:
+                there = context.stand_ins.find(proxy, uri)
+                if there is None or (there.local.port, held.name, held.caller_id) not in relays:
+                    missed = held.name, held.caller_id, uri
+                    left.setdefault((there, endpoint.address), []).append(missed)
+        return [
+            one
+            for (there, address), missing in left.items()
+            if there is None or there.fast_peers.get(address, 0) < len(missing)
+            for one in missing
+        ]
 
     async def _send_without(self, graph: Graph, found: Iterable[Missed]) -> set[str]:
         """Send each subscriber its publishers without those that it misses; the topics."""

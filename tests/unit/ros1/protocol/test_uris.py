@@ -130,18 +130,36 @@ def test_any_text_is_parsed_without_raising(text: str) -> None:
     ],
 )
 def test_the_inside_address_in_a_path(node: HostPort, address: str, path: str) -> None:
-    assert inside_path(node, address) == path
+    assert inside_path(slave_uri(node), node, address) == path
     held = None if node.host == address else address
     assert parse_inside_path(f"http://robot-host:45000{path}") == InsidePath(node, held)
 
 
 @given(PLACES, ADDRESSES, PLACES)
 def test_inside_paths_round_trip(node: HostPort, address: str, outside: HostPort) -> None:
-    uri = slave_uri(outside, inside_path(node, address))
+    uri = slave_uri(outside, inside_path(slave_uri(node), node, address))
     found = parse_inside_path(uri)
     assert found is not None
     assert (found.node, found.address or found.node.host) == (node, address)
     assert parse_slave_uri(uri) == outside
+
+
+@given(PLACES, PLACES, PLACES)
+def test_the_uri_that_another_proxy_advertises_is_kept(
+    node: HostPort, first: HostPort, second: HostPort
+) -> None:
+    """Of two proxies in a row the outer one's URI carries the inner one's, with all it carries."""
+    inner = slave_uri(first, inside_path(slave_uri(node), node, "10.0.0.5"))
+    outer = slave_uri(second, inside_path(inner, first, "10.0.0.9"))
+    found = parse_inside_path(outer)
+    assert found is not None
+    assert slave_uri(found.node, found.path) == inner
+    assert found.slave == HostPort("10.0.0.9", first.port)
+
+
+def test_a_path_that_is_too_long_is_not_carried() -> None:
+    node = HostPort("10.0.0.5", 40001)
+    assert inside_path(slave_uri(node, f"/{'x' * 600}"), node, "10.0.0.5") == "/10.0.0.5:40001/"
 
 
 @pytest.mark.parametrize(

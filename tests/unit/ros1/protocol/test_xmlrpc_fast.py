@@ -126,3 +126,30 @@ def test_spaces_cost_no_more_than_their_number() -> None:
     body = dumps(("a",), "x").encode().replace(b"<param>", spaces + b"<param>" + spaces)
     assert fast.call(body) is not None
     assert fast.call(body.replace(b"</param>", b"</parm>")) is None
+
+
+NAMES = st.recursive(TEXT | st.integers(-(2**31), 2**31 - 1), st.lists)
+
+
+@given(st.lists(NAMES))
+def test_lists_of_names_and_numbers_are_read_as_they_are(value: list[Any]) -> None:
+    body = py_reply(value)
+    assert fast.lists(body) == value
+    assert xmlrpc.python_value(xmlrpc.parse_response(body)[0]) == value
+
+
+@given(SOUP)
+def test_what_is_taken_for_lists_is_what_expat_reads(soup: str) -> None:
+    for inner in (soup, f"<value><array><data>{soup}</data></array></value>"):
+        body = f"<methodResponse><params><param>{inner}</param></params></methodResponse>".encode()
+        found = fast.lists(body)
+        if found is not None:
+            _, (value, _) = by_expat(body)
+            assert xmlrpc.python_value(value) == found
+
+
+@given(VALUES, st.integers(0, 40))
+def test_a_reply_that_is_too_deep_is_no_lists_either(value: Any, depth: int) -> None:
+    body, limits = py_reply([value]), Limits(10_000, 1000, depth)
+    if fast.lists(body, limits) is not None:
+        assert by_expat(body, limits)[0] == "reply"

@@ -10,7 +10,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.rewriting import slave_api
-from rosproxy.ros1.rewriting.slave_api import View
+from rosproxy.ros1.rewriting.slave_api import CallView
 from tests.unit.builders import (
     DIALECTS,
     PROXY,
@@ -33,7 +33,7 @@ OUTSIDE = HostPort("robot-host", 45000)
 MASTER_ID = "/master"
 
 
-def world() -> View:
+def world() -> CallView:
     addressing = make_addressing()
     node = add_node(addressing, OWN)
     add_node(addressing, OTHER)

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
-from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.ros1.upkeep.policy import liveness
 from tests.unit.builders import add_node, add_registration, make_addressing
 
@@ -99,3 +101,67 @@ def test_whether_it_is_the_same_process(
 ) -> None:
     endpoint = endpoint_with(known, *topics)
     assert liveness.is_same_process(endpoint, pid, said) is same
+
+
+TIMES = st.none() | st.integers(0, 12).map(float)
+HEALTHS = st.builds(
+    Health,
+    answered=TIMES,
+    failures=st.integers(0, 3),
+    cleaned=st.booleans(),
+    checked=TIMES,
+    pid=st.sampled_from([None, -1, 7]),
+)
+
+
+@given(
+    HEALTHS,
+    st.booleans(),
+    st.booleans(),
+    st.integers(0, 1),
+    TIMES,
+)
+def test_nobody_who_is_due_or_unused_is_passed_over(
+    health: Health, registered: bool, direct: bool, connections: int, idle_since: float | None
+) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    if registered:
+        add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter")
+    if direct:
+        endpoint.note_former_uri(endpoint.uri)
+    endpoint.health, endpoint.connections, endpoint.idle_since = health, connections, idle_since
+    passed_over = not liveness.to_look_at([endpoint], 12.0, 5.0)
+    if passed_over:
+        assert not liveness.is_due(endpoint, 12.0, 5.0)
+        assert not endpoint.unused
+        assert endpoint.idle_since is None
+    if liveness.may_be_kept(endpoint):
+        assert health.pid == 7
+        assert not any((health.failures, health.cleaned, direct))
+
+
+def test_a_thousand_that_are_well_are_passed_over() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    add_registration(addressing, endpoint, Kind.PUBLISHER, "/chatter")
+    endpoint.health.note(ProbeResult.ANSWERED, 10.0)
+    assert liveness.to_look_at([endpoint] * 1000, 14.9, 5.0) == []
+    assert liveness.to_look_at([endpoint], 15.0, 5.0) == [endpoint]
+
+
+def test_a_process_that_hangs_up_is_called_from_then_on_and_another_is_not() -> None:
+    endpoint = add_node(make_addressing())
+    health = endpoint.health
+    assert not liveness.may_be_kept(endpoint)  # it has never answered
+    health.note(ProbeResult.ANSWERED, 1.0)
+    health.pid = 7
+    assert liveness.may_be_kept(endpoint)
+    health.note_hung_up()
+    assert health.due(1.0, 5.0)
+    health.note(ProbeResult.ANSWERED, 1.1)
+    assert not liveness.may_be_kept(endpoint)
+    health.pid = 8
+    assert liveness.may_be_kept(endpoint)
+    health.suspect()
+    assert not liveness.may_be_kept(endpoint)

@@ -148,6 +148,12 @@ def parse_response(body: bytes, limits: Limits = OWN_REPLY) -> tuple[Value, bool
     return parser.values[0], parser.fault
 
 
+def read_response(body: bytes, limits: Limits = OWN_REPLY) -> Any:
+    """What a reply of the master's or a node's holds, a fault's value too. Raises XmlRpcError."""
+    found = fast.lists(body, limits)
+    return python_value(parse_response(body, limits)[0]) if found is None else found
+
+
 def dump_call(method: str, *params: Any) -> bytes:
     """A ``methodCall`` of the proxy's own."""
     return dumps(params, method).encode()

@@ -8,6 +8,7 @@ as long and decides what is an error.
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.values import KINDS, Value, text_of
@@ -36,6 +37,22 @@ _TOKEN = re.compile(
     )""",
     re.VERBOSE,
 )
+_LIST_TOKEN = re.compile(
+    rb"""\s*(?:
+    <value>\s*<(?:
+        string>([^<]*)</string>\s*</value>
+        |(?:int|i4)>(-?\d{1,18})</(?:int|i4)>\s*</value>
+        |array>\s*<data>()
+    )
+    |</data>\s*</array>\s*</value>()
+    )""",
+    re.VERBOSE,
+)
+_STRING, _INTEGER, _LIST, _LIST_END = range(1, 5)
+_FIRST_PARAM = re.compile(rb"\s*<param>")
+_LAST_PARAM = re.compile(rb"\s*</param>" + _RESPONSE_END.pattern)
+_AROUND = "methodResponse", "params", "param", "value", "string"
+"""The elements around a text that is in no list; each list adds three."""
 _VALUE, _TYPE, _TYPED, _TEXT, _ARRAY, _STRUCT = range(1, 7)
 _ARRAY_END, _NAME, _MEMBER_END, _STRUCT_END, _PARAM, _PARAM_END, _NONE = range(7, 14)
 """The groups of a token; the last one of a match tells what it is."""
@@ -65,6 +82,41 @@ def response(body: bytes, limits: Limits = OWN_REPLY) -> Value | None:
         return None
     params = _params(body, head.end(), _RESPONSE_END, limits.depth)
     return params[0] if params is not None and len(params) == 1 else None
+
+
+def lists(body: bytes, limits: Limits = OWN_REPLY) -> list[Any] | None:
+    """What a ``methodResponse`` holds if that is a list of strings, numbers and lists, else None.
+
+    Such are the master's own replies, of which those that name all topics are long. It takes a
+    fifth of the time of `response`, which also tells where each value is.
+    """
+    head = _RESPONSE.match(body)
+    param = _FIRST_PARAM.match(body, head.end()) if head else None
+    if param is None or b"\r" in body or not _is_plain(body, limits):
+        return None
+    top = list[Any]()
+    end = _read_lists(body, param.end(), top, (limits.depth - len(_AROUND)) // 3)
+    found = top[0] if end is not None and _LAST_PARAM.match(body, end) else None
+    return found if isinstance(found, list) else None
+
+
+def _read_lists(body: bytes, start: int, top: list[Any], depth: int) -> int | None:
+    """Read one value into a list, with at most so many lists in each other; where it ends."""
+    around, match = [top], _LIST_TOKEN.scanner(body, start).match  # type: ignore[attr-defined]
+    while (token := match()) and len(around) <= depth:
+        which = token.lastindex
+        if which == _STRING:
+            around[-1].append(token[_STRING].decode())
+        elif which == _INTEGER:
+            around[-1].append(int(token[_INTEGER]))
+        elif which == _LIST:
+            around[-1].append([])
+            around.append(around[-1][-1])
+        else:
+            around.pop()
+        if len(around) < 2:
+            return int(token.end())
+    return None
 
 
 def _is_plain(body: bytes, limits: Limits) -> bool:

@@ -20,6 +20,30 @@ NO_PATIENCE = 0.001
 """Seconds: less than between any two probes. Zero would mean that nothing is ever cleaned up."""
 
 
+def to_look_at(endpoints: Iterable[Endpoint], now: float, interval: float) -> list[Endpoint]:
+    """Those that may be due, or whose lease may end.
+
+    All are gone through several times a second: so it is a single expression, of attributes alone.
+    """
+    return [
+        e
+        for e in endpoints
+        if (health := e.health).checked is None
+        or now - health.checked >= interval
+        or health.failures
+        or health.cleaned
+        or e.idle_since is not None
+        or e.former_uris
+        or not e.registrations
+    ]
+
+
+def may_be_kept(endpoint: Endpoint) -> bool:
+    """Whether a node may be asked over a connection that is kept: nothing follows if it answers."""
+    health = endpoint.health
+    return health.steady and endpoint.trusted and not (health.hangs_up or endpoint.direct)
+
+
 def is_due(endpoint: Endpoint, now: float, interval: float) -> bool:
     """Whether it is time to probe a node; ``interval`` is that of idle nodes in seconds."""
     return endpoint.health.due(now, min(interval, DIRECT_INTERVAL) if endpoint.direct else interval)

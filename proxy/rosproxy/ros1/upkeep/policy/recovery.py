@@ -24,8 +24,8 @@ NO_MERIT = -(10**9)
 class Claim:
     """An endpoint that the master's data tell of: its port, its inside address, what it holds.
 
-    ``node`` is the host and port that the node calls itself, ``slave`` where to look for it,
-    ``advertised`` the URI that the master has.
+    ``node`` is the host and port that the node calls itself, ``path`` its URI's, ``slave`` where to
+    look for it, ``advertised`` the URI that the master has.
     ``said`` are the topics that it names there; None if it was not asked or gave no answer.
     """
 
@@ -35,6 +35,7 @@ class Claim:
     registrations: list[Registration] = field(default_factory=list)
     said: set[str] | None = None
     advertised: str = ""
+    path: str = "/"
 
     @property
     def topics(self) -> set[str]:
@@ -44,7 +45,7 @@ class Claim:
     @property
     def uri(self) -> str:
         """The slave URI as the node must have given it."""
-        return slave_uri(self.node)
+        return slave_uri(self.node, self.path)
 
 
 def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
@@ -53,7 +54,7 @@ def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
     for node, uri in graph.uris.items():
         if ours := addressing.identify(uri):
             port, inside = ours
-            claim = Claim(port, inside.node, inside.slave, advertised=uri)
+            claim = Claim(port, inside.node, inside.slave, advertised=uri, path=inside.path)
             found.setdefault(uri, claim).registrations += graph.held.get(node, [])
     return list(found.values())
 

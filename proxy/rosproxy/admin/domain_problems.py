@@ -1,0 +1,147 @@
+"""What keeps participants of a domain from meeting, as its status tells: the cause, and the cure.
+
+``rosproxy doctor`` says it when it is asked, the proxy in its log and in ``rosproxy status`` once
+it is so. Of a participant only the first cause is told: what follows from it says nothing more.
+"""
+
+from collections.abc import Iterator
+
+import msgspec
+
+from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
+from rosproxy.ros2.registry.participants import VENDORS, DdsSecurity, LocatorFault
+from rosproxy.telemetry.text import plural
+
+
+class DomainProblem(msgspec.Struct, frozen=True):
+    """A cause: which ``check`` has found it, with which participant or name, what, and its cure.
+
+    ``grave``: somebody is kept from somebody by it for certain.
+    """
+
+    check: str
+    subject: str
+    text: str
+    fix: str
+    grave: bool = True
+
+
+FAST_DDS, CYCLONE_DDS = VENDORS[b"\x01\x0f"], VENDORS[b"\x01\x10"]
+_LOCATOR_FAULTS: dict[str, tuple[str, str]] = {
+    LocatorFault.TCP: (
+        "it is reached by TCP alone, and the proxy passes on UDP",
+        "where it runs: unset FASTDDS_BUILTIN_TRANSPORTS (LARGE_DATA is TCP), or give it a "
+        "transport of UDPv4 in its profile",
+    ),
+    LocatorFault.LOOPBACK: (
+        "it announces loopback addresses alone, which mean its own machine to everybody",
+        "where it runs: ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, unset ROS_LOCALHOST_ONLY, and no "
+        "loopback in CYCLONEDDS_URI or an interface list; it was perhaps started before its "
+        "network: restart it",
+    ),
+    LocatorFault.ELSEWHERE: (
+        "the addresses that it announces are not the one that it sends from",
+        "where it runs: let it use the network that it shares with the proxy (the interface list "
+        "of its profile, or CYCLONEDDS_URI); NAT between them can't be",
+    ),
+    LocatorFault.MISSING: (
+        "it announces no address of UDP",
+        "where it runs: give it a transport of UDPv4 in its profile",
+    ),
+}
+_BOTH = "give both the same {policy}"
+_CURES = {
+    "type": "mend one of the programs, or remap its name",
+    "reliability": "make the publisher RELIABLE, or the subscription BEST_EFFORT",
+    "durability": "make the publisher TRANSIENT_LOCAL (latched), or the subscription VOLATILE",
+    "deadline": "a shorter deadline for the publisher, or a longer one for the subscription",
+    "liveliness lease duration": (
+        "a shorter lease for the publisher, or a longer one for the subscription"
+    ),
+    "data representation": "have both write and read XCDR (version 1), as ROS 2 does",
+}
+
+
+def domain_problems(domain: DomainStatus) -> Iterator[DomainProblem]:
+    """All that keeps somebody in a domain from meeting somebody, those to be mended first first."""
+    yield from (problem for _, problem in _of_participants(domain))
+    yield from (problem for _, problem in mismatch_problems(domain))
+    if domain.mismatches_left_out:
+        text = f"{plural(domain.mismatches_left_out, 'more pair')} of endpoints don't match"
+        yield DomainProblem(
+            "qos", f"domain {domain.domain}", text, "mend those that are named first"
+        )
+
+
+def mismatch_problems(domain: DomainStatus) -> Iterator[tuple[MismatchStatus, DomainProblem]]:
+    """What keeps pairs apart neither of which is hindered otherwise."""
+    hindered = {one.guid_prefix for one, problem in _of_participants(domain) if problem.grave}
+    where = {one.guid_prefix: named(one, True) for one in domain.inside}
+    where |= {one.guid_prefix: named(one, False) for one in domain.outside}
+    for pair in domain.mismatches:
+        if not hindered & {pair.writer, pair.reader}:
+            yield pair, _mismatch(pair, where.get(pair.writer, ""), where.get(pair.reader, ""))
+
+
+def named(one: ParticipantStatus, is_inside: bool) -> str:
+    """A participant as texts name it, besides its GUID prefix."""
+    return f"at {one.address} ({one.vendor}, {'inside' if is_inside else 'outside'})"
+
+
+def _of_participants(
+    domain: DomainStatus,
+) -> Iterator[tuple[ParticipantStatus, DomainProblem]]:
+    for side in (domain.inside, domain.outside):
+        for one in side:
+            problem = next(_problems(one, domain, side is domain.inside), None)
+            if problem:
+                yield one, problem
+
+
+def _problems(
+    one: ParticipantStatus, domain: DomainStatus, is_inside: bool
+) -> Iterator[DomainProblem]:
+    """What is wrong with a participant, the first cause first."""
+    where = named(one, is_inside)
+    if one.domain is not None and one.domain != domain.domain:
+        text = f"{where}: it is of domain {one.domain}, and was heard in domain {domain.domain}"
+        fix = f"ROS_DOMAIN_ID={domain.domain} for it, or --ros2-domain {one.domain} for the proxy"
+        yield DomainProblem("domain", one.guid_prefix, text, fix)
+    fault = _LOCATOR_FAULTS.get(one.locator_fault)
+    if fault:
+        yield DomainProblem("transport", one.guid_prefix, f"{where}: {fault[0]}", fault[1])
+    if is_inside:
+        yield from _security(one, where)
+    if one.problem:
+        fix = "give a longer --port-range, and publish it"
+        yield DomainProblem("ports", one.guid_prefix, f"{where}: {one.problem}", fix)
+    if not one.proven:
+        text = f"{where}: nothing has come from it at the ports of the range"
+        fix = f"see that it reaches {domain.discovery.rpartition(':')[0]} there, by UDP"
+        yield DomainProblem("reached", one.guid_prefix, text, fix, grave=False)
+
+
+def _security(one: ParticipantStatus, where: str) -> Iterator[DomainProblem]:
+    """What DDS Security keeps from one inside: the proxy can't change what is protected.
+
+    Fast DDS repeats its addresses with each reader and writer; Cyclone DDS only announces them with
+    the participant itself, which is never protected.
+    """
+    if one.security != DdsSecurity.PROTECTED or one.vendor == CYCLONE_DDS:
+        return
+    text = f"{where}: DDS Security protects its discovery, so that the proxy can't change the "
+    text += "addresses of its readers and writers: what outside sends does not reach them"
+    fix = "a governance with discovery_protection_kind and rtps_protection_kind NONE; or "
+    fix += "ROS_SECURITY_ENABLE=false"
+    yield DomainProblem("security", one.guid_prefix, text, fix, grave=one.vendor == FAST_DDS)
+
+
+def _mismatch(pair: MismatchStatus, writer: str, reader: str) -> DomainProblem:
+    sides = ("publisher", "subscription") if pair.kind == "topic" else ("one side", "other side")
+    text = (
+        f"{pair.policy} differs: the {sides[0]} {pair.writer} {writer} offers {pair.offered}, "
+        f"the {sides[1]} {pair.reader} {reader} requests {pair.requested}"
+    )
+    fix = _CURES.get(pair.policy, _BOTH.format(policy=pair.policy))
+    check = "type" if pair.policy == "type" else "qos"
+    return DomainProblem(check, f"{pair.kind} {pair.name}", text, fix)

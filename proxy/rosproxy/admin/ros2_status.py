@@ -1,0 +1,193 @@
+"""The state of ROS 2 in a running proxy: as a part of ``/status``, and as metrics."""
+
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import msgspec
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from rosproxy.access.access_policy import AccessPolicy
+from rosproxy.admin import status_document as document
+from rosproxy.admin.domain_plane import DomainPlane
+from rosproxy.admin.status import policy_status
+from rosproxy.admin.status_bounds import bounded_names
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.names import is_of_service, ros_name, ros_service, ros_topic, ros_type
+from rosproxy.ros2.registry.matching import MismatchedPair, mismatched_pairs
+from rosproxy.ros2.registry.participants import (
+    DdsEndpoint,
+    EndpointKind,
+    InsideParticipant,
+    OutsideParticipant,
+    Participant,
+)
+from rosproxy.ros2.servers.domain_server import DomainServer
+
+MOST_NAMES = 200
+"""Topics and services of a participant that are told; the rest is counted."""
+MOST_MISMATCHES = 100
+"""Mismatches of a domain that are told; the rest is counted."""
+
+
+@dataclass(eq=False)
+class Ros2State(Collector):
+    """What there is to tell of ROS 2, read when somebody asks.
+
+    Without ``with_names`` no topics and services are told, which takes a tenth of the time.
+    """
+
+    _servers: Sequence[DomainServer]
+    _plane: DomainPlane
+    with_names: bool = True
+
+    def status(self) -> tuple[document.DomainStatus, ...]:
+        """The domains."""
+        return tuple(self._domain(server) for server in self._servers)
+
+    def policy(
+        self, policy: AccessPolicy, told: document.PolicyStatus | None
+    ) -> document.PolicyStatus:
+        """The layers in force and what they hide, next to what is told of ROS 1."""
+        hidden = list(told.hidden) if told else []
+        for server in self._servers:
+            for one in server.domain.inside.by_prefix.values():
+                for (kind, name), allowed in one.verdicts.items():
+                    if not allowed:
+                        reason = policy.judge(kind, name, (), one.address).reason
+                        hidden.append(
+                            document.HiddenStatus(kind.value, name, one.guid_prefix, reason)
+                        )
+        return policy_status(policy, hidden, told.left_out if told else 0)
+
+    def collect(self) -> Iterable[Metric]:
+        """The state as metrics: gauges, and counters of datagrams."""
+        yield from self._participants()
+        used = GaugeMetricFamily(
+            "rosproxy_ros2_leases_used", "Ports of the range held by locators.", labels=["domain"]
+        )
+        free = GaugeMetricFamily(
+            "rosproxy_ros2_leases_free", "Ports of the range left for locators.", labels=["domain"]
+        )
+        lacking = GaugeMetricFamily(
+            "rosproxy_ros2_participants_without_port",
+            "Participants inside with locators that got no port.",
+            labels=["domain"],
+        )
+        dropped = CounterMetricFamily(
+            "rosproxy_ros2_dropped_datagrams", "Datagrams that were refused.", labels=["domain"]
+        )
+        passed = CounterMetricFamily(
+            "rosproxy_ros2_relayed_bytes",
+            "Bytes of datagrams passed on.",
+            labels=["domain", "kind", "direction"],
+        )
+        for server in self._servers:
+            domain, number = server.domain, str(server.domain.settings.number)
+            used.add_metric([number], len(domain.inside.leases))
+            free.add_metric([number], domain.ports.pool.free)
+            lacking.add_metric([number], len(domain.inside.lacking))
+            dropped.add_metric([number], domain.refused.count)
+            for (kind, inwards), size in domain.passed.items():
+                passed.add_metric([number, kind.value, "inward" if inwards else "outward"], size)
+        yield from (used, free, lacking, dropped, passed)
+
+    def _participants(self) -> Iterator[Metric]:
+        found = GaugeMetricFamily(
+            "rosproxy_ros2_participants", "Participants by side.", labels=["domain", "side"]
+        )
+        for server in self._servers:
+            number = str(server.domain.settings.number)
+            found.add_metric([number, "inside"], len(server.domain.inside.by_prefix))
+            found.add_metric([number, "outside"], len(server.domain.outside.by_prefix))
+        yield found
+
+    def _domain(self, server: DomainServer) -> document.DomainStatus:
+        domain, settings = server.domain, server.domain.settings
+        discovery = settings.ports.advertised(settings.discovery_port)
+        pairs = mismatched_pairs(
+            domain.inside.by_prefix.values(), domain.outside.by_prefix.values()
+        )
+        return document.DomainStatus(
+            domain=settings.number,
+            discovery=str(HostPort(settings.host, discovery)),
+            peers=tuple(peer.host if not peer.port else str(peer) for peer in settings.peers),
+            ear=str(settings.ear or ""),
+            ports_used=len(domain.inside.leases),
+            ports_free=domain.ports.pool.free,
+            dropped=domain.refused.count,
+            lost=server.lost,
+            data_plane=self._plane.status(),
+            mismatches=tuple(map(_mismatch, pairs[:MOST_MISMATCHES])),
+            mismatches_left_out=max(len(pairs) - MOST_MISMATCHES, 0),
+            inside=bounded_names(
+                self._inside(one, domain.inside.lacking.get(one.prefix, ""), domain.is_kept(one))
+                for one in domain.inside.by_prefix.values()
+            ),
+            outside=bounded_names(self._outside(one) for one in domain.outside.by_prefix.values()),
+        )
+
+    def _inside(
+        self, one: InsideParticipant, problem: str, kept: bool
+    ) -> document.ParticipantStatus:
+        return msgspec.structs.replace(self._told(one, problem=problem), kept=kept)
+
+    def _outside(self, one: OutsideParticipant) -> document.ParticipantStatus:
+        return self._told(one, proven=one.proven)
+
+    def _told(
+        self,
+        one: Participant,
+        proven: bool = True,
+        problem: str = "",
+    ) -> document.ParticipantStatus:
+        ends = list(one.endpoints.values()) if self.with_names else []
+        writers = {end.topic for end in ends if end.kind is EndpointKind.WRITER}
+        readers = {end.topic for end in ends if end.kind is EndpointKind.READER}
+        lists = [
+            sorted(filter(None, map(ros_topic, writers))),
+            sorted(filter(None, map(ros_topic, readers))),
+            sorted(filter(None, map(ros_service, readers))),
+        ]
+        shown = [names[:MOST_NAMES] for names in lists]
+        left_out = sum(map(len, lists)) - sum(map(len, shown))
+        return document.ParticipantStatus(
+            guid_prefix=one.guid_prefix,
+            address=one.address,
+            vendor=one.vendor_name,
+            leases=tuple(self._plane.locator(lease) for lease in one.leases.values()),
+            publishes=tuple(shown[0]),
+            subscribes=tuple(shown[1]),
+            services=tuple(shown[2]),
+            left_out=left_out,
+            proven=proven,
+            problem=problem,
+            domain=one.traits.domain,
+            security=one.traits.security.value,
+            locator_fault=one.traits.locator_fault.value,
+            types=_types(ends, {name for names in shown for name in names}),
+        )
+
+
+def _types(
+    ends: Iterable[DdsEndpoint], names: Container[str]
+) -> tuple[document.NamedTypeStatus, ...]:
+    """The types of topics and services, one for each."""
+    types = {ros_name(end.topic): ros_type(end.type_name) for end in ends}
+    return tuple(
+        document.NamedTypeStatus(name, kind)
+        for name, kind in sorted(types.items())
+        if name in names
+    )
+
+
+def _mismatch(pair: MismatchedPair) -> document.MismatchStatus:
+    return document.MismatchStatus(
+        kind="service" if is_of_service(pair.topic) else "topic",
+        name=ros_name(pair.topic),
+        policy=pair.mismatch.policy,
+        offered=pair.mismatch.offered,
+        requested=pair.mismatch.requested,
+        writer=pair.writer.guid_prefix,
+        reader=pair.reader.guid_prefix,
+    )

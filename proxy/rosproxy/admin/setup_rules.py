@@ -1,0 +1,148 @@
+"""Whether outside can reach a proxy as it was set up: its advertised host, its range, its ports.
+
+One word for all who say it: ``rosproxy doctor`` when it is asked, the proxy itself in its log and
+its status, and ``rosproxy run --check --deep`` before anything runs. The first cause comes first,
+and what follows from one that was told is not told again.
+"""
+
+from collections.abc import Iterator, Sequence
+
+from rosproxy.admin.findings import DoctorFinding, error, note, ok, warning
+from rosproxy.admin.requests import RangeProbe
+from rosproxy.admin.status_document import PortsStatus
+from rosproxy.net.addresses import is_loopback
+from rosproxy.telemetry.text import listed, plural
+
+FEW_FREE = 0.1
+"""Share of the range that should be free at least."""
+
+HOST, RANGE = "advertised host", "published range"
+BY_ADDRESS = "--advertise-host ADDRESS instead of a name (ROSPROXY_ADVERTISE_HOST)"
+_OF_THIS_HOST = (
+    "--advertise-host ADDRESS, the address of this host in the network of the robots "
+    "(ROSPROXY_ADVERTISE_HOST)"
+)
+_NO_WAY_BACK = ("refused", "silent", "unreachable")
+"""How the proxy's own try may end although outside gets through: NAT has no hairpin."""
+_TRIES = {
+    "refused": "nothing listens there: the range is not published, or the host is another machine",
+    "silent": "no answer: a firewall drops it, or the host is not this one",
+    "unreachable": "no way leads there",
+    "unresolvable": "the host name is unknown here",
+    "closed": "something takes the connection and drops it: published to another port or container",
+    "stranger": "something else answers there, not this proxy",
+}
+
+
+def advertised_host(host: str, addresses: Sequence[str], all_here: bool) -> Iterator[DoctorFinding]:
+    """What is wrong with an advertised host that leads to these addresses here.
+
+    ``all_here``: all that is outside is on this machine as well.
+    """
+    loopback = [address for address in addresses if is_loopback(address)]
+    if is_loopback(host) and not all_here:
+        text = f"{host} is a loopback address: to every other machine it means that machine itself"
+        yield error(HOST, HOST, text, _OF_THIS_HOST)
+    elif not addresses:
+        yield error(HOST, HOST, f"the host name {host} can't be resolved here", BY_ADDRESS)
+    elif len(loopback) == len(addresses) and not all_here:
+        text = (
+            f"{host} leads to {listed(loopback)} here, which is loopback (/etc/hosts of many "
+            "systems has the machine's own name so): fine only if outside finds another address"
+        )
+        yield warning(HOST, HOST, text, BY_ADDRESS)
+
+
+def published_range(probe: RangeProbe, host: str, ports: PortsStatus) -> Iterator[DoctorFinding]:
+    """What tries at some ports of the range mean."""
+    outcomes: dict[tuple[str, str, str], list[str]] = {}
+    for one in probe.probes:
+        port = one.advertised.rpartition(":")[2]
+        outcomes.setdefault((one.transport, one.from_proxy, one.from_master), []).append(port)
+    for (transport, mine, masters), tried in outcomes.items():
+        at = f"{host}, port {' and '.join(tried)}"
+        whole = len({key for key in outcomes if key[0] == transport}) == 1
+        if transport == "udp":
+            yield _by_udp(host, ports, mine, at)
+        elif mine == "ok" or masters == "ok":
+            yield _reached(host, mine, masters, at)
+        else:
+            yield _not_reached(host, ports, mine, masters, at, whole)
+
+
+def few_ports(ports: PortsStatus) -> Iterator[DoctorFinding]:
+    """How many ports are left, and who else has some."""
+    used, free, blocked = ports.used, ports.free, ports.blocked
+    larger = (
+        "a larger --port-range (ROSPROXY_PORT_RANGE), published as well; rosproxy status tells who "
+        "was refused"
+    )
+    if blocked:
+        first, _, last = ports.listen.partition("-")
+        text = f"{plural(blocked, 'port')} of the range {ports.listen} held by other programs"
+        if ports.held_by:
+            text += f": {'; '.join(ports.held_by)}"
+            fix = "give one of the two another --port-range (ROSPROXY_PORT_RANGE), published too"
+        else:
+            fix = f"ss -ltnp 'sport >= :{first} and sport <= :{last}'; or another --port-range"
+        yield warning("ports", "ports", text, fix)
+    if not free:
+        text = f"none is free, {used} used: no further node gets in"
+        yield error("ports", "ports", text, larger)
+    elif free < FEW_FREE * (used + free + blocked):
+        yield warning("ports", "ports", f"only {free} left, {used} used", larger)
+    else:
+        text = f"{ports.listen} as {ports.advertise}, {used} used, {free} free"
+        yield ok("ports", "ports", text)
+
+
+def _reached(host: str, mine: str, masters: str, at: str) -> DoctorFinding:
+    """What tries at free ports mean of which one came through, the proxy's own or the master's."""
+    if masters == "ok":
+        back = "" if mine == "ok" else f" (the proxy itself does not, {mine}: no harm)"
+        return ok(RANGE, RANGE, f"the master reaches {at}{back}")
+    if masters == "unknown":
+        return ok(RANGE, RANGE, f"the proxy reaches {at}; the master could not be asked to try")
+    text = (
+        f"{at}: reached from here, but not from the master's machine. For that it is another "
+        "machine, an address that only this side has, or behind a firewall"
+    )
+    fix = (
+        "--advertise-host ADDRESS: this host as the master's machine knows it "
+        "(ROSPROXY_ADVERTISE_HOST). To try there: nc -vz"
+    )
+    return error(RANGE, RANGE, text, f"{fix} {host} {at.rpartition(' ')[2]}")
+
+
+def _not_reached(
+    host: str, ports: PortsStatus, mine: str, masters: str, at: str, whole: bool
+) -> DoctorFinding:
+    fix = f"docker run -p {ports.advertise}:{ports.listen}"
+    if mine == "unresolvable":
+        fix = BY_ADDRESS
+    elif whole:
+        fix += f", and let it through the firewall; or correct --advertise-host, now {host}"
+    else:
+        fix = f"publish the whole range: {fix}"
+    text = f"{at}: {_TRIES.get(mine, mine)}"
+    if masters == "missed":
+        return error(RANGE, RANGE, f"{text}. The master does not get through either", fix)
+    if mine in _NO_WAY_BACK:
+        text += ". Or only the way back is missing; the master, which could tell, is not there"
+        return warning(RANGE, RANGE, text, fix)
+    return error(RANGE, RANGE, text, fix)
+
+
+def _by_udp(host: str, ports: PortsStatus, mine: str, at: str) -> DoctorFinding:
+    """What a try by UDP means: one that fails proves nothing where NAT has no way back.
+
+    Who outside does not get through is told once somebody there is heard (`domain_problems`).
+    """
+    if mine == "ok":
+        return ok(RANGE, RANGE, f"the proxy reaches {at} by UDP")
+    text = (
+        f"{at}: what the proxy sends there by UDP does not come back to it. Perhaps only the way "
+        "back is missing; perhaps the range is not published for UDP, or a firewall drops it"
+    )
+    fix = f"if nobody outside is heard: docker run -p {ports.advertise}:{ports.listen}/udp; is "
+    return note(RANGE, RANGE, text, f"{fix}--advertise-host {host} this host?")

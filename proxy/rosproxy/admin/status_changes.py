@@ -1,0 +1,67 @@
+"""Waiting for a change of the proxy's state, so that nobody has to ask for it again and again.
+
+The state is in many places, none of which knows who waits. So as long as somebody does it is looked
+at, at most twice a second and as seldom as it takes to cost a hundredth of a processor.
+"""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import Callable
+
+from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.admin.status_news import version_of
+
+EVERY = 0.5
+"""Seconds between two looks at the state, at least."""
+SHARE = 0.01
+"""Of a processor, that looking may cost for each who waits."""
+LONGEST = 300.0
+"""Seconds that somebody may wait."""
+MOST = 4
+"""Who may wait at the same time: operators, one after the other."""
+
+
+class Crowded(Exception):
+    """Too many wait already."""
+
+
+class StatusChanges:
+    """Lets callers wait until the state is another one than they know."""
+
+    def __init__(self, status: Callable[[], ProxyStatus]) -> None:
+        self._status = status
+        self._waiting = 0
+        self._ending = asyncio.Event()
+
+    def end(self) -> None:
+        """Let nobody wait any longer."""
+        self._ending.set()
+
+    async def after(
+        self, since: str, within: float, there: Callable[[], bool]
+    ) -> tuple[str, ProxyStatus]:
+        """The state and its version, once that is another one than ``since``.
+
+        Or after ``within`` seconds, or once the caller is not ``there`` any more. Raises Crowded.
+        """
+        if self._waiting >= MOST:
+            raise Crowded
+        self._waiting += 1
+        try:
+            until = time.monotonic() + (min(within, LONGEST) if math.isfinite(within) else 0.0)
+            while True:
+                began = time.monotonic()
+                status = self._status()
+                version, now = version_of(status), time.monotonic()
+                if version != since or now >= until or self._ending.is_set() or not there():
+                    return version, status
+                await self._pause(min(max(EVERY, (now - began) / SHARE), until - now))
+        finally:
+            self._waiting -= 1
+
+    async def _pause(self, seconds: float) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._ending.wait()

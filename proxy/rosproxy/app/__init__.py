@@ -1,0 +1,1 @@
+"""A running proxy: its parts put together, started and stopped."""

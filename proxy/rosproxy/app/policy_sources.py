@@ -1,0 +1,87 @@
+"""The policy in a running proxy: where its rules come from, and who applies a change of them.
+
+The options' rules stay. A file's and an operator's may change at any time: ROS 1 and ROS 2 look
+for that by themselves; what an operator posts they apply before it is answered.
+"""
+
+import time
+from typing import Any
+
+from rosproxy.access.access_policy import AccessPolicy
+from rosproxy.access.layers import read_layer
+from rosproxy.access.policy_file import LOOK_INTERVAL, OPTION, PolicyFile
+from rosproxy.admin.requests import BodyError, PolicyNews, read_body
+from rosproxy.admin.status_document import to_json
+from rosproxy.app.ros1 import Ros1
+from rosproxy.app.ros2 import Ros2
+from rosproxy.ros1.upkeep.policy_enforcer import Enforced
+from rosproxy.runtime import Runtime
+from rosproxy.settings import SettingError, Settings
+from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.refusals import Refusals
+
+TOLD_POLICY = "the operator's policy"
+"""The subject of the problem that it is refused: whoever looks at the proxy sees it."""
+
+
+class PolicySources:
+    """Takes in rules while the proxy runs."""
+
+    def __init__(self, runtime: Runtime, ros1: Ros1 | None, ros2: Ros2 | None) -> None:
+        self._runtime, self._ros1, self._ros2 = runtime, ros1, ros2
+
+    def start(self) -> None:
+        """Read the file, and look at it from now on. Raises SettingError."""
+        runtime, settings = self._runtime, self._runtime.settings
+        if not settings.policy_file:
+            return
+        file = PolicyFile(
+            settings.policy_file, settings.policy_mode, runtime.policy, runtime.problems
+        )
+        _read(file)
+        runtime.tasks.repeat(file.look, LOOK_INTERVAL, "looking at the policy's file")
+
+    async def post(self, body: Any) -> dict[str, Any]:
+        """``POST /policy``: how many registrations are hidden and shown now, and what was cut.
+
+        Raises BodyError, Unreachable, MasterError.
+        """
+        problems = self._runtime.problems
+        try:
+            self._use_told(body)
+        except BodyError as error:
+            problems.solved(TOLD_POLICY)
+            problems.add(TOLD_POLICY, f"refused, that of before stays in force: {error}")
+            raise
+        problems.solved(TOLD_POLICY)
+        if self._ros2:
+            await self._ros2.apply_policy()
+        return to_json(await self._ros1.enforce_policy() if self._ros1 else Enforced())
+
+    def _use_told(self, body: Any) -> None:
+        """Take in the rules of a post. Raises BodyError."""
+        written = read_body(body, PolicyNews).layers
+        try:
+            self._runtime.policy.use_told([read_layer(one) for one in written])
+        except ValueError as error:
+            raise BodyError(f"layers: {error}") from None
+
+
+def read_policy_file(settings: Settings) -> None:
+    """Read the policy's file, if there is one, for a look whether it is sound. Raises SettingError.
+
+    Its rules count together with those of the options, as they do in a running proxy.
+    """
+    if settings.policy_file:
+        metrics, problems = Metrics(), Problems()
+        refusals = Refusals(metrics, problems, time.monotonic)
+        policy = AccessPolicy(settings.policy, settings.policy_layers, metrics, refusals)
+        _read(PolicyFile(settings.policy_file, settings.policy_mode, policy, problems))
+
+
+def _read(file: PolicyFile) -> None:
+    try:
+        file.read()
+    except ValueError as error:
+        raise SettingError(OPTION, str(error)) from None

@@ -1,0 +1,266 @@
+"""ROS 2 in a running proxy: one server for each domain, which share out the range."""
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Mapping
+from typing import Any
+
+from rosproxy.access.rules import RuleKind
+from rosproxy.admin.domain_plane import DomainPlane
+from rosproxy.admin.requests import ContainerNews, Nothing, PortProbe, read_body
+from rosproxy.admin.ros2_status import Ros2State
+from rosproxy.admin.server import Action
+from rosproxy.admin.udp_probe import try_udp
+from rosproxy.app.binding import binding
+from rosproxy.app.domain_watch import DomainWatch
+from rosproxy.app.holders import tell_taken
+from rosproxy.forwarding.kernel.nft import Table, Transport
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.forwarding.kernel.table import KernelTable
+from rosproxy.forwarding.kernel.tools import Tools
+from rosproxy.leases.ports import PortMap, PortPool, PortRange
+from rosproxy.net import addresses, signs
+from rosproxy.net.addresses import HostPort, Network
+from rosproxy.net.interfaces import address_into, address_towards, interface_networks
+from rosproxy.net.resolver import resolve
+from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.discovery.domain_settings import DomainSettings
+from rosproxy.ros2.discovery.observer import ANNOUNCE_INTERVAL
+from rosproxy.ros2.registry.ports import REMEMBERED
+from rosproxy.ros2.registry.selected import NEWS_TIMEOUT
+from rosproxy.ros2.servers.domain_server import EXPIRY_INTERVAL, DomainServer
+from rosproxy.runtime import Runtime
+from rosproxy.settings import SettingError
+
+log = logging.getLogger(__name__)
+
+REFRESH_INTERVAL = 5.0
+"""Seconds between looks at the networks, at the addresses of peers, and at what is wrong."""
+POLICY_INTERVAL = 0.5
+"""Seconds between looks whether the policy has changed."""
+RATE_INTERVAL = 2.0
+
+
+class Ros2:
+    """The part for ROS 2. `start` it in a running event loop, `stop` it in the same."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime, self._settings = runtime, runtime.settings
+        self.servers: list[DomainServer] = []
+        self._hosts: tuple[str, ...] = ()
+        ports = runtime.settings.ports.listen
+        self._leases = leases = DataLeases(PortPool(ports))
+        table = KernelTable(Table(ports.first, ports, Transport.UDP), Tools())
+        self.plane = plane = KernelPlane(
+            runtime.settings, leases, runtime.tasks, runtime.problems, runtime.now, table
+        )
+        self._told_plane = DomainPlane(plane, leases)
+        self.state = Ros2State(self.servers, self._told_plane)
+        self._applied, self._awaited = runtime.policy.version, bool(self._settings.await_policy)
+        self.networks: tuple[Network, ...] = ()
+        self._peers = self._settings.ros2_peer
+        self._watch = DomainWatch(
+            Ros2State(self.servers, self._told_plane, with_names=False), runtime.problems
+        )
+
+    async def start(self) -> None:
+        """Bind all ports and begin. Raises SettingError if one is taken that has to be had."""
+        tasks = self._runtime.tasks
+        self._hosts = await self._advertised_addresses()
+        await self.plane.start()
+        self._leases.note_former(self.plane.forwards)
+        self._start_servers()
+        self._runtime.metrics.registry.register(self.state)
+        self._runtime.metrics.registry.register(self._told_plane)
+        self.plane.recovered([])
+        tasks.spawn(self._forget_former(), "waiting for participants of before the start")
+        await self._refresh()
+        if self._awaited:
+            tasks.spawn(self._await_policy(), "waiting for an operator's policy")
+        tasks.repeat(self._look_at_policy, POLICY_INTERVAL, "applying the policy")
+        for server in self.servers:
+            tasks.repeat(server.expire, EXPIRY_INTERVAL, "looking after participants")
+            tasks.repeat(server.observe, ANNOUNCE_INTERVAL, "observing participants")
+        tasks.repeat(self._refresh, REFRESH_INTERVAL, "looking at networks and peers")
+        tasks.repeat(self._watch.look, REFRESH_INTERVAL, "looking at what keeps participants apart")
+        tasks.repeat(self._sample_rates, RATE_INTERVAL, "sampling rates")
+
+    def _start_servers(self) -> None:
+        """Serve all domains. Raises SettingError."""
+        settings, taken = self._settings, list[int]()
+        for number, ports in zip(settings.domains, self._parts(), strict=True):
+            told = DomainSettings(
+                number=number,
+                hosts=self._hosts,
+                ports=ports,
+                near=address_towards,
+                note=self._runtime.refusals.note,
+                judge=self._is_allowed,
+                both_ways=settings.direction == "both",
+                ear=settings.ros2_ear,
+            )
+            server = DomainServer(
+                told,
+                settings.bind,
+                self._runtime.now,
+                self._is_inside,
+                self.plane.syncer.note_change,
+                NEWS_TIMEOUT if settings.admin_token_hash else 0.0,
+            )
+            server.domain.ports.note_forwarded(self.plane.forwards)
+            self.servers.append(server)
+            self._leases.domains.append(server.domain.inside)
+            others = signs.others("2", 1, 65535, settings.admin)
+            with binding("--ros2-domain", f"a port of domain {number}", others):
+                taken += server.start()
+        tell_taken("2", settings, taken, self._runtime.problems)
+
+    async def probe(self) -> tuple[PortProbe, ...]:
+        """Whether the port of each domain where outside finds it is reached there by UDP."""
+        return tuple([await self._probe(server) for server in self.servers])
+
+    async def _probe(self, server: DomainServer) -> PortProbe:
+        told, secret = server.domain.settings, secrets.token_bytes(16)
+        port = told.ports.advertised(told.discovery_port)
+        where = HostPort(self._hosts[0], port)
+        outcome = await server.hears(secret, lambda heard: try_udp(where, secret, heard))
+        advertised = str(HostPort(self._settings.advertise_host, port))
+        return PortProbe(told.discovery_port, advertised, outcome, "unknown", "udp")
+
+    async def stop(self) -> None:
+        """End everything; no task may run any more."""
+        await self.plane.stop()
+        for server in self.servers:
+            server.close()
+
+    @property
+    def actions(self) -> Mapping[str, Action]:
+        """What posts at the admin endpoint do, by their paths."""
+        return {"/containers": self._handle_news, "/retire": self._retire}
+
+    async def _handle_news(self, body: Any) -> dict[str, Any]:
+        """``POST /containers``: how many participants were ended.
+
+        One whose container has moved is ended as well: at its new address it is heard by itself.
+        """
+        news = read_body(body, ContainerNews)
+        self._look_at_networks()  # it may have been connected to that of new containers just now
+        for server in self.servers:
+            server.note_former(news.former_ports)
+        if news.selected is not None:
+            for server in self.servers:
+                server.select(news.selected)
+        if (peers := news.ros2_peers) is not None and peers != self._peers:
+            self._peers = peers
+            await self._find_peers()
+        left = {*news.gone, *news.moved}
+        return {"unregistered": sum(server.end(left) for server in self.servers)}
+
+    async def _retire(self, body: Any) -> dict[str, Any]:
+        """``POST /retire``: how many participants were ended."""
+        read_body(body, Nothing)
+        ended = 0
+        for server in self.servers:
+            server.select(())
+            everybody = server.domain.inside.by_prefix.values()
+            ended += server.end({one.address for one in everybody})
+        return {"unregistered": ended}
+
+    @property
+    def greeting(self) -> str:
+        """How nodes use it, for the log."""
+        domains = ", ".join(map(str, self._settings.domains))
+        host, ports = self._settings.advertise_host, self._settings.ports.advertise
+        return (
+            f"ROS 2 nodes of domain {domains} are found by multicast; outside sees {host}:{ports}"
+        )
+
+    async def _forget_former(self) -> None:
+        """Stop what the kernel was told before the start, where nobody has claimed it since."""
+        await asyncio.sleep(REMEMBERED)
+        self._leases.note_former({})
+        self.plane.syncer.note_change()
+
+    def _parts(self) -> list[PortMap]:
+        """The range, shared out among the domains."""
+        ports, count = self._settings.ports, len(self._settings.domains)
+        size = len(ports.listen) // count
+
+        def part(whole: PortRange, index: int) -> PortRange:
+            first = whole.first + index * size
+            return PortRange(first, first + size - 1)
+
+        return [
+            PortMap(part(ports.listen, index), part(ports.advertise, index))
+            for index in range(count)
+        ]
+
+    def _is_inside(self, address: str) -> bool:
+        return addresses.is_inside(address, self.networks)
+
+    def _is_allowed(self, kind: RuleKind, name: str, address: str) -> bool:
+        """Whether the policy allows something to a participant inside; nodes have no names here.
+
+        Nothing is, before an operator has told the policy that is waited for.
+        """
+        return not self._awaited and self._runtime.policy.ask(kind, name, (), address).allowed
+
+    async def apply_policy(self) -> None:
+        """Have participants meet anew of whom the policy says something else than before."""
+        self._applied = self._runtime.policy.version
+        for server in self.servers:
+            server.apply_policy()
+
+    async def _look_at_policy(self) -> None:
+        if self._applied != self._runtime.policy.version:
+            await self.apply_policy()
+
+    async def _await_policy(self) -> None:
+        await self._runtime.policy.wait_for_operator(self._settings.await_policy)
+        self._awaited = False
+        await self.apply_policy()
+
+    async def _advertised_addresses(self) -> tuple[str, ...]:
+        """The advertised host's addresses, one of each family: locators have no names.
+
+        Of a family that the ports are not bound for only if there is no other. Raises SettingError.
+        """
+        host, bind = self._settings.advertise_host, self._settings.bind
+        found = await resolve(host)
+        if not found:
+            text = f"{host} can't be resolved; ROS 2 needs its address: give that instead"
+            raise SettingError("--advertise-host", text)
+        served = [one for one in found if bind == "::" or (":" in one) == (":" in bind)]
+        first = {":" in one: one for one in reversed(served or found)}
+        return tuple(sorted(first.values(), key=found.index))
+
+    async def _refresh(self) -> None:
+        """Take in the networks that there are now, and where the peers are."""
+        self._look_at_networks()
+        await self._find_peers()
+
+    async def _find_peers(self) -> None:
+        peers = await asyncio.gather(*(self._peer(peer) for peer in self._peers))
+        for server in self.servers:
+            server.ask_outside(tuple(peer for found in peers for peer in found))
+
+    def _look_at_networks(self) -> None:
+        self.networks = self._settings.inside_networks or interface_networks()
+        own = {address_into(network) for network in self.networks}
+        for server in self.servers:
+            server.join(address for address in own if self._is_inside(address))
+
+    async def _sample_rates(self) -> None:
+        now = self._runtime.now()
+        for server in self.servers:
+            for _, lease in server.domain.inside.leases.values():
+                lease.sample(now)
+
+    async def _peer(self, peer: HostPort) -> list[HostPort]:
+        subject, found = f"peer {peer.host}", await resolve(peer.host)
+        self._runtime.problems.solved(subject)
+        if not found:
+            text = "its name can't be resolved: participants there are not told of those inside"
+            self._runtime.problems.add(subject, text)
+        return [HostPort(address, peer.port) for address in found]

@@ -1,0 +1,119 @@
+"""What a proxy finds out about itself at its start: whether outside can reach it as it is told to.
+
+The advertised host is looked up before the proxy says that it is ready. Then, once the rush of a
+start is over and the master answers, the range is tried from outside (`rosproxy.admin.range_probe`;
+of ROS 2 by UDP, which can prove that all is well, and not that it is not). What is wrong is told in
+the log and in ``rosproxy status``, in the doctor's words, and tried again at times until it is
+mended. It keeps nothing from working: who can reach the proxy does.
+"""
+
+import asyncio
+import logging
+from collections.abc import Iterable
+from typing import Any
+
+from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.range_probe import probe_range
+from rosproxy.admin.requests import RangeProbe
+from rosproxy.admin.setup_rules import HOST, RANGE, advertised_host, published_range
+from rosproxy.admin.status_document import PortsStatus, to_json
+from rosproxy.app.ros1 import Ros1
+from rosproxy.app.ros2 import Ros2
+from rosproxy.net.addresses import is_loopback, parse_authority
+from rosproxy.net.resolver import resolve
+from rosproxy.runtime import Runtime
+
+log = logging.getLogger(__name__)
+
+SETTLED = 3.0
+"""Seconds after which the range is tried at the earliest: nodes that come back go first."""
+AGAIN = 300.0
+"""Seconds between tries while something is wrong. A master that does not get through holds one of
+its three threads for two minutes."""
+
+
+class SelfCheck:
+    """Looks into the setting-up of a running proxy and notes what is wrong."""
+
+    def __init__(self, runtime: Runtime, ros1: Ros1 | None, ros2: Ros2 | None) -> None:
+        self._runtime, self._ros1, self._ros2 = runtime, ros1, ros2
+        self._told: dict[str, list[DoctorFinding]] = {}
+        self._probing = asyncio.Lock()
+        self._addresses: list[str] = []
+
+    @property
+    def findings(self) -> list[DoctorFinding]:
+        """What is wrong, as far as is known."""
+        return [finding for found in self._told.values() for finding in found]
+
+    async def start(self) -> None:
+        """Look at the advertised host, and try the range in a moment."""
+        await self._look_at_host()
+        self._runtime.tasks.spawn(self._keep_trying(), "trying the range from outside")
+
+    async def probe(self, body: Any) -> dict[str, Any]:
+        """``POST /probe``: how some ports of the range were reached."""
+        return to_json(await self._try_range(or_fast=True))
+
+    async def _keep_trying(self) -> None:
+        await asyncio.sleep(SETTLED)
+        if self._ros1:  # it can try from where it is; while it is away, that is the first cause
+            await self._ros1.master_monitor.answered.wait()
+        while not (self._ros1 and self._ros1.context.retired):
+            try:
+                await self._try_range(or_fast=False)
+            except OSError as error:  # a port that was free a moment ago
+                log.debug("the range could not be tried: %s", error)
+                await asyncio.sleep(AGAIN)
+                continue
+            if not any(self._told.values()):
+                return
+            await asyncio.sleep(AGAIN)
+            await self._look_at_host()
+
+    async def _look_at_host(self) -> None:
+        host = self._runtime.settings.advertise_host
+        self._addresses = await resolve(host)
+        all_here = await self._all_here()
+        self._note(HOST, advertised_host(host, self._addresses, all_here))
+
+    async def _all_here(self) -> bool:
+        """Whether the proxy is told of nobody outside but on loopback: a trial on one machine."""
+        settings = self._runtime.settings
+        outside = [peer.host for peer in settings.ros2_peer] if settings.for_ros2 else []
+        if settings.for_ros1:
+            master = parse_authority(settings.master_uri)
+            outside += [settings.master_address or (master.host if master else "")]
+        found = [await resolve(host) or [host] for host in outside]
+        return bool(found) and all(any(map(is_loopback, each)) for each in found)
+
+    async def _try_range(self, or_fast: bool) -> RangeProbe:
+        """Try ports of the range, and note what is wrong. Raises OSError if one was just taken."""
+        async with self._probing:
+            ros1, ros2 = self._ros1, self._ros2
+            found = RangeProbe()
+            if ros1:
+                found = await probe_range(ros1.context, ros1.leases, or_fast)
+            if ros2:
+                found = RangeProbe((*found.probes, *await ros2.probe()))
+        settings = self._runtime.settings
+        ports = PortsStatus(str(settings.ports.listen), str(settings.ports.advertise))
+        if self._addresses:  # else it is told that the host's name leads nowhere
+            self._note(RANGE, published_range(found, settings.advertise_host, ports))
+        return found
+
+    def _note(self, subject: str, found: Iterable[DoctorFinding]) -> None:
+        """Tell what is wrong, once for as long as it is."""
+        wrong = [one for one in found if one.severity >= Severity.WARNING]
+        before = self._told.get(subject, [])
+        self._told[subject] = wrong
+        self._runtime.metrics.setup_faults.set(sum(map(len, self._told.values())))
+        if wrong == before:
+            return
+        self._runtime.problems.solved(subject)
+        for one in wrong:
+            self._runtime.problems.add(subject, f"{one.text}: {one.fix}")
+            level = logging.ERROR if one.severity is Severity.ERROR else logging.WARNING
+            log.log(level, "%s: %s; %s", subject, one.text, one.fix)
+        if before and not wrong:
+            log.info("%s: nothing is wrong any more", subject)

@@ -1,0 +1,70 @@
+"""The file of ``--config``: options by their names, in TOML.
+
+It only stands in for what neither the command line nor a variable gives. Its values are read as the
+option's own text would be, so that they are checked alike. A key that is no option is a mistake, as
+it is on the command line.
+"""
+
+import difflib
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+LONGEST_FILE = 1024 * 1024
+"""Bytes of the file that are read at most."""
+_NOT_THERE = frozenset({"config", "check", "deep", "once", "help", "version"})
+"""Options that say what is to be done now."""
+
+
+def read_config(path: str, options: Mapping[str, click.Option]) -> dict[str, Any]:
+    """The values in a file, by the parameters of the options that it names.
+
+    ``options`` are by their names. Raises ValueError, which says what is wrong.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            text = file.read(LONGEST_FILE + 1)
+        if len(text) > LONGEST_FILE:
+            raise ValueError(f"{path} is longer than {LONGEST_FILE} bytes")
+        given = tomllib.loads(text.decode())
+    except OSError as error:
+        raise ValueError(f"{path} can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is no UTF-8 text") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ValueError(f'{path} is no TOML: {error}; write as port-range = "A-B"') from None
+    found = {}
+    for key, value in given.items():
+        option = options.get(key)
+        if option is None or key in _NOT_THERE:
+            raise ValueError(f"{path}: {_unknown(key, options)}")
+        found[str(option.name)] = _value(f"{path}: {key}", value, option)
+    return found
+
+
+def _unknown(key: str, options: Mapping[str, click.Option]) -> str:
+    near = difflib.get_close_matches(key.lower(), sorted({*options} - _NOT_THERE), 1)
+    hint = f"did you mean {near[0]}?" if near else "it takes the names of options, without --"
+    return f"unknown key {key[:40]!r}; {hint}"
+
+
+def _value(what: str, value: Any, option: click.Option) -> Any:
+    """A value as the option takes it. Raises ValueError."""
+    if option.is_flag:
+        if not isinstance(value, bool):
+            raise ValueError(f"{what} must be true or false")
+        return value
+    if isinstance(value, list):
+        if not option.multiple:
+            raise ValueError(f"{what} takes one value, not a list")
+        return [_text(what, each) for each in value]
+    return [_text(what, value)] if option.multiple else _text(what, value)
+
+
+def _text(what: str, value: Any) -> str:
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ValueError(f"{what} must be a text in quotes, or a number")
+    return str(value)

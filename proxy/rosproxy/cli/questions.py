@@ -1,0 +1,209 @@
+"""The commands that ask a running proxy: ``rosproxy status``, ``health`` and ``doctor``.
+
+Commands import what they need when they run, so that a health check starts fast.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import click
+
+from rosproxy.cli import options
+
+WAIT_INTERVAL = 0.5
+"""Seconds between two questions of ``status --wait``."""
+
+
+def _admin_client(context: click.Context, option: click.Parameter, url: str | None) -> Any:
+    from rosproxy.admin.client import AdminClient, default_url
+
+    bound = None if url or "ROSPROXY_ADMIN_BIND" in os.environ else _bound_by_file()
+    try:
+        return AdminClient(url or default_url(bound))
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def _bound_by_file() -> str | None:
+    """The admin endpoint in the file of ROSPROXY_CONFIG, which the proxy reads, too."""
+    path = os.environ.get("ROSPROXY_CONFIG")
+    if not path:
+        return None
+    import tomllib
+
+    try:
+        with open(path, "rb") as file:
+            return str(tomllib.load(file).get("admin-bind", ""))
+    except (OSError, ValueError):
+        return None  # `run` says what is wrong with it
+
+
+_admin_option = click.option(
+    "--admin",
+    envvar="ROSPROXY_ADMIN",
+    show_envvar=True,
+    callback=_admin_client,
+    metavar="URL",
+    help="The proxy's admin endpoint. Default: what ROSPROXY_ADMIN_BIND says, else "
+    "http://127.0.0.1:11312.",
+)
+
+
+@click.command(cls=options.Shown)
+@_admin_option
+@click.option("--json", "as_json", is_flag=True, help="Print the state as JSON.")
+@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
+@click.option(
+    "--wait",
+    type=options.Seconds(0),
+    default=0,
+    help="Time in which the proxy may become ready, before it is shown.",
+)
+@click.option("--open", "opens", is_flag=True, help="Open the live page in a browser instead.")
+def status(admin: Any, as_json: bool, watch: bool, wait: float, opens: bool) -> None:
+    """Show the master, the ports, and the nodes behind the proxy.
+
+    Exits with 0 if the proxy is ready for nodes, with 1 if it does not answer or its master does
+    not.
+    """
+    if as_json + watch + opens > 1:
+        raise click.UsageError("one of --json, --watch and --open, not several")
+    from rosproxy.cli import terminal
+
+    if opens:
+        _or_exit(lambda: _open_page(admin))
+        return
+    if watch:
+        terminal.watch_status(admin)
+        return
+    end = time.monotonic() + wait
+    while (error := _why_not_ready(admin)) and time.monotonic() < end:
+        time.sleep(WAIT_INTERVAL)
+    _or_exit(lambda: terminal.show_status(admin, as_json))
+    if error:
+        _fail(error)
+
+
+def _open_page(admin: Any) -> None:
+    """Print where the live page is, and have a browser show it if there is one."""
+    import webbrowser
+
+    where = admin.page()
+    click.echo(where)
+    webbrowser.open(where)
+
+
+def _why_not_ready(admin: Any) -> str:
+    """Why nodes can't use the proxy; empty if they can."""
+    from rosproxy.admin.client import AdminError
+
+    try:
+        admin.get("/readyz")
+    except AdminError as error:
+        return str(error)
+    return ""
+
+
+@click.command(cls=options.Shown)
+@_admin_option
+def health(admin: Any) -> None:
+    """Exit with 0 if the proxy is alive, with 1 if not; for container health checks."""
+    _or_exit(lambda: admin.get("/healthz", within=3.0))
+
+
+@click.command(cls=options.Shown)
+@click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
+@_admin_option
+@click.option(
+    "--master-uri",
+    type=options.MASTER_URI,
+    envvar="ROS_MASTER_URI",
+    help="The master to look at if the proxy can't be asked for its own.",
+)
+@click.option(
+    "--advertise-host",
+    type=options.HOST,
+    envvar="ROSPROXY_ADVERTISE_HOST",
+    help="The advertised host if the proxy can't be asked for it.",
+)
+@click.option(
+    "--master-address",
+    type=options.ADDRESS,
+    envvar="ROSPROXY_MASTER_ADDRESS",
+    help="The IP address of the master's host if the proxy can't be asked for it.",
+)
+@click.option(
+    "--outside",
+    is_flag=True,
+    help="Look from here as a machine outside does, for example from a robot; ask no proxy.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the findings as JSON.")
+def doctor(
+    names: tuple[str, ...],
+    admin: Any,
+    master_uri: str | None,
+    advertise_host: str | None,
+    master_address: str | None,
+    outside: bool,
+    as_json: bool,
+) -> None:
+    """Find out why A can't hear B, and say what mends it.
+
+    Looks at the proxy, its ports, the master and all nodes. With names: who publishes and who
+    subscribes to that topic; that node's topics; or what two nodes have to say to each other,
+    and which of them are not connected, and why.
+
+    Run it where the proxy runs: docker exec CONTAINER rosproxy doctor. What outside machines see
+    is told by running it there with --outside. Exits with 0 if nothing is wrong, with 1 if
+    something is.
+    """
+    import asyncio
+
+    from rosproxy.doctor import rules
+    from rosproxy.doctor.collect import collect
+
+    if outside and not master_uri:
+        raise click.UsageError("--outside needs --master-uri (ROS_MASTER_URI)")
+    asked = collect(
+        None if outside else admin,
+        master_uri or "",
+        advertise_host or "",
+        tuple(f"/{name.strip('/')}" for name in names),
+        master_address,
+    )
+    remarks = options.unknown_variables(click.get_current_context().find_root().command, log=False)
+    found = rules.diagnose(asyncio.run(asked))
+    tell([*found, *(rules.unknown_variable(one.name, one.text) for one in remarks)], as_json)
+
+
+def tell(found: Any, as_json: bool) -> NoReturn:
+    """Print findings, and exit with 1 if something is wrong."""
+    import json
+
+    from rosproxy.admin.findings import failed
+    from rosproxy.cli import terminal
+    from rosproxy.doctor import findings
+
+    if as_json:
+        terminal.write(json.dumps(findings.as_json(found), indent=2))
+    else:
+        terminal.write(findings.render(found, terminal.size()[0]))
+    sys.exit(1 if failed(found) else 0)
+
+
+def _or_exit(ask: Callable[[], object]) -> None:
+    """Do something that may find the proxy absent, and say so in one line."""
+    from rosproxy.admin.client import AdminError
+
+    try:
+        ask()
+    except AdminError as error:
+        _fail(error)
+
+
+def _fail(reason: object) -> NoReturn:
+    click.echo(f"rosproxy: {reason}", err=True)
+    sys.exit(1)

@@ -1,0 +1,49 @@
+"""Environment variables that are meant for this program, and that no option reads."""
+
+import difflib
+import re
+from collections.abc import Collection, Mapping
+
+import msgspec
+
+_PREFIX = "ROSPROXY_"
+_NEAR, _VERY_NEAR = 0.5, 0.85
+"""How alike a name has to be: one that begins as ours do, and any other one of ROS's."""
+_SERVICE_LINK = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)$|_PORT_\d+_(TCP|UDP|SCTP)(_\w+)?$")
+"""What Kubernetes and Docker set for a service of the name rosproxy, or one that begins so."""
+
+
+class UnknownVariable(msgspec.Struct, frozen=True):
+    """A variable that nobody reads, and the one that was probably meant, if any is like it."""
+
+    name: str
+    meant: str = ""
+
+    @property
+    def text(self) -> str:
+        """What is wrong, in words that follow the name."""
+        hint = f"; did you mean {self.meant}?" if self.meant else ""
+        return f"is no variable of rosproxy's and is ignored{hint}"
+
+
+def unknown(environment: Mapping[str, str], known: Collection[str]) -> list[UnknownVariable]:
+    """The variables of an environment that look as if they were meant for an option."""
+    found = []
+    for name, value in sorted(environment.items()):
+        upper, prefixed = name.upper(), name.upper().startswith(_PREFIX)
+        linked = _SERVICE_LINK.search(upper) or (upper.endswith("_PORT") and "://" in value)
+        if name in known or linked or not upper.startswith("ROS"):
+            continue
+        meant = _nearest(upper, known)
+        if prefixed or meant:
+            found.append(UnknownVariable(name, meant))
+    return found
+
+
+def _nearest(name: str, known: Collection[str]) -> str:
+    """The variable that is most like a name; what both begin with makes no names alike."""
+    if not name.startswith(_PREFIX):
+        return next(iter(difflib.get_close_matches(name, known, 1, _VERY_NEAR)), "")
+    own = {one.removeprefix(_PREFIX): one for one in known if one.startswith(_PREFIX)}
+    near = difflib.get_close_matches(name.removeprefix(_PREFIX), own, 1, _NEAR)
+    return own[near[0]] if near else ""

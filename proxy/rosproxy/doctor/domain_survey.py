@@ -1,0 +1,119 @@
+"""Who is on the networks inside, of whatever domain: each participant is asked to announce itself.
+
+The proxy hears what is announced to the group of its own domain. It can't hear a participant of
+another one, nor one that announces itself to its own machine alone
+(``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST``). Yet both answer at once when they hear of somebody
+new. So the doctor is somebody new for a moment: it announces itself to the groups of all domains,
+and to all hosts (224.0.0.1, ff02::1) at the well-known ports of its own; hears who answers, and
+takes its leave. It has no reader and no writer, so that nothing else is told to it.
+"""
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Collection, Iterable, Iterator
+from ipaddress import ip_network
+
+from rosproxy.doctor.facts import HeardParticipant
+from rosproxy.forwarding import datagrams
+from rosproxy.net.addresses import HostPort, is_inside, plain_address
+from rosproxy.net.interfaces import address_into
+from rosproxy.ros2.discovery.announced import traits
+from rosproxy.ros2.discovery.domain_settings import (
+    PARTICIPANTS_TRIED,
+    PORTS_PER_DOMAIN,
+    SPDP_MULTICAST,
+    SPDP_UNICAST,
+)
+from rosproxy.ros2.protocol.announcement import ANNOUNCES, announcement, farewell
+from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.rtps import PREFIX, RtpsError, source_vendor
+from rosproxy.ros2.registry.participants import Participant
+from rosproxy.ros2.rewriting.discovery import Announcement, read_discovery
+from rosproxy.ros2.servers.groups import family_of, groups_of, send_through
+
+DOMAINS = 233
+"""Those whose ports exist: 0 to 232."""
+ALL_HOSTS = {socket.AF_INET: "224.0.0.1", socket.AF_INET6: "ff02::1"}
+WITHIN = 2.0
+"""Seconds in which participants answer."""
+LEASE = 5.0
+MOST_HEARD = 200
+
+
+def ask_participants(network: str, domains: Collection[int]) -> list[HeardParticipant]:
+    """Who answers on a network, given as CIDR, if this machine is in it; takes WITHIN.
+
+    ``domains`` are those in which also they are asked who don't hear the group.
+    """
+    with contextlib.suppress(ValueError, OSError):  # no network; gone, or without multicast
+        there = ip_network(network)
+        own = address_into(there)
+        if is_inside(own, (there,)):
+            return _ask(own, domains)
+    return []
+
+
+def heard_participant(datagram: bytes, source: str) -> HeardParticipant | None:
+    """Who announces itself in a datagram; None if nobody does, or of no domain that can be told."""
+    try:
+        message = read_discovery(datagram)
+        prefix, told = message.prefix, message.of_participant
+        vendor = source_vendor(datagram)
+    except RtpsError:
+        return None
+    domain = _domain(told, datagram, source) if told and not told.ended else None
+    if domain is None:
+        return None
+    one = Participant(prefix, source, vendor, 0.0)
+    return HeardParticipant(domain, one.guid_prefix, source, one.vendor_name)
+
+
+def _ask(own: str, domains: Collection[int]) -> list[HeardParticipant]:
+    """Those that answer on the network where this machine has an address. Raises OSError."""
+    found: dict[str, HeardParticipant] = {}
+    with contextlib.closing(datagrams.bind(own, 0)) as sock:
+        send_through(sock, own, loop=False)
+        prefix, targets = os.urandom(PREFIX), list(_targets(own, domains))
+        here = HostPort(own, sock.getsockname()[1])
+        _tell(sock, announcement(prefix, [here], LEASE, ANNOUNCES), targets)
+        ends = time.monotonic() + WITHIN
+        while len(found) < MOST_HEARD and (left := ends - time.monotonic()) > 0:
+            sock.settimeout(left)
+            with contextlib.suppress(TimeoutError):
+                datagram, sender = sock.recvfrom(datagrams.LARGEST)
+                one = heard_participant(datagram, plain_address(sender[0]))
+                found |= {one.guid_prefix: one} if one else {}
+        _tell(sock, farewell(prefix), targets)
+    return list(found.values())
+
+
+def _targets(own: str, domains: Collection[int]) -> Iterator[tuple[str, int]]:
+    for domain in range(DOMAINS):
+        for group in groups_of(own):
+            yield group, SPDP_MULTICAST + PORTS_PER_DOMAIN * domain
+    for domain in domains:
+        first = SPDP_UNICAST + PORTS_PER_DOMAIN * domain
+        for port in range(first, min(first + 2 * PARTICIPANTS_TRIED, 65536), 2):
+            yield ALL_HOSTS[family_of(own)], port
+
+
+def _tell(sock: socket.socket, datagram: bytes, targets: Iterable[tuple[str, int]]) -> None:
+    sock.settimeout(None)
+    for target in targets:
+        sock.sendto(datagram, target)
+
+
+def _domain(told: Announcement, datagram: bytes, source: str) -> int | None:
+    """The domain that a participant says it is in, or else that of its well-known port."""
+    said = traits(told, datagram, source).domain
+    if said is not None:
+        return said
+    ports = (
+        where.port
+        for pid, where in told.reached_at(datagram)
+        if pid == Pid.METATRAFFIC_UNICAST_LOCATOR and where.port >= SPDP_MULTICAST
+    )
+    port = next(ports, None)
+    return None if port is None else (port - SPDP_MULTICAST) // PORTS_PER_DOMAIN

@@ -1,0 +1,85 @@
+"""Which other proxies there are on this machine: each puts up a sign.
+
+A port that is bound and does not listen is in none of the kernel's lists, so that nobody can tell
+who holds a range. A sign is a Unix socket with an abstract name (unix(7)), which says it. Like
+ports it belongs to a network namespace, and the kernel takes it down when its process ends, however
+that ends. ``/proc/net/unix`` lists all of them.
+
+Anybody can put up a sign. So what is read is told to people, not too much of it, and nothing is
+decided by it.
+"""
+
+import contextlib
+import re
+import secrets
+import socket
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from rosproxy.net.addresses import is_address, parse_host_port
+
+MOST = 8
+"""Proxies that are told of."""
+_LISTED = Path("/proc/net/unix")
+_SIGN = re.compile(r"@rosproxy/([12]{1,2})/(\d{1,5})-(\d{1,5})/([0-9A-Fa-z.:\[\]-]{1,60})/\w{8}$")
+
+
+@dataclass(frozen=True, slots=True)
+class Sign:
+    """What a proxy says of itself: versions of ROS, first and last port, and its admin endpoint."""
+
+    ros: str
+    first: int
+    last: int
+    admin: str
+
+    def __str__(self) -> str:
+        """Words for people, to be used after "held by"."""
+        return (
+            f"another rosproxy, with --port-range {self.first}-{self.last} "
+            f"(rosproxy status --admin http://{self.admin})"
+        )
+
+
+def put_up(ros: Collection[str], first: int, last: int, admin: object) -> socket.socket | None:
+    """Put up the sign of this process; it stays until the socket is closed.
+
+    None where that is not possible: a sign only helps people.
+    """
+    name = f"\0rosproxy/{''.join(sorted(ros))}/{first}-{last}/{admin}/{secrets.token_hex(4)}"
+    with contextlib.suppress(OSError):
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            sock.bind(name)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+    return None
+
+
+def others(ros: str, first: int, last: int, admin: object) -> list[Sign]:
+    """The proxies that are here, for a version of ROS, and have some of these ports.
+
+    ``admin`` is the own admin endpoint, which no other can have. MOST at most, and none whose admin
+    endpoint is not at an address: people are told to ask there.
+    """
+    try:
+        lines = _LISTED.read_text("utf-8", "replace").splitlines()
+    except OSError:
+        return []
+    read = filter(None, map(_SIGN.search, lines))
+    signs = (Sign(one[1], int(one[2]), int(one[3]), one[4]) for one in read)
+    found = (
+        one
+        for one in signs
+        if ros in one.ros and one.first <= last and first <= one.last and one.admin != str(admin)
+    )
+    return list(islice(dict.fromkeys(one for one in found if _is_at_address(one.admin)), MOST))
+
+
+def _is_at_address(admin: str) -> bool:
+    where = parse_host_port(admin)
+    return where is not None and is_address(where.host)

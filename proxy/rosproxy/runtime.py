@@ -1,0 +1,35 @@
+"""What all parts of a running proxy share, of ROS 1 and of ROS 2: clock, tasks, what is told.
+
+Made once, before the parts.
+"""
+
+import time
+import uuid
+from collections.abc import Collection
+
+from rosproxy.access.access_policy import AccessPolicy
+from rosproxy.net.tasks import Tasks
+from rosproxy.settings import Settings
+from rosproxy.telemetry.metrics import Metrics
+from rosproxy.telemetry.problems import Problems
+from rosproxy.telemetry.refusals import Refusals
+
+
+class Runtime:
+    """The tools of one proxy; needs a running event loop.
+
+    ``instance`` is a random name of this process. ``refusals`` tells what is over some bound;
+    ``policy``: what outside may see and do. ``known_methods`` are those that metrics name.
+    """
+
+    def __init__(self, settings: Settings, known_methods: Collection[str] = ()) -> None:
+        self.settings, self.instance = settings, uuid.uuid4().hex
+        self.metrics, self.tasks, self.problems = Metrics(known_methods), Tasks(), Problems()
+        self.refusals = Refusals(self.metrics, self.problems, self.now)
+        self.policy = AccessPolicy(
+            settings.policy, settings.policy_layers, self.metrics, self.refusals
+        )
+
+    def now(self) -> float:
+        """Seconds of the monotonic clock."""
+        return time.monotonic()

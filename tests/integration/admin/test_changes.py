@@ -1,0 +1,84 @@
+"""Waiting at the admin endpoint until something has changed."""
+
+import asyncio
+import json
+from typing import Any
+from urllib.parse import quote
+
+import pytest
+
+from examples.demo.fake_master import FakeMaster
+from rosproxy.admin import status_changes
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.net import Reply, exchange, until
+from tests.integration.proxy import Proxy
+
+
+async def wait(proxy: Proxy, since: str = "", within: str = "60", *headers: str) -> Reply:
+    where = (proxy.settings.admin.host, proxy.settings.admin.port)
+    path = f"/status/changes?since={quote(since)}&within={within}"
+    lines = [f"GET {path} HTTP/1.1", "Host: x", *headers, "", ""]
+    return await exchange(where, "\r\n".join(lines).encode())
+
+
+async def changes(proxy: Proxy, since: str = "", within: str = "60") -> tuple[str, dict[str, Any]]:
+    """The version and the state."""
+    reply = await wait(proxy, since, within)
+    assert reply.status == 200, reply.body
+    found = json.loads(reply.body)
+    return found["version"], found["status"]
+
+
+async def test_a_change_is_told(
+    make_proxy: MakeProxy, make_node: MakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(status_changes, "EVERY", 0.01)
+    proxy = await make_proxy()
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
+    version, status = await changes(proxy)
+    assert status["nodes"] == []
+    waiting = asyncio.create_task(changes(proxy, version))
+    node = await make_node("/talker")
+    await node.publish(proxy.master, "/chatter")
+    another, status = await waiting
+    assert another != version
+    assert status["nodes"][0]["nodes"] == ["/talker"]
+    assert (await changes(proxy, version))[1]["nodes"]  # it has changed by then
+
+
+async def test_no_change_is_told_after_a_while(make_proxy: MakeProxy, master: FakeMaster) -> None:
+    proxy = await make_proxy()
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
+    version, _ = await changes(proxy)
+    assert (await changes(proxy, version, "0.2"))[0] == version
+
+
+@pytest.mark.parametrize("within", ["nan", "inf", "-1", "1e999"])
+async def test_nonsense_is_no_time(make_proxy: MakeProxy, within: str) -> None:
+    proxy = await make_proxy()
+    assert (await wait(proxy, "", within)).status == 200
+    assert (await wait(proxy, "", "soon")).status == 400
+
+
+async def test_so_many_may_wait(make_proxy: MakeProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who goes away makes room, and nobody is waited for when the proxy ends."""
+    monkeypatch.setattr(status_changes, "EVERY", 0.01)
+    proxy = await make_proxy()
+    await until(lambda: proxy.ros1.master_monitor.up, "the master is seen")
+    version, _ = await changes(proxy)
+    room = proxy.app._admin._changes
+    some = [asyncio.create_task(wait(proxy, version)) for _ in range(status_changes.MOST)]
+    await until(lambda: room._waiting == status_changes.MOST, "all wait")
+    refused = await wait(proxy, version)
+    assert refused.status == 503
+    some[0].cancel()
+    await until(lambda: room._waiting < status_changes.MOST, "there is room again")
+    room.end()
+    assert {(await one).status for one in some[1:]} == {200}
+
+
+async def test_no_web_page_may_wait(proxy: Proxy) -> None:
+    assert (await wait(proxy, "", "0")).status == 200
+    refused = await wait(proxy, "", "0", "Origin: http://page.example")
+    assert refused.status == 403
+    assert refused.body.startswith(b"rosproxy: GET /status/changes is for callers on this host")

@@ -1,0 +1,234 @@
+"""What ``rosproxy run`` finds out about itself at its start, and before that ``--check --deep``."""
+
+import asyncio
+import json
+import subprocess
+from typing import Any
+
+import pytest
+
+from examples.demo.fake_master import FakeMaster
+from examples.demo.proxy_process import clean_environment
+from rosproxy.admin.findings import DoctorFinding, Severity
+from rosproxy.admin.range_probe import probe_range
+from tests.integration.commands import run
+from tests.integration.conftest import MakeNode, MakeProxy
+from tests.integration.doctor.test_doctor import examine
+from tests.integration.net import rpc, until
+from tests.integration.process import Process, command_line
+from tests.integration.proxy import Proxy, options_for
+
+
+def started(options: dict[str, Any]) -> "subprocess.CompletedProcess[str]":
+    """``rosproxy run``, which is expected to end by itself."""
+    command = command_line(options)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, env=clean_environment()
+    )
+
+
+def admin_of(process: Process) -> str:
+    return f"http://{process.options['admin_bind']}"
+
+
+async def status(process: Process) -> dict[str, Any]:
+    ended = await run("status", "--json", "--admin", admin_of(process))
+    found: dict[str, Any] = json.loads(ended.out)
+    return found
+
+
+async def problems(process: Process) -> list[str]:
+    return [f"{one['subject']}: {one['text']}" for one in (await status(process))["problems"]]
+
+
+async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_process, node):
+    """Both started before, and nodes got now the one's port, now the other's."""
+    first: Process = start_process()
+    assert (await node.publish(first.master))[0] == 1
+    second = options_for(master_uri=first.options["master_uri"])
+    second["port_range"] = first.options["port_range"]
+    ended = await asyncio.to_thread(started, second)
+    assert ended.returncode == 2
+    (line,) = [line for line in ended.stderr.splitlines() if line.startswith("rosproxy: ")]
+    assert line.startswith("rosproxy: --port-range: no port of ")
+    assert f"held by another rosproxy, with --port-range {first.options['port_range']}" in line
+    assert f"rosproxy status --admin {admin_of(first)}" in line
+    await node.publish(first.master)
+    assert (await status(first))["ports"]["blocked"] == 0
+
+
+async def test_a_second_proxy_on_a_part_of_the_range_names_the_first(start_process):
+    first: Process = start_process()
+    port = int(first.options["port_range"].split("-")[0])
+    second: Process = start_process(port_range=f"{port - 3}-{port}")
+    told = "\n".join(await problems(second))
+    assert f"held by other programs: [{port}]" in told
+    assert f"held by another rosproxy, with --port-range {first.options['port_range']}" in told
+    assert admin_of(first) in told
+    text = (await run("doctor", "--admin", admin_of(second))).out
+    assert "give one of the two another --port-range" in text
+    first.kill()
+    first.start()
+    assert (await status(first))["ports"]["blocked"] == 0, "it gets the same ports again"
+
+
+@pytest.mark.parametrize("domain", [201, 202])
+async def test_a_second_proxy_of_ros2_on_the_range_names_the_first(start_process, domain):
+    """Of one domain there can be one proxy on a machine anyway."""
+    first: Process = start_process(ros="2", ros2_domain=201, ros2_peer="127.0.0.1")
+    options = options_for(ros="2", ros2_domain=domain, ros2_peer="127.0.0.1")
+    options["port_range"] = first.options["port_range"]
+    ended = await asyncio.to_thread(started, options)
+    assert ended.returncode == 2
+    assert f"another rosproxy, with --port-range {first.options['port_range']}" in ended.stderr
+
+
+async def test_doctor_takes_no_living_node_of_another_proxy_for_dead(
+    make_proxy: MakeProxy, proxy: Proxy, node, master
+) -> None:
+    """The other one has the same host and range, as outside sees them; the cure was a clean-up."""
+    await node.publish(proxy.master)
+    port = proxy.settings.ports.listen.last
+    uri = f"http://{proxy.settings.advertise_host}:{port}/{node.address}:{node.slave.address[1]}/"
+    await rpc(master.uri, "registerPublisher", "/others", "/t", "a/B", uri)
+    await rpc(master.uri, "registerPublisher", "/ghost", "/t", "a/B", uri.replace(str(port), "9"))
+    found = [one for one in await examine(proxy) if one.severity is Severity.ERROR]
+    assert (found[0].check, found[0].subject) == ("two proxies", "/others")
+    assert "another rosproxy advertises the same host and ports" in found[0].text
+    assert "ROSPROXY_PORT_RANGE" in found[0].fix
+    assert all(not one.fix.startswith("rosnode cleanup") for one in found)
+
+
+@pytest.mark.parametrize(
+    ("host", "text", "cure"),
+    [
+        ("nowhere.invalid", "the host name nowhere.invalid can't be resolved here", "ADDRESS"),
+        ("127.0.0.1", "127.0.0.1 is a loopback address", "the address of this host"),
+        ("localhost", "localhost is a loopback address", "the address of this host"),
+    ],
+)
+async def test_an_advertised_host_that_leads_nowhere_is_told_before_ready(
+    start_process, host, text, cure
+):
+    process: Process = start_process(advertise_host=host, master_uri="http://192.0.2.7:11311")
+    log = process.text
+    assert log.index(text) < log.index("ready: ")
+    assert "ERROR" in log[: log.index("ready: ")]
+    (told,) = [one for one in await problems(process) if one.startswith("advertised host: ")]
+    assert text in told
+    assert cure in told
+    assert told.removeprefix("advertised host: ")[:40] in (
+        await run("status", "--admin", admin_of(process))
+    ).out.replace("\n    ", " ")
+
+
+async def test_loopback_is_fine_where_all_is_on_one_machine(start_process):
+    process: Process = start_process(advertise_host="127.0.0.1")
+    assert not await problems(process)
+
+
+async def test_a_range_that_outside_does_not_reach_is_told_once_it_was_tried(start_process):
+    """192.0.2.1 is nobody's; the master does not get there either."""
+    process: Process = start_process(advertise_host="192.0.2.1")
+    await until(lambda: "published range: " in process.text, "the range was tried", 60)
+    (told,) = [one for one in await problems(process) if one.startswith("published range: ")]
+    assert "docker run -p" in told
+    assert process.text.count("published range: ") == 1
+
+
+def findings(text: str) -> list[DoctorFinding]:
+    rows = json.loads(text)["findings"]
+    return [DoctorFinding(**{**row, "severity": Severity[row["severity"].upper()]}) for row in rows]
+
+
+async def deep(options: dict[str, Any]) -> tuple[int, str]:
+    """The exit code of ``run --check --deep``, and what it printed."""
+    ended = await asyncio.to_thread(started, {**options, "check": True, "deep": True})
+    assert "Traceback" not in ended.stderr
+    return ended.returncode, ended.stdout + ended.stderr
+
+
+async def test_the_deep_check_of_a_sound_proxy_ends_with_0_and_leaves_nothing(master):
+    code, text = await deep(options_for(master_uri=master.uri))
+    assert (code, "Nothing wrong was found." in text) == (0, True), text
+    assert "the master reaches" in text
+    assert not master.holds("publishers", "/chatter")
+    assert not [name for name in master.nodes if "probe" in name]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"master_uri": "http://127.0.0.1:1"}, "refuses connections"),
+        ({"advertise_host": "nowhere.invalid"}, "can't be resolved here"),
+        (
+            {"admin_bind": "nowhere.invalid:11312"},
+            "--admin-bind: nowhere.invalid can't be resolved",
+        ),
+        ({"advertise_host": "192.0.2.1"}, "The master does not get through either"),
+        ({"policy_file": "/nowhere/policy"}, "--policy-file: /nowhere/policy can't be read"),
+    ],
+)
+async def test_the_deep_check_finds(master, options, text):
+    code, told = await deep(options_for(**{"master_uri": master.uri, **options}))
+    assert code == (2 if "policy_file" in options else 1), told
+    assert text in " ".join(told.split())
+
+
+async def test_the_deep_check_names_another_proxy(start_process):
+    first: Process = start_process()
+    code, told = await deep({**first.options, "admin_bind": "127.0.0.1:11313"})
+    assert code == 1
+    assert "held by another rosproxy" in " ".join(told.split())
+
+
+@pytest.mark.parametrize(("port", "code"), [(0, 0), (1, 1)])
+async def test_the_deep_check_for_ros2(port, code):
+    options = options_for(ros="2", ros2_domain=203, ros2_peer="127.0.0.1")
+    if port:
+        options["advertise_host"] = "nowhere.invalid"
+    ended, told = await deep(options)
+    assert ended == code, told
+    assert ("by UDP" if not code else "can't be resolved") in told
+
+
+async def test_check_reads_the_policys_file(tmp_path):
+    file = tmp_path / "policy"
+    file.write_text("deny publish camera\n")
+    ended = await asyncio.to_thread(
+        started,
+        {
+            **options_for(master_uri="http://robot:11311"),
+            "policy_file": str(file),
+            "check": True,
+        },
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("rosproxy: --policy-file: ")
+
+
+async def test_a_node_gets_the_port_that_is_being_tried(
+    make_proxy: MakeProxy,
+    make_node: MakeNode,
+    master: FakeMaster,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The proxy tries its range by itself, just when nodes start; roscpp never asks again."""
+    monkeypatch.setattr(master, "_notify", lambda *_: None)  # it does not get through
+    monkeypatch.setattr("rosproxy.admin.range_probe.MASTER_WAIT", 1.0)
+    proxy = await make_proxy(ports=1)
+    leases, context = proxy.ros1.leases, proxy.ros1.context
+    (port,) = context.settings.ports.listen.ports()
+    trial = asyncio.create_task(probe_range(context, leases))
+    await until(lambda: leases.is_lent(port), "the port is being tried")
+    node = await make_node()
+    assert (await node.publish(proxy.master))[0] == 1
+    assert (await trial).probes == ()
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+
+
+async def test_no_fast_port_is_tried_unasked(make_proxy: MakeProxy, make_node: MakeNode) -> None:
+    proxy = await make_proxy(ports=1)
+    node = await make_node()
+    await node.publish(proxy.master)
+    assert (await probe_range(proxy.ros1.context, proxy.ros1.leases, or_fast=False)).probes == ()

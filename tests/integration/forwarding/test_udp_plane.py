@@ -1,0 +1,174 @@
+"""The kernel plane of ROS 2 with a kernel made up: what is forwarded, and what goes astray."""
+
+from collections.abc import AsyncIterator
+
+import pytest
+
+from rosproxy.forwarding.kernel.nft import Marks, Table, Transport
+from rosproxy.forwarding.kernel.plane import KernelPlane
+from rosproxy.forwarding.kernel.table import KernelTable
+from rosproxy.leases.ports import PortMap, PortPool, PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.data_leases import DataLeases
+from rosproxy.ros2.discovery.domain_settings import DomainSettings, Refused
+from rosproxy.ros2.discovery.inside import InsideParticipants
+from rosproxy.ros2.registry.participants import InsideParticipant, Lease, LeaseKind
+from rosproxy.ros2.registry.ports import LocatorPorts
+from rosproxy.runtime import Runtime
+from tests.integration.kernel_fake import FakeTools, clear_the_way
+from tests.integration.net import until
+from tests.run_options import parse_settings
+
+RANGE = PortRange(45000, 45015)
+MARKS = Marks(RANGE.first)
+LOCATOR, OTHER = HostPort("192.0.2.5", 7411), HostPort("192.0.2.6", 7411)
+UNLED = (
+    "udp 17 29 src=198.51.100.2 dst={at} sport=5555 dport=45001 [UNREPLIED] "
+    "src={at} dst=198.51.100.2 sport=45001 dport=5555 mark=0 use=1\n"
+)
+LED = (
+    "udp 17 29 src=198.51.100.2 dst=192.0.2.1 sport=5555 dport=45001 [UNREPLIED] "
+    "src=192.0.2.5 dst=192.0.2.1 sport=7411 dport=5555 mark={mark} use=1\n"
+)
+
+
+class Bench:
+    """A plane for UDP over a made-up kernel, and the leases of one domain; nothing listens."""
+
+    def __init__(self, tools: FakeTools | None = None) -> None:
+        told = {"ros": ("2",), "advertise_host": "192.0.2.1", "port_range": str(RANGE)}
+        self.runtime = runtime = Runtime(parse_settings(told))
+        self.tools = tools or FakeTools()
+        ports, pool = PortMap(RANGE, RANGE), PortPool(RANGE)
+        domain = DomainSettings(0, ("192.0.2.1",), ports, str, lambda *_: None, lambda *_: True)
+        refused = Refused(domain.note)
+        self.inside = InsideParticipants(domain, LocatorPorts(pool, 0.0), refused)
+        self.leases = DataLeases(pool)
+        self.leases.domains.append(self.inside)
+        table = KernelTable(Table(RANGE.first, RANGE, Transport.UDP), self.tools)
+        self.plane = KernelPlane(
+            runtime.settings, self.leases, runtime.tasks, runtime.problems, runtime.now, table
+        )
+
+    async def start(self) -> None:
+        await self.plane.start()
+        self.leases.note_former(self.plane.forwards)
+        self.plane.recovered([])
+
+    def lend(self, where: HostPort = LOCATOR, port: int = 45001) -> InsideParticipant:
+        participant = InsideParticipant(bytes(12), where.host, b"", 0.0)
+        lease = participant.leases[where] = Lease(port, where, LeaseKind.DATA)
+        self.inside.by_prefix[participant.prefix] = participant
+        self.inside.leases[port] = participant, lease
+        self.inside.changes += 1
+        self.plane.syncer.note_change()
+        return participant
+
+    def end(self, participant: InsideParticipant) -> None:
+        self.inside.forget(participant)
+        self.plane.syncer.note_change()
+
+    async def forwarding(self, forwards: dict[int, HostPort]) -> None:
+        wanted = {port: (where.host, where.port) for port, where in forwards.items()}
+        await until(lambda: self.tools.forwards == wanted, f"{forwards} are forwarded")
+
+    def forgotten(self, *which: str) -> bool:
+        return (False, which) in self.tools.forgotten
+
+    async def close(self) -> None:
+        await self.runtime.tasks.cancel()
+        await self.plane.stop()
+
+
+@pytest.fixture
+def sound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network namespace in which nothing is in the way."""
+    clear_the_way(monkeypatch)
+
+
+@pytest.fixture
+async def bench(sound: None) -> AsyncIterator[Bench]:
+    one = Bench()
+    await one.start()
+    yield one
+    await one.close()
+
+
+async def test_a_lease_is_forwarded_while_it_is_there(bench: Bench) -> None:
+    participant = bench.lend()
+    await bench.forwarding({45001: LOCATOR})
+    (lease,) = bench.leases
+    await until(lambda: bench.plane.status_of(lease)["plane"] == "kernel", "it is told")
+    bench.tools.flows = LED.format(mark=MARKS.of(45001))
+    bench.end(participant)
+    await bench.forwarding({})
+    await until(lambda: bench.forgotten("--mark", MARKS.one(45001)), "its senders are forgotten")
+
+
+async def test_senders_follow_to_another_locator(bench: Bench) -> None:
+    participant = bench.lend()
+    await bench.forwarding({45001: LOCATOR})
+    bench.tools.flows = LED.format(mark=MARKS.of(45001))
+    await bench.plane.look()
+    assert bench.tools.forgotten == []
+    bench.end(participant)
+    bench.lend(OTHER)
+    await bench.forwarding({45001: OTHER})
+    await until(lambda: bench.forgotten("--mark", MARKS.one(45001)), "its senders are forgotten")
+
+
+async def test_who_had_begun_before_is_forgotten_at_the_proxy_alone(bench: Bench) -> None:
+    bench.tools.flows = UNLED.format(at="127.0.0.1") + UNLED.format(at="198.51.100.9")
+    bench.lend()
+    words = "--orig-dst", "127.0.0.1", "--orig-port-dst", "45001", "--reply-port-src", "45001"
+    await until(lambda: bench.forgotten(*words), "who sends to the proxy is forgotten")
+    assert {which for _, which in bench.tools.forgotten} == {words}
+
+
+async def test_datagrams_are_counted_and_need_no_answer(bench: Bench) -> None:
+    bench.lend()
+    await bench.forwarding({45001: LOCATOR})
+    bench.tools.counted = {"sent": 0, "received": 2028}
+    for _ in range(4):
+        await bench.plane.look()
+        bench.tools.counted["received"] += 1000
+    (lease,) = bench.leases
+    told = bench.plane.status_of(lease)
+    assert (told["plane"], told["received"], told["received_packets"]) == ("kernel", 5028, 1)
+    assert bench.plane.total.received == 5028
+    assert bench.plane.total.packets == 1
+
+
+async def test_a_graceful_stop_resets_nobody_and_leaves_nothing(bench: Bench) -> None:
+    bench.lend()
+    await bench.forwarding({45001: LOCATOR})
+    await bench.close()
+    assert bench.tools.table is None
+    assert not any("reset" in document for document in bench.tools.documents)
+    assert bench.forgotten("--mark", MARKS.all)
+
+
+async def test_what_a_killed_process_left_goes_on_for_a_while(bench: Bench) -> None:
+    bench.lend()
+    bench.lend(OTHER, 45002)
+    await bench.forwarding({45001: LOCATOR, 45002: OTHER})
+    later = Bench(bench.tools)
+    await later.start()
+    later.lend(LOCATOR, 45003)
+    await later.forwarding({45001: LOCATOR, 45002: OTHER, 45003: LOCATOR})
+    later.lend(LOCATOR, 45002)
+    await later.forwarding({45001: LOCATOR, 45002: LOCATOR, 45003: LOCATOR})
+    later.leases.note_former({})
+    later.plane.syncer.note_change()
+    await later.forwarding({45002: LOCATOR, 45003: LOCATOR})
+    await later.runtime.tasks.cancel()
+
+
+async def test_a_plane_that_is_lost_is_told_apart_from_that_for_topics(bench: Bench) -> None:
+    bench.tools.failing = 2
+    bench.lend()
+    await until(lambda: not bench.plane.syncer.usable, "the plane is lost")
+    (problem,) = bench.runtime.problems.all()
+    assert problem.subject == "--data-plane for UDP"
+    assert bench.plane.status()["plane"] == "copy"
+    assert bench.plane.forwards == {}

@@ -1,0 +1,162 @@
+"""Nodes that are well are asked over one connection that is kept; what becomes of it is noticed."""
+
+import os
+from collections import Counter
+from collections.abc import AsyncIterator
+
+import pytest
+
+from examples.demo.fake_http import End, ok, value
+from examples.demo.fake_node import FakeNode
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.kept import KeptConnections
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.health import ProbeResult
+from rosproxy.runtime import Runtime
+from tests.integration.net import until
+from tests.integration.proxy import settings_for
+
+NAME = "/talker"
+Kept = KeptConnections[str]
+
+
+@pytest.fixture
+async def kept() -> AsyncIterator[Kept]:
+    context = Context(Runtime(settings_for(master_uri="http://127.0.0.1:1")))
+    found = Kept(context.nodes, within=5.0)
+    found.most = 1
+    yield found
+    found.close_all()
+    await context.upstream.close()
+
+
+def ask(kept: Kept, node: FakeNode, now: float = 0.0) -> bool:
+    return kept.ask(NAME, HostPort(*node.slave.address), node.pid, now)
+
+
+async def told(kept: Kept, now: float = 0.0) -> ProbeResult | None:
+    """What becomes of the question, as soon as that is known."""
+    found = dict[str, ProbeResult | None]()
+
+    def collected() -> bool:
+        found.update(kept.collect(now))
+        return bool(found)
+
+    await until(collected, "the connection tells something")
+    return found[NAME]
+
+
+def asked(node: FakeNode) -> int:
+    return Counter(method for method, _ in node.calls)["getPid"]
+
+
+async def test_a_node_is_asked_over_and_over_on_one_connection(kept: Kept, node: FakeNode) -> None:
+    for _ in range(3):
+        assert ask(kept, node)
+        assert ask(kept, node)  # and waits for the answer to the first
+        assert await told(kept) is ProbeResult.ANSWERED
+    assert (asked(node), node.slave.connections) == (3, 1)
+
+
+async def test_the_end_of_a_node_is_noticed_unasked(kept: Kept, node: FakeNode) -> None:
+    ask(kept, node)
+    await told(kept)
+    assert kept.collect(9.0) == {}
+    await node.stop()
+    assert await told(kept) is None
+    assert kept.collect(9.0) == {}
+
+
+async def test_a_node_that_is_gone_before_the_connection_is_made(
+    kept: Kept, node: FakeNode
+) -> None:
+    await node.stop()
+    assert ask(kept, node)
+    assert await told(kept) is None
+
+
+async def test_a_node_that_hangs_is_silent_after_its_time(kept: Kept, node: FakeNode) -> None:
+    ask(kept, node, 10.0)
+    await told(kept, 10.0)
+    node.hang = True
+    ask(kept, node, 20.0)
+    await until(lambda: len(node.requests) == 2, "it was asked")
+    assert kept.collect(25.0) == {}
+    assert kept.collect(25.1) == {NAME: ProbeResult.SILENT}
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        value([1, "", 4711]),
+        value([1, "", "100"]),
+        value([-1, "no", 0]),
+        ok(b"<methodResponse>"),
+        ok(b"x" * 5000),
+        ok(b"", "Content-Length: 99999"),
+        b"HTTP/1.1 200 OK\r\n\r\n",
+        b"HTTP/1.1 500 Internal Server Error\r\nContent-Length: 0\r\n\r\n",
+        b"x" * 5000,
+        value([1, "", 100]) + b"more",
+        End.CLOSE,
+        End.RESET,
+    ],
+    ids=lambda answer: answer.name if isinstance(answer, End) else f"{answer[:20]!r} {len(answer)}",
+)
+@pytest.mark.parametrize("first", [True, False])
+async def test_any_other_answer_ends_the_connection(
+    kept: Kept, node: FakeNode, answer: bytes | End, first: bool
+) -> None:
+    if not first:
+        ask(kept, node)
+        assert await told(kept) is ProbeResult.ANSWERED
+    node.answers["getPid"] = answer
+    assert ask(kept, node)
+    assert await told(kept) is None
+    del node.answers["getPid"]
+    assert ask(kept, node)
+    assert await told(kept) is ProbeResult.ANSWERED
+
+
+async def test_another_process_or_place_is_asked_on_a_new_connection(
+    kept: Kept, node: FakeNode
+) -> None:
+    ask(kept, node)
+    await told(kept)
+    node.pid += 1
+    assert ask(kept, node)
+    assert await told(kept) is ProbeResult.ANSWERED
+    assert node.slave.connections == 2
+
+
+async def test_there_are_never_too_many_and_those_of_others_are_closed(
+    kept: Kept, node: FakeNode
+) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    ask(kept, node)
+    where = HostPort(*node.slave.address)
+    assert not kept.ask("/another", where, node.pid, 0.0)
+    kept.keep({"/another"})
+    assert len(os.listdir("/proc/self/fd")) <= before + 1  # the node's end may still be open
+    assert kept.ask("/another", where, node.pid, 0.0)
+
+
+async def test_the_proxy_keeps_a_connection_to_a_node_that_is_well(make_proxy, node):
+    proxy = await make_proxy(probe_interval=0.1)
+    await node.publish(proxy.master)
+    await until(lambda: asked(node) > 3, "it is asked")
+    before, connections = asked(node), node.slave.connections
+    await until(lambda: asked(node) > before + 3, "it is asked on")
+    assert node.slave.connections == connections
+    node.pid += 1  # as if another process had the address
+    await until(lambda: proxy.ros1.context.registry.by_caller[NAME].health.pid == node.pid, "seen")
+
+
+async def test_a_node_that_ends_every_connection_is_called_and_stays(make_proxy, node):
+    proxy = await make_proxy(probe_interval=0.1)
+    body = value([1, "", node.pid]).partition(b"\r\n\r\n")[2]
+    node.answers["getPid"] = ok(body, "Connection: close")
+    await node.publish(proxy.master)
+    before = asked(node)
+    await until(lambda: asked(node) > before + 4, "it is asked on")
+    assert proxy.app.status()["nodes"][0]["state"] == "ok"

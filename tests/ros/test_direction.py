@@ -1,0 +1,74 @@
+"""Inside has no way out: with ``--direction out`` it hears nobody there, and doctor says why.
+
+With ``both`` it does, also if the nodes of outside are on the proxy's own machine.
+
+The tests of both directions run in that network with ROS_TESTS_ISOLATED=1.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from tests.ros.combinations import LIBRARIES, each_library
+from tests.ros.lab import MASTER_URI, Lab
+from tests.ros.processes import stop_all
+from tests.ros.topology import MASTER_PORT, OUT_HOST, SHARED
+
+pytestmark = pytest.mark.boundary
+
+PLAN = replace(SHARED, name="i", isolated=True)
+PROXY_OPTIONS = ("--direction", "out")
+
+
+@each_library
+def test_inside_is_heard_and_hears_nobody(lab: Lab, library: str) -> None:
+    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    name = lab.unique("talker")
+    lab.node(library, "out", "pub", name=name, topic=topic)
+    deaf = lab.node(library, "c1", "sub", topic=topic)
+    lab.node(library, "out", "serve", service=service)
+    caller = lab.node(library, "c1", "call", service=service)
+    lab.node(library, "c1", "pub", topic=f"{topic}/out")
+    lab.node(library, "out", "sub", topic=f"{topic}/out").wait_for_count("^got ", 20)
+    found = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
+    assert "--direction both" in found, found
+    assert "got " not in deaf.output()
+    assert "reply " not in caller.output()
+
+
+@pytest.fixture
+def beside(lab: Lab) -> Iterator[dict[str, str]]:
+    """A proxy for both directions on a machine with nodes of outside; what nodes inside are told.
+
+    Its machine is their network's gateway: as a Docker host is, with an internal network.
+    """
+    gateway = "172.30.1.1"
+    argv = [sys.executable, "-m", "rosproxy", "run", "--master-uri", MASTER_URI]
+    argv += ["--advertise-host", OUT_HOST, "--port-range", "48000-48019", "--direction", "both"]
+    argv += ["--inside-network", "172.30.1.0/24"]
+    proxy = lab.spawn_proxy("host", argv)
+    proxy.wait_for("ready: ")
+    yield {"ROS_MASTER_URI": f"http://{gateway}:{MASTER_PORT}"}
+    log = proxy.output()
+    assert "Traceback" not in log, log
+    stop_all([proxy])
+
+
+@pytest.mark.parametrize(("one", "other"), [LIBRARIES, LIBRARIES[::-1]], ids=str)
+def test_nodes_of_outside_may_run_beside_the_proxy(
+    lab: Lab, beside: dict[str, str], one: str, other: str
+) -> None:
+    """On its machine, by an address that is the proxy's own as well."""
+    topic, service = f"/{lab.unique('topic')}", f"/{lab.unique('service')}"
+    there = {"ROS_IP": OUT_HOST}
+    lab.node(one, "host", "pub", topic=topic, env=there)
+    lab.node(one, "host", "serve", service=service, env=there)
+    back = lab.node(one, "host", "sub", topic=f"{topic}/back", env=there)
+    lab.node(other, "c1", "sub", topic=topic, env=beside).wait_for_count("^got hello ", 5)
+    lab.node(other, "c1", "call", service=service, env=beside).wait_for("^reply ask 0 ")
+    lab.node(other, "c1", "pub", topic=f"{topic}/back", env=beside)
+    back.wait_for_count("^got hello ", 5)

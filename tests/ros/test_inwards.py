@@ -1,0 +1,93 @@
+"""Nodes inside have no way outwards but the proxy, which has no ports for datagrams.
+
+So rules about what is outside hold: elsewhere they hide, and a node that knows an address connects
+to it by itself. And who wants UDP alone is told by doctor what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+import pytest
+
+from rosproxy.ros1.protocol.tcpros import decode_header, encode_header
+from tests.ros import wire
+from tests.ros.combinations import LIBRARIES
+from tests.ros.lab import CALLER, Lab
+from tests.ros.topology import SHARED
+
+pytestmark = pytest.mark.boundary
+
+PLAN = replace(SHARED, name="p", isolated=True)
+
+
+def told(lab: Lab, method: str, name: str, role: str = "c1") -> tuple[str, int]:
+    """Where the master has a node or service, as it is told to a machine."""
+    where = urlsplit(lab.ask_master(method, name, role=role))
+    assert where.hostname
+    assert where.port
+    return where.hostname, where.port
+
+
+def greet(lab: Lab, where: tuple[str, int], **fields: str) -> dict[str, str]:
+    """What a TCPROS header is answered with that comes from inside."""
+    header = {"callerid": "/spy", "md5sum": "*", "type": "*", **fields}
+    with lab.place("c1").entered(), socket.create_connection(where, timeout=20) as conn:
+        conn.sendall(encode_header(header))
+        stream = conn.makefile("rb")
+        return decode_header(stream.read(int.from_bytes(stream.read(4), "little")))
+
+
+@pytest.mark.parametrize(("one", "other"), [LIBRARIES, LIBRARIES[::-1]], ids=LIBRARIES)
+def test_what_is_denied_is_not_reached_by_a_known_address_either(
+    lab: Lab, one: str, other: str
+) -> None:
+    topic, service, name = f"/{lab.unique('t')}", f"/{lab.unique('s')}", lab.unique("talker")
+    lab.node(one, "out", "pub", name=name, topic=topic, rate=20)
+    lab.node(one, "out", "serve", service=service).wait_for("^ready")
+    receiver = lab.node(other, "c1", "sub", topic=topic)
+    receiver.wait_for_count("^got ", 5)
+    lab.node(other, "c2", "call", service=service, count=3).wait_for("^done")
+    talker, server = told(lab, "lookupNode", f"/{name}"), told(lab, "lookupService", service)
+    assert "error" not in greet(lab, talker, topic=topic)
+    assert "error" not in greet(lab, server, service=service)
+
+    rules = [f"deny subscribe {topic}", f"deny call {service}"]
+    layer = {"name": "test", "mode": "enforce", "rules": rules, "addresses": None}
+    assert lab.tell("/policy", layers=[layer])["cut"] > 0
+
+    assert "deny subscribe" in greet(lab, talker, topic=topic)["error"]
+    assert "deny call" in greet(lab, server, service=service)["error"]
+    with pytest.raises(LookupError, match="deny subscribe"):
+        wire.call(lab.place("c1"), *talker, "requestTopic", CALLER, topic, [["TCPROS"]])
+    for itself in (told(lab, "lookupNode", f"/{name}", "out"),
+                   told(lab, "lookupService", service, "out")):  # fmt: skip
+        address = (lab.place("out").address, itself[1])
+        with lab.place("c1").entered(), pytest.raises(OSError, match="unreachable"):
+            socket.create_connection(address, timeout=20)
+    lab.tell("/policy", layers=[])
+    receiver.wait_for_count("^got ", 5, since=receiver.mark())
+
+
+def test_who_wants_datagrams_alone_is_told_what_that_needs(lab: Lab) -> None:
+    topic = f"/{lab.unique('topic')}"
+    lab.node("roscpp", "out", "pub", topic=topic)
+    deaf = lab.node("roscpp", "c1", "sub", topic=topic, udp=1)
+    deaf.wait_for("^ready")
+    found = " ".join(lab.rosproxy("doctor", topic, check=False).output.split())
+    assert "if it wants UDP alone: --udp" in found, found
+    assert "got " not in deaf.output()
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_the_live_page_shows_what_comes_in_by_the_proxy(lab: Lab, library: str) -> None:
+    topic, name = f"/{lab.unique('topic')}", lab.unique("talker")
+    lab.node(library, "out", "pub", name=name, topic=topic, rate=20)
+    lab.node(library, "c1", "sub", topic=topic).wait_for_count("^got ", 5)
+    shown = lab.wait_shown(topic, carried="splice", state="ok", flows=True)
+    status = json.loads(lab.rosproxy("status", "--json").output)
+    ports = {one["uri"]: one["port"] for one in status["stand_ins"]}
+    assert shown["port"] == ports[lab.node_uri(name)]

@@ -1,0 +1,107 @@
+"""What keeps participants from meeting, as the status of a domain tells it."""
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.admin.domain_problems import DomainProblem, domain_problems
+from rosproxy.admin.status_document import DomainStatus, MismatchStatus, ParticipantStatus
+
+INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
+OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")
+MISMATCH = MismatchStatus(
+    "topic", "/scan", "reliability", "BEST_EFFORT", "RELIABLE", "01.0f.aa", "01.10.bb"
+)
+DOMAIN = DomainStatus(
+    domain=3, discovery="10.0.0.1:11400", peers=("robot",), inside=(INSIDE,), outside=(OUTSIDE,)
+)
+
+
+def with_inside(**changes: object) -> list[DomainProblem]:
+    return list(domain_problems(replace(DOMAIN, inside=(replace(INSIDE, **changes),))))
+
+
+def test_nothing_is_wrong() -> None:
+    assert list(domain_problems(DOMAIN)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "check", "grave", "said"),
+    [
+        ({"domain": 5}, "domain", True, "ROS_DOMAIN_ID=3"),
+        ({"security": "protected"}, "security", True, "ROS_SECURITY_ENABLE=false"),
+        ({"security": "protected", "vendor": "OpenDDS"}, "security", False, "does not reach them"),
+        ({"locator_fault": "tcp"}, "transport", True, "FASTDDS_BUILTIN_TRANSPORTS"),
+        ({"locator_fault": "loopback"}, "transport", True, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
+        ({"locator_fault": "elsewhere"}, "transport", True, "not the one that it sends from"),
+        ({"locator_fault": "missing"}, "transport", True, "UDPv4"),
+        ({"problem": "no port of 11400-11403 is free"}, "ports", True, "--port-range"),
+        ({"proven": False}, "reached", False, "10.0.0.1"),
+    ],
+)
+def test_each_cause_has_its_cure(
+    changes: dict[str, object], check: str, grave: bool, said: str
+) -> None:
+    (found,) = with_inside(**changes)
+    assert (found.check, found.subject, found.grave) == (check, "01.0f.aa", grave)
+    assert said in found.text + found.fix
+    assert found.text.startswith("at 172.30.0.5 (")
+
+
+def test_of_a_participant_the_first_cause_alone_is_told() -> None:
+    (found,) = with_inside(security="protected", locator_fault="tcp", problem="no port", domain=4)
+    assert found.check == "domain"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"security": "authenticated"}, {"security": "protected", "vendor": "Cyclone DDS"}],
+)
+def test_dds_security_that_passes(changes: dict[str, object]) -> None:
+    """Seen: addresses in SEDP that can be read, or none there, as Cyclone DDS has it."""
+    assert with_inside(**changes) == []
+
+
+def test_outside_is_reached_by_its_own_addresses() -> None:
+    secured = replace(OUTSIDE, security="protected", vendor="Fast DDS")
+    assert list(domain_problems(replace(DOMAIN, outside=(secured,)))) == []
+
+
+def test_its_own_domain_is_no_fault() -> None:
+    assert with_inside(domain=3) == []
+
+
+def test_what_another_version_says_is_passed_over() -> None:
+    assert with_inside(locator_fault="something new") == []
+
+
+@pytest.mark.parametrize(
+    ("policy", "check", "said"),
+    [
+        ("type", "type", "remap"),
+        ("reliability", "qos", "make the publisher RELIABLE"),
+        ("ownership", "qos", "give both the same ownership"),
+    ],
+)
+def test_a_pair_that_does_not_match(policy: str, check: str, said: str) -> None:
+    pair = replace(MISMATCH, policy=policy)
+    (found,) = domain_problems(replace(DOMAIN, mismatches=(pair,)))
+    assert (found.check, found.subject, found.grave) == (check, "topic /scan", True)
+    for part in (
+        f"{policy} differs",
+        "01.0f.aa at 172.30.0.5 (Fast DDS, inside) offers BEST_EFFORT",
+        "01.10.bb at 10.0.0.9 (Cyclone DDS, outside) requests RELIABLE",
+        said,
+    ):
+        assert part in found.text + found.fix, part
+
+
+def test_a_pair_of_which_one_is_not_reached_at_all_says_nothing_more() -> None:
+    bad = replace(DOMAIN, mismatches=(MISMATCH,), inside=(replace(INSIDE, security="protected"),))
+    assert [one.check for one in domain_problems(bad)] == ["security"]
+    slow = replace(DOMAIN, mismatches=(MISMATCH,), outside=(replace(OUTSIDE, proven=False),))
+    assert [one.check for one in domain_problems(slow)] == ["reached", "qos"]
+
+
+def test_pairs_that_are_left_out_are_counted() -> None:
+    (found,) = domain_problems(replace(DOMAIN, mismatches_left_out=7))
+    assert "7 more pairs" in found.text

@@ -1,0 +1,61 @@
+"""What is news of a proxy, and what is not."""
+
+from typing import Any
+
+import pytest
+
+from rosproxy.admin.status_document import read_status
+from rosproxy.admin.status_news import version_of
+
+NODE = {"nodes": ["/talker"], "address": "10.0.0.5:40001", "publishes": ["/chatter"]}
+MEMBER = {
+    "guid_prefix": "01.0f",
+    "address": "10.0.0.6",
+    "leases": [{"port": 11401, "datagrams": 3}],
+}
+STATUS: dict[str, Any] = {
+    "instance": "a",
+    "uptime": 3.0,
+    "master": {"up": True, "since": 2.0},
+    "nodes": [NODE],
+    "domains": [{"domain": 7, "inside": [MEMBER]}],
+    "problems": [{"age": 1.0, "subject": "master", "text": "refused"}],
+}
+
+
+def version(**more: Any) -> str:
+    return version_of(read_status({**STATUS, **more}))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"uptime": 9.0},
+        {"master": {"up": True, "since": 9.0, "round_trip": 0.1}},
+        {"nodes": [{**NODE, "connections": [{"name": "/chatter"}], "state": "live"}]},
+        {"domains": [{"domain": 7, "inside": [{**MEMBER, "leases": [{"port": 11401}]}]}]},
+        {"problems": [{"age": 9.0, "subject": "master", "text": "refused"}]},
+    ],
+)
+def test_what_only_passes_is_no_news(change: dict[str, Any]) -> None:
+    assert version(**change) == version()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"instance": "b"},
+        {"retired": True},
+        {"master": {"up": False}},
+        {"master": {"up": True, "error": "odd"}},
+        {"nodes": []},
+        {"nodes": [{**NODE, "publishes": []}]},
+        {"nodes": [{**NODE, "address": "10.0.0.7:40001"}]},
+        {"nodes": [{**NODE, "state": "cleaned"}]},
+        {"domains": []},
+        {"domains": [{"domain": 7, "inside": [{**MEMBER, "leases": []}]}]},
+        {"problems": []},
+    ],
+)
+def test_who_and_what_is_news(change: dict[str, Any]) -> None:
+    assert version(**change) != version()

@@ -1,0 +1,74 @@
+"""Problems of ROS 2 are told once, and go when they are mended."""
+
+import asyncio
+import logging
+from typing import cast
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.admin.domain_plane import DomainPlane
+from rosproxy.admin.ros2_status import Ros2State
+from rosproxy.admin.status_document import DomainStatus, ParticipantStatus
+from rosproxy.app.domain_watch import MOST_TOLD, DomainWatch
+from rosproxy.telemetry.problems import Problems
+
+GOOD = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
+TCP = replace(GOOD, locator_fault="tcp")
+
+
+class Told(Ros2State):
+    """A state of which a test says what it is."""
+
+    def __init__(self) -> None:
+        super().__init__((), cast(DomainPlane, None))
+        self.domain = DomainStatus()
+
+    def status(self) -> tuple[DomainStatus, ...]:
+        return (self.domain,)
+
+
+def look(watch: DomainWatch, told: Told, *inside: ParticipantStatus) -> None:
+    told.domain = DomainStatus(inside=inside)
+    asyncio.run(watch.look())
+
+
+def test_what_lasts_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    told, problems = Told(), Problems()
+    watch = DomainWatch(told, problems)
+    with caplog.at_level(logging.WARNING):
+        look(watch, told, TCP)
+        assert problems.all() == []
+        for _ in range(3):
+            look(watch, told, TCP)
+    (noted,) = problems.all()
+    assert noted.subject == "01.0f.aa"
+    assert "FASTDDS_BUILTIN_TRANSPORTS" in noted.text
+    assert len(caplog.records) == 1
+
+
+def test_what_is_mended_is_told_no_more() -> None:
+    told, problems = Told(), Problems()
+    watch = DomainWatch(told, problems)
+    for one in (TCP, TCP, GOOD):
+        look(watch, told, one)
+    assert problems.all() == []
+
+
+def test_another_cause_takes_the_place_of_the_first() -> None:
+    told, problems = Told(), Problems()
+    watch = DomainWatch(told, problems)
+    secured = replace(GOOD, security="protected")
+    for one in (TCP, TCP, secured, secured):
+        look(watch, told, one)
+    (noted,) = problems.all()
+    assert "DDS Security" in noted.text
+
+
+def test_so_many_are_told_and_no_more() -> None:
+    told, problems = Told(), Problems()
+    watch = DomainWatch(told, problems)
+    crowd = [replace(TCP, guid_prefix=f"01.0f.{number:02x}") for number in range(MOST_TOLD + 5)]
+    for _ in range(2):
+        look(watch, told, *crowd)
+    assert len(problems.all()) == MOST_TOLD

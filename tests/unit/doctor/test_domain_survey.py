@@ -1,0 +1,52 @@
+"""What the doctor takes from an answer of a participant."""
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.doctor.domain_survey import ask_participants, heard_participant
+from rosproxy.doctor.facts import HeardParticipant
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.protocol.announcement import farewell
+from rosproxy.ros2.protocol.locators import pack_locator
+from rosproxy.ros2.protocol.parameters import Pid
+from tests.unit.ros2.protocol.messages import PREFIX, data, message, payload
+
+SOURCE = "172.30.0.5"
+NAME = "00.01.02.03.04.05.06.07.08.09.0a.0b"
+
+
+def answer(port: int, domain: int | None = None) -> bytes:
+    held = [(Pid.METATRAFFIC_UNICAST_LOCATOR, pack_locator(HostPort(SOURCE, port), "<"))]
+    held += [] if domain is None else [(Pid.DOMAIN_ID, struct.pack("<I", domain))]
+    return message(data(payload(held)))
+
+
+@pytest.mark.parametrize(
+    ("port", "said", "domain"),
+    [(7410, None, 0), (7412, 0, 0), (8660, None, 5), (58_793, 3, 3), (65_410, None, 232)],
+)
+def test_of_which_domain_it_is(port: int, said: int | None, domain: int) -> None:
+    found = heard_participant(answer(port, said), SOURCE)
+    assert found == HeardParticipant(domain, NAME, SOURCE, "Fast DDS")
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [answer(1024), farewell(PREFIX), message(), b"", b"RTPS"],
+    ids=["port", "end", "nothing", "empty", "cut"],
+)
+def test_what_says_nothing(datagram: bytes) -> None:
+    assert heard_participant(datagram, SOURCE) is None
+
+
+@given(st.binary(max_size=200))
+def test_whatever_is_answered(rest: bytes) -> None:
+    heard_participant(answer(7410)[:60] + rest, SOURCE)
+
+
+@pytest.mark.parametrize("network", ["somewhere", "fd00::/64", "192.0.2.0/24", "10.0.0.0/99"])
+def test_a_network_that_this_machine_is_not_in_is_not_asked(network: str) -> None:
+    assert ask_participants(network, [0]) == []

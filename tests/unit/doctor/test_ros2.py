@@ -1,0 +1,169 @@
+"""What ``rosproxy doctor`` says of ROS 2."""
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.admin.findings import Severity, failed
+from rosproxy.admin.requests import PortProbe, RangeProbe
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    MismatchStatus,
+    ParticipantStatus,
+    PortsStatus,
+    ProblemStatus,
+    ProxyStatus,
+    StatusSettings,
+)
+from rosproxy.doctor.facts import DoctorFacts, HeardParticipant
+from rosproxy.doctor.rules import diagnose
+
+INSIDE = ParticipantStatus("01.0f.aa", "172.30.0.5", "Fast DDS")
+OUTSIDE = ParticipantStatus("01.10.bb", "10.0.0.9", "Cyclone DDS")
+
+
+def found(
+    domain: DomainStatus,
+    *names: str,
+    heard: tuple[HeardParticipant, ...] = (),
+    problems: tuple[ProblemStatus, ...] = (),
+    uptime: float = 60.0,
+) -> dict[tuple[str, str], tuple[Severity, str]]:
+    settings = StatusSettings(ros=("2",))
+    ports = PortsStatus("11400-11431", "11400-11431", free=32)
+    status = ProxyStatus(
+        settings=settings, ports=ports, domains=(domain,), problems=problems, uptime=uptime
+    )
+    facts = DoctorFacts(
+        admin="http://127.0.0.1:11312",
+        status=status,
+        probe=RangeProbe((PortProbe(11400, "host:11400", "ok", "unknown", "udp"),)),
+        advertise_host="host",
+        advertised_addresses=("192.0.2.10",),
+        names=names,
+        heard=heard,
+    )
+    findings = diagnose(facts)
+    assert failed(findings) == any(one.severity is Severity.ERROR for one in findings)
+    return {(one.check, one.subject): (one.severity, one.text + one.fix) for one in findings}
+
+
+def test_all_is_well() -> None:
+    told = found(DomainStatus(peers=("robot",), inside=(INSIDE,), outside=(OUTSIDE,)))
+    assert {severity for severity, _ in told.values()} == {Severity.OK}
+    assert "1 participant of Fast DDS" in told["inside", "domain 0"][1]
+
+
+def test_who_tells_nobody_is_told_what_to_give() -> None:
+    severity, text = found(DomainStatus(inside=(INSIDE,)))["announcing", "domain 0"]
+    assert severity is Severity.ERROR
+    assert "--ros2-peer" in text
+
+
+def test_who_hears_nobody_is_told_where_to_look() -> None:
+    told = found(DomainStatus(domain=7, ear="172.30.0.1:7500", discovery="10.0.0.1:11400"))
+    assert "ROS_DOMAIN_ID=7" in told["inside", "domain 7"][1]
+    assert "10.0.0.1:11400" in told["outside", "domain 7"][1]
+
+
+def test_a_range_that_is_too_short_and_a_port_that_is_not_reached() -> None:
+    short = ParticipantStatus("01.0f.cc", "172.30.0.6", problem="no port of 11400-11403 is free")
+    unheard = ParticipantStatus("01.10.dd", "10.0.0.8", proven=False)
+    told = found(
+        DomainStatus(
+            peers=("robot",), discovery="10.0.0.1:11400", inside=(short,), outside=(unheard,)
+        )
+    )
+    assert told["ports", "01.0f.cc"][0] is Severity.ERROR
+    assert told["reached", "01.10.dd"][0] is Severity.WARNING
+    assert "10.0.0.1" in told["reached", "01.10.dd"][1]
+
+
+TALKER = replace(INSIDE, publishes=("/chatter", "/scan"), services=("/add",))
+LISTENER = replace(OUTSIDE, subscribes=("/chatter", "/scan"))
+BOTH = DomainStatus(peers=("robot",), inside=(TALKER,), outside=(LISTENER,))
+MISMATCH = MismatchStatus(
+    "topic", "/scan", "reliability", "BEST_EFFORT", "RELIABLE", "01.0f.aa", "01.10.bb"
+)
+
+
+def test_a_topic_that_matches() -> None:
+    severity, text = found(BOTH, "/chatter")["topic", "/chatter"]
+    assert severity is Severity.OK
+    for part in ("01.0f.aa at 172.30.0.5", "01.10.bb at 10.0.0.9", "they match"):
+        assert part in text
+
+
+def test_a_topic_that_does_not_match() -> None:
+    told = found(replace(BOTH, mismatches=(MISMATCH,)), "/scan", "/chatter")
+    assert told["qos", "topic /scan"][0] is Severity.ERROR
+    assert ("topic", "/scan") not in told
+    assert ("topic", "/chatter") in told
+
+
+def test_who_can_t_be_reached_matches_nobody() -> None:
+    lost = replace(BOTH, inside=(replace(TALKER, locator_fault="tcp"),))
+    told = found(lost, "/chatter")
+    assert told["transport", "01.0f.aa"][0] is Severity.ERROR
+    assert ("topic", "/chatter") not in told
+
+
+@pytest.mark.parametrize(
+    ("domain", "said"),
+    [
+        (replace(BOTH, outside=(OUTSIDE,)), "nobody subscribes to it"),
+        (replace(BOTH, inside=(INSIDE,)), "nobody publishes it"),
+        (replace(BOTH, inside=(TALKER, replace(LISTENER)), outside=()), "on one side"),
+    ],
+)
+def test_a_topic_that_lacks_a_side(domain: DomainStatus, said: str) -> None:
+    severity, text = found(domain, "/chatter")["topic", "/chatter"]
+    assert severity is Severity.INFO
+    assert said in text
+
+
+def test_who_serves_a_service() -> None:
+    severity, text = found(BOTH, "/add")["service", "/add"]
+    assert severity is Severity.OK
+    assert "served by 01.0f.aa at 172.30.0.5" in text
+
+
+def test_a_name_that_nobody_has() -> None:
+    assert found(BOTH, "/chater")["name", "/chater"][0] is Severity.ERROR
+
+
+def test_who_is_on_a_network_inside_and_not_heard() -> None:
+    told = found(
+        BOTH,
+        heard=(
+            HeardParticipant(0, "01.0f.aa", "172.30.0.5", "Fast DDS"),
+            HeardParticipant(0, "01.0f.cc", "172.30.0.6", "Fast DDS"),
+            HeardParticipant(5, "01.10.dd", "172.30.0.7", "Cyclone DDS"),
+        ),
+    )
+    assert not any(subject == "01.0f.aa" for _, subject in told)
+    severity, text = told["range", "01.0f.cc"]
+    assert severity is Severity.WARNING
+    assert "at 172.30.0.6 (Fast DDS, inside)" in text
+    assert "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET" in text
+    severity, text = told["domain", "01.10.dd"]
+    assert severity is Severity.WARNING
+    assert "it is in domain 5; this proxy serves 0" in text
+    assert "--ros2-domain 5" in text
+
+
+def test_a_proxy_that_has_just_started_may_know_them_and_not_tell() -> None:
+    unknown = HeardParticipant(0, "01.0f.cc", "172.30.0.6", "Fast DDS")
+    assert not any(name == "01.0f.cc" for _, name in found(BOTH, heard=(unknown,), uptime=3.0))
+
+
+def test_what_was_refused_lately_is_told() -> None:
+    recent = ProblemStatus(10.0, "refused: no locator", "from 10.0.0.8: it names no locator (tcp)")
+    old = ProblemStatus(1000.0, "refused: not a peer", "from 10.0.0.7")
+    told = found(BOTH, problems=(recent, old))
+    assert told["refused", "refused: no locator"][0] is Severity.WARNING
+    assert ("refused", "refused: not a peer") not in told
+
+
+def test_nothing_is_heard_of_zenoh() -> None:
+    told = found(DomainStatus(peers=("robot",)))["inside", "domain 0"][1]
+    assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in told
