@@ -1,17 +1,17 @@
 """The command line ``rosproxy-operator``."""
 
-import contextlib
 import importlib.util
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
 from rosproxy import __version__
+from rosproxy.cli.main import main as proxy_main
 from rosproxy.cli.options import (
     BIND_ADDRESS,
     GROUP_SETTINGS,
@@ -21,11 +21,15 @@ from rosproxy.cli.options import (
     Commands,
     Parsed,
     Seconds,
+    config_option,
     log_options,
     setting_errors,
+    unknown_variables,
 )
 from rosproxy.net.addresses import HostPort, parse_host_port
 from rosproxy_operator.common.options import policy_options, proxy_bound_options
+from rosproxy_operator.common.words import fail, one_line
+from rosproxy_operator.docker import commands as docker_commands
 from rosproxy_operator.docker.options import bound_options
 from rosproxy_operator.docker.planner.model import MOST_PORTS, PlanSettings
 from rosproxy_operator.docker.settings import (
@@ -34,7 +38,8 @@ from rosproxy_operator.docker.settings import (
     read_shared_master_uri,
     read_uplink,
 )
-from rosproxy_operator.kubernetes.options import administrators_options, own_options
+from rosproxy_operator.kubernetes import commands as kubernetes_commands
+from rosproxy_operator.kubernetes.options import administrators_options, own_options, ros2_options
 from rosproxy_operator.kubernetes.settings import DEFAULT_ADMIN as CLUSTER_ADMIN
 from rosproxy_operator.kubernetes.settings import (
     DEFAULT_LIVENESS,
@@ -74,7 +79,9 @@ def _bind_option(
 
 
 def _admin_option(default: HostPort) -> Callable[[Command], Command]:
-    return _bind_option("--admin-bind", default, "Where /healthz, /readyz and /metrics are served.")
+    return _bind_option(
+        "--admin-bind", default, "Where /healthz, /readyz, /metrics and the live page are served."
+    )
 
 
 def _image_option(text: str) -> Callable[[Command], Command]:
@@ -151,6 +158,12 @@ def main() -> None:
     help="Who needs no route to the other side: outside alone, or (both) containers as well. Those "
     "on an internal network get both by themselves.",
 )
+@click.option(
+    "--udp",
+    is_flag=True,
+    help="Proxies of both directions publish their ports for UDP as well, so that UDPROS of nodes "
+    "outside reaches containers.",
+)
 @bound_options
 @proxy_bound_options
 @policy_options
@@ -175,6 +188,7 @@ def main() -> None:
 )
 @_admin_option(DEFAULT_ADMIN)
 @log_options
+@config_option
 @click.option(
     "--once",
     is_flag=True,
@@ -196,6 +210,7 @@ def docker(
     logs.set_up(log_format, log_level)
     for library in ("docker", "urllib3"):  # they tell of each request otherwise
         logging.getLogger(library).setLevel(logging.INFO)
+    unknown_variables(main, proxy_main)
     with setting_errors():
         context.obj = make_plan_settings(options)
     if context.invoked_subcommand is None:
@@ -207,7 +222,7 @@ def docker(
 def _need(library: str, extra: str) -> None:
     """Say how to install a library that one kind of controller needs, if it is not there."""
     if importlib.util.find_spec(library) is None:
-        _fail(
+        fail(
             f"the Python package {library} is not installed here: "
             f"pip install 'rosproxy[{extra}]' (in its sources: pip install '.[{extra}]')"
         )
@@ -221,7 +236,9 @@ def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> 
         with setting_errors():
             run(settings, resync, admin)
         return
-    with _one_line():
+    from rosproxy_operator.docker.errors import EngineError
+
+    with one_line(EngineError):
         problems = run_once(settings, resync)
     for problem in problems:
         text = clean(f"{problem.subject}: {problem.text}")
@@ -229,37 +246,15 @@ def _run(settings: PlanSettings, resync: float, admin: HostPort, once: bool) -> 
     sys.exit(1 if problems else 0)
 
 
-@docker.command()
-@click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
-@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
-@click.pass_obj
-def status(settings: PlanSettings, as_json: bool, watch: bool) -> None:
-    """Show the proxies, the labelled containers, their nodes, and what is wrong.
-
-    Needs no running controller.
-    """
-    if as_json and watch:
-        raise click.UsageError("--json or --watch, not both")
-    from rosproxy_operator.docker.status import show_status, watch_status
-
-    if watch:
-        watch_status(settings)
-    else:
-        with _one_line():
-            show_status(settings, as_json)
+for command in (docker_commands.status, docker_commands.plan, docker_commands.doctor):
+    docker.add_command(command)
 
 
-@docker.command()
-@click.pass_obj
-def plan(settings: PlanSettings) -> None:
-    """Show what the operator would do now, and change nothing."""
-    from rosproxy_operator.docker.status import show_plan
-
-    with _one_line():
-        show_plan(settings)
-
-
-@main.command(context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True})
+@main.group(
+    cls=OperatorCommands,
+    invoke_without_command=True,
+    context_settings={"auto_envvar_prefix": "ROSPROXY", "show_default": True},
+)
 @click.option(
     "--namespace",
     type=Parsed("name", read_namespace),
@@ -287,6 +282,7 @@ def plan(settings: PlanSettings) -> None:
     help="The nodes' net.ipv4.ip_local_port_range: no proxy gets a port of it.",
 )
 @administrators_options
+@ros2_options
 @proxy_bound_options
 @policy_options
 @own_options
@@ -324,7 +320,9 @@ def plan(settings: PlanSettings) -> None:
     "Where /healthz is served for the kubelet: it fails when any part hangs.",
 )
 @log_options
-def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
+@config_option
+@click.pass_context
+def kubernetes(context: click.Context, /, log_format: str, log_level: str, **options: Any) -> None:
     """Look after the RosProxies of a Kubernetes cluster.
 
     The cluster is the one that this runs in, else the one that KUBECONFIG names. Every option has
@@ -333,18 +331,25 @@ def kubernetes(log_format: str, log_level: str, **options: Any) -> None:
     for library in ("kubernetes", "kopf", "cryptography"):
         _need(library, "kubernetes")
     with setting_errors():
-        _run_kubernetes(make_kubernetes_settings(options), log_format, log_level)
+        settings = make_kubernetes_settings(options)
+        if context.invoked_subcommand is None:
+            _run_kubernetes(settings, log_format, log_level)
+    context.obj = settings.namespaces
+
+
+kubernetes.add_command(kubernetes_commands.doctor)
 
 
 def _run_kubernetes(settings: Any, log_format: str, log_level: str) -> None:
     from rosproxy.telemetry import logs
-    from rosproxy_operator.kubernetes.api import ApiError
+    from rosproxy_operator.kubernetes.api.client import ApiError
     from rosproxy_operator.kubernetes.run import run
-    from rosproxy_operator.kubernetes.watch import quieten
+    from rosproxy_operator.kubernetes.serving import quieten
 
     logs.set_up(log_format, log_level)
+    unknown_variables(main, proxy_main)
     quieten()
-    with _one_line(ApiError):
+    with one_line(ApiError):
         run(settings)
 
 
@@ -357,24 +362,4 @@ def health() -> None:
     try:
         AdminClient(url).get("/healthz", within=3.0)
     except AdminError as error:
-        _fail(error if "HTTP" in str(error) else f"no operator answers at {url}")
-
-
-@contextlib.contextmanager
-def _one_line(*more: type[Exception]) -> Iterator[None]:
-    """Tell in one line that the engine or the API server can't be asked."""
-    from rosproxy_operator.common.control_loop import LookFailed
-    from rosproxy_operator.docker.errors import EngineError
-
-    errors: tuple[type[Exception], ...] = (EngineError, LookFailed, *more)
-    try:
-        yield
-    except errors as error:
-        _fail(error)
-
-
-def _fail(reason: object) -> NoReturn:
-    from rosproxy.telemetry.text import clean
-
-    click.echo(f"rosproxy-operator: {clean(reason)}", err=True)
-    sys.exit(1)
+        fail(error if "HTTP" in str(error) else f"no operator answers at {url}")

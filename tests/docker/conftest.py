@@ -9,9 +9,10 @@ import pytest
 from tests.docker import images
 from tests.docker.controller import Controller, proxies, remove_proxies, running_controller
 from tests.docker.engine import docker, logs, running_engine
-from tests.docker.inside import Inside, inside
+from tests.docker.inside import Inside, inside, remove_leftovers
 from tests.docker.machines import Machine
 from tests.docker.robot import Robot, laptop, named_robot, robot_outside
+from tests.docker.ros2 import Inside2, Outside, machine_on_lan
 
 
 @pytest.hookimpl(wrapper=True)
@@ -31,6 +32,7 @@ def pytest_runtest_makereport(
 @pytest.fixture(scope="session", autouse=True)
 def _engine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with running_engine(tmp_path_factory.mktemp("engine") / "dockerd.log"):
+        remove_leftovers()
         yield
 
 
@@ -44,6 +46,15 @@ def proxy_image(_engine: None) -> str:
     return images.build_image(images.PROXY)
 
 
+@pytest.fixture
+def moving_image(proxy_image: str) -> Iterator[str]:
+    """A tag that tests give to other images."""
+    tag = "rosproxy-test-moving:latest"
+    docker("tag", proxy_image, tag)
+    yield tag
+    docker("rmi", "--force", tag, check=False)
+
+
 @pytest.fixture(scope="session")
 def controller_image(_engine: None) -> str:
     return images.build_image(images.OPERATOR)
@@ -52,6 +63,11 @@ def controller_image(_engine: None) -> str:
 @pytest.fixture(scope="session")
 def ros_image(_engine: None) -> str:
     return images.build_image(images.ROS)
+
+
+@pytest.fixture(scope="session")
+def ros2_image(_engine: None) -> str:
+    return images.build_image(images.ROS2)
 
 
 @pytest.fixture(scope="session")
@@ -81,8 +97,25 @@ def other_machine(ros_image: str, named: Robot) -> Iterator[Machine]:
         yield machine
 
 
+@pytest.fixture(scope="module")
+def lan(ros2_image: str) -> Iterator[Outside]:
+    """A machine outside with ROS 2, which hears this host's multicast."""
+    with machine_on_lan(ros2_image) as found:
+        yield found
+
+
+@pytest.fixture
+def inside2(ros2_image: str) -> Iterator[Inside2]:
+    """Where the nodes of ROS 2 inside live; all that a test makes there is removed after it."""
+    with inside(ros2_image, "") as made:
+        yield Inside2(made)
+
+
 @pytest.fixture(scope="session")
 def _no_other_controller(_engine: None) -> None:
+    """Where all proxies have the tests' image, a killed run has left them: they are taken away."""
+    if {proxy.image for proxy in proxies()} == {images.PROXY}:
+        remove_proxies()
     found = [proxy.name for proxy in proxies()]
     assert not found, f"a controller is at work on this engine, or has left its proxies: {found}"
 
@@ -128,6 +161,13 @@ def controller(
 def net(ros_image: str, named: Robot) -> Iterator[Inside]:
     """Where the nodes inside live; all that a test makes there is removed after it."""
     with inside(ros_image, named.master_uri) as made:
+        yield made
+
+
+@pytest.fixture
+def near(ros_image: str, robot: Robot) -> Iterator[Inside]:
+    """Where nodes live whose ROS_MASTER_URI has the robot's address."""
+    with inside(ros_image, robot.master_uri) as made:
         yield made
 
 

@@ -34,8 +34,20 @@ class Proxy:
         return f"{self.name}-ports"
 
     @property
+    def ear(self) -> str:
+        """The container that hears the LAN for it, if it is for ROS 2."""
+        return f"{self.name}-ear"
+
+    @property
     def id(self) -> str:
-        return str(inspect(self.name)["Id"])
+        """Its id; empty while there is none."""
+        return str(inspect(self.name, check=False).get("Id", ""))
+
+    @property
+    def image(self) -> str:
+        """The image it was made of, as it was named."""
+        found = inspect(self.name, check=False) or inspect(self.sandbox, check=False)
+        return str(found["Config"]["Image"]) if found else ""
 
     @property
     def ports(self) -> range:
@@ -95,7 +107,7 @@ def the_proxy(seconds: float = 30) -> Proxy:
 
 def remove_proxies() -> None:
     """Remove all proxies and the uplink."""
-    names = [*managed("proxy"), *managed("ports")]
+    names = [*managed("redirect"), *managed("ear"), *managed("proxy"), *managed("ports")]
     if names:
         docker("rm", "--force", *names, check=False, seconds=120)
     docker("network", "rm", UPLINK, check=False)
@@ -117,7 +129,7 @@ class Controller:
                       *words, check=check)  # fmt: skip
 
     def status(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.command("status", "--json"))
+        found: dict[str, Any] = json.loads(self.command("status", "--json", check=False))
         return found
 
     def problems(self) -> str:

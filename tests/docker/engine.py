@@ -51,6 +51,22 @@ def docker(
     return run("docker", *host, *arguments, check=check, seconds=seconds)
 
 
+def pause(container: str) -> None:
+    """Pause a container.
+
+    With version 1 of control groups runc tries to freeze a container for a moment and then gives
+    up, "a game of chances" in its authors' words (opencontainers/runc#2791): on a busy machine it
+    takes several calls.
+    """
+
+    def paused() -> bool:
+        said = docker("pause", container, check=False)
+        assert said == container or "unable to freeze" in said, said
+        return said == container
+
+    wait_until(paused, 30, f"{container} is paused")
+
+
 def engine_url() -> str:
     """The engine that is used now."""
     return os.environ.get("DOCKER_HOST") or "unix:///var/run/docker.sock"

@@ -9,13 +9,15 @@ knows what has not changed.
 import hashlib
 import os
 import tempfile
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
-from tests.docker.engine import ROOT, build, run, running_engine
+from tests.docker.engine import ROOT, build, docker, run, running_engine
 
 PROXY, OPERATOR, ROS = "rosproxy:test", "rosproxy-operator:test", "rosproxy-test-ros:latest"
+ROS2 = "rosproxy-test-ros2:latest"
 HAPROXY = "rosproxy-test-haproxy:latest"
 _HERE = ROOT / "tests/docker"
 
@@ -40,20 +42,32 @@ def build_image(name: str) -> str:
         OPERATOR: ("--target", "operator", ROOT),
         # A machine with ROS 1 on it.
         ROS: ("--file", _HERE / "ros.Dockerfile", ROOT / "tests/ros/nodes"),
+        # One with ROS 2, of two distributions, and with Cyclone DDS.
+        ROS2: ("--file", _HERE / "ros2.Dockerfile", ROOT / "tests/ros2"),
         HAPROXY: ("--file", _HERE / "haproxy.Dockerfile", _HERE),
     }
     return build(name, "--build-arg", f"BASE_IMAGE={base_image()}", *recipes[name])
 
 
+def update(tag: str) -> None:
+    """Give the tag to another image that does the same."""
+    made = docker("create", tag)
+    try:
+        docker("commit", "--change", f"LABEL made={time.time()}", made, tag)
+    finally:
+        docker("rm", made)
+
+
 def main() -> None:
-    """Build the images of proxy, operator and robot."""
+    """Build the images of proxy, operator and robots."""
     log = Path(tempfile.mkdtemp()) / "dockerd.log"
     with running_engine(log), ThreadPoolExecutor() as pool:
         base_image()
-        robot = pool.submit(build_image, ROS)
+        robots = [pool.submit(build_image, name) for name in (ROS, ROS2)]
         for name in (PROXY, OPERATOR):  # which have their first steps in common
             build_image(name)
-        robot.result()
+        for robot in robots:
+            robot.result()
 
 
 if __name__ == "__main__":

@@ -6,12 +6,14 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from tests.docker.engine import containers, docker, inspect, logs
 from tests.docker.nodes import Log, node_command
 
-MARK = f"test.of.rosproxy={os.getpid()}"
+_LABEL = "test.of.rosproxy"
+MARK = f"{_LABEL}={os.getpid()}"
 ENABLE = "rosproxy.enable=true"
 _numbers = itertools.count(1)
 
@@ -107,15 +109,24 @@ def inside(image: str, master_uri: str) -> Iterator[Inside]:
         remove_marked()
 
 
-def remove_marked() -> None:
-    """Remove all containers and networks that the tests have made."""
-    found = [one["Id"] for one in containers(MARK)]
+def remove_marked(mark: str = MARK) -> None:
+    """Remove all containers and networks that the tests have made, here or with another mark."""
+    found = [one["Id"] for one in containers(mark)]
     if found:
         docker("rm", "--force", *found, check=False, seconds=120)
-    for network in docker("network", "ls", "--quiet", "--filter", f"label={MARK}").split():
+    for network in docker("network", "ls", "--quiet", "--filter", f"label={mark}").split():
         for container in attached(network):
             docker("network", "disconnect", "--force", network, container, check=False)
         docker("network", "rm", network, check=False)
+
+
+def remove_leftovers() -> None:
+    """Remove what runs have made whose process is gone, killed before it could."""
+    labels = docker("ps", "--all", "--format", f'{{{{.Label "{_LABEL}"}}}}').split()
+    labels += docker("network", "ls", "--format", f'{{{{.Label "{_LABEL}"}}}}').split()
+    for pid in set(labels):
+        if not Path(f"/proc/{pid}").exists():
+            remove_marked(f"{_LABEL}={pid}")
 
 
 def attached(network: str) -> list[str]:

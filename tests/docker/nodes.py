@@ -1,4 +1,4 @@
-"""The test nodes of tests/ros, in containers and on machines, and what they print."""
+"""The test nodes of tests/ros and tests/ros2, in containers and on machines, what they print."""
 
 import itertools
 import re
@@ -11,7 +11,7 @@ LIBRARIES = ("rospy", "roscpp")
 UNNOTICED = 10.0
 """Seconds without a message that a busy machine may cause by itself; see also `Log.lost`."""
 _PROGRAMS = {"rospy": ("python3", "/nodes/node.py"), "roscpp": ("/nodes/node",)}
-_GOT = re.compile(r"^(got|reply|sent) (\S+) (\d+) size \d+ crc \w+ at ([\d.]+)", re.MULTILINE)
+_GOT = re.compile(r"^(got|reply|sent) (\S+) (\d+) size \d+(?: crc \w+)? at ([\d.]+)", re.MULTILINE)
 
 
 def node_command(library: str, role: str, *options: str) -> tuple[str, ...]:

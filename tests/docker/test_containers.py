@@ -8,7 +8,7 @@ import time
 import pytest
 
 from tests.docker.controller import Controller, proxies, the_proxy
-from tests.docker.engine import docker, wait_until
+from tests.docker.engine import docker, pause, wait_until
 from tests.docker.inside import Container, Inside
 from tests.docker.nodes import LIBRARIES
 from tests.docker.robot import Robot
@@ -79,7 +79,7 @@ def test_paused_container_keeps_its_registrations(
         ear.wait_for("inside")
         uri = named.uri(node.node)
 
-        docker("pause", node.name)
+        pause(node.name)
         wait_until(lambda: silent_for(ear.got()[-1].at, 4), 60, "nothing is heard any more")
         assert named.uri(node.node) == uri
         docker("unpause", node.name)

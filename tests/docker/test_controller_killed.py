@@ -136,7 +136,7 @@ def test_traffic_goes_on_without_the_controller(
         flow.wait(since=time.time())
         controller.start()
         wait_until(lambda: "health and metrics" in controller.logs(), 60, controller.logs)
-        controller.command("status")
+        controller.command("status", "--wait", "60")
         flow.wait(since=time.time())
 
         gaps = flow.gaps(before)

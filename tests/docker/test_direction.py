@@ -53,5 +53,34 @@ def test_the_label_alone_is_enough(controller: Controller, net: Inside, named: R
     ) as flow:
         flow.wait()
         assert told_direction() == "both"
-        found = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
+        found = json.loads(
+            docker("exec", the_proxy().name, "rosproxy", "status", "--json", check=False)
+        )
         assert sum(one["connections"] for one in found["stand_ins"]) > 0
+
+
+def test_udpros_of_the_robot_reaches_a_container_that_asks_for_it(
+    controller: Controller, net: Inside, named: Robot
+) -> None:
+    """And the reverse, for which no port is published; also after the proxy was removed."""
+    network, words = net.network("--internal"), ("--topic", "/quick", "--udp", "1")
+    back = ("--topic", "/back", "--rate", "20", "--word", "back")
+    named.node("mouth", "roscpp", "pub", "--topic", "/quick", "--rate", "20", "--word", "quick")
+    listener = net.node(network, "roscpp", "sub", *words, labels=(ENABLE, "rosproxy.udp=true"))
+    net.node(network, "roscpp", "pub", *back)
+    ear = named.node("ear", "roscpp", "sub", "--topic", "/back", "--udp", "1")
+    try:
+        listener.log.wait_for("quick", count=10)
+        ear.wait_for("back", count=10)
+        found = json.loads(docker("exec", the_proxy().name, "rosproxy", "status", "--json"))
+        assert {row["topic"] for row in found["udpros"]} == {"/quick", "/back"}
+
+        lost = time.time()
+        docker("rm", "--force", the_proxy().name)
+
+        listener.log.wait_for("quick", count=10, since=recovered(lost))
+        ear.wait_for("back", count=10, since=recovered(lost))
+    finally:
+        named.end("mouth")
+        named.end("ear")
+    assert "Traceback" not in controller.logs()

@@ -17,7 +17,8 @@ from tests.docker.private_engine import PrivateEngine, private_engine
 from tests.docker.robot import Robot, named_robot
 
 NUMBER = 84
-RESTART = ("--restart", "unless-stopped")
+RESTART = ("--restart", "always")
+LIVE = ("--live-restore",)
 
 
 @pytest.fixture(scope="module")
@@ -72,23 +73,33 @@ def ears(
         }
 
 
+@pytest.mark.parametrize(("how", "then"), [(signal.SIGKILL, ()), (signal.SIGTERM, LIVE)])
 def test_everything_comes_back_with_the_engine(
-    engine: PrivateEngine, controller: Process, ears: dict[str, Log]
+    how: signal.Signals,
+    then: tuple[str, ...],
+    engine: PrivateEngine,
+    controller: Process,
+    ears: dict[str, Log],
 ) -> None:
-    """The engine starts the containers again; their addresses may be others."""
+    """The engine ends the containers, at the latest when it is back, and starts them again.
+
+    Their addresses may be others.
+    """
     for ear in ears.values():
         ear.wait_for("inside")
     ports, process = the_proxy().ports, controller.process
 
-    engine.end()
+    engine.end(how)
     assert process is not None
     assert process.poll() is None, controller.logs()
-    engine.start("--live-restore")
+    engine.start(*then)
     began = time.time()
 
     for library, ear in ears.items():
         heard = ear.wait_for("inside", since=began, seconds=60)
-        print(f"{library}: heard {heard - began:.1f} s after the engine was there again")
+        print(
+            f"{how.name}, {library}: heard {heard - began:.1f} s after the engine was there again"
+        )
     assert the_proxy().ports == ports
     assert process.poll() is None, controller.logs()
 
@@ -102,7 +113,7 @@ def test_nobody_notices_an_engine_with_live_restore(
 
     engine.end(how)
     time_without = time.time()
-    engine.start("--live-restore")
+    engine.start(*LIVE)
 
     for ear in ears.values():
         ear.wait_for("inside", since=time.time())

@@ -11,9 +11,15 @@ import pytest
 from tests.docker.controller import UPLINK, remove_proxies, the_proxy
 from tests.docker.engine import ROOT, compose, docker, inspect, wait_until
 from tests.docker.robot import Robot
+from tests.docker.ros2 import HERE, THERE, Outside, wait_for_line
 
 EXAMPLES = ROOT / "examples/docker"
+BY_ADDRESS = EXAMPLES / "by-address"
+ROS2 = EXAMPLES / "ros2"
 SOCKET_PROXY = EXAMPLES / "socket-proxy"
+
+
+STATUS = ("exec", "-T", "operator", "rosproxy-operator", "docker", "status", "--wait", "60")
 
 
 @dataclass
@@ -41,9 +47,16 @@ def example(
     extra.write_text(f"services:\n  operator:\n    extra_hosts: {hosts}\n")
     variables = {"ROS_MASTER_URI": robot.master_uri, "ADVERTISE_HOST": robot.host_address}
     found = Example(directory, {**variables, **images}, extra)
+    with running(found):
+        yield found
+
+
+@contextmanager
+def running(found: Example) -> Iterator[None]:
+    """An example that is up, and of which nothing is left in the end."""
     try:
         found.compose("up", "--detach", "--no-build")
-        yield found
+        yield
     finally:
         print(found.compose("logs", "operator"))
         found.compose("rm", "--stop", "--force", "talker", "listener")
@@ -82,7 +95,7 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
     with example(EXAMPLES, named, images, tmp_path) as found:
         works_both_ways(found, named)
 
-        status = found.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
+        status = found.compose(*STATUS)
         assert the_proxy().name in status
         assert "talker" in status
         assert "listener" in status
@@ -90,6 +103,19 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
 
         found.compose("rm", "--stop", "--force", "talker", "listener")
         wait_until(lambda: not the_proxy().networks, 5, "the proxy has left the network")
+
+
+@pytest.mark.usefixtures("_no_other_controller")
+def test_example_with_a_master_by_address(
+    robot: Robot, images: dict[str, str], tmp_path: Path
+) -> None:
+    """Its services are stock ones, but for the label."""
+    with example(BY_ADDRESS, robot, images, tmp_path) as found:
+        assert found.variables["ROS_MASTER_URI"] == f"http://{robot.address}:11311"
+        works_both_ways(found, robot)
+
+        status = found.compose("exec", "-T", "operator", "rosproxy-operator", "docker", "status")
+        assert status.count(f"{robot.address}:11311 leads to its proxy there") == 2
 
 
 @pytest.mark.usefixtures("_no_other_controller")
@@ -124,9 +150,43 @@ def test_socket_proxy_allows_what_the_operator_calls() -> None:
     assert calls == [(verb.upper(), path.replace("/v[0-9.]+", "")) for verb, path in allowed]
 
 
+@pytest.mark.usefixtures("_no_other_controller")
+@pytest.mark.parametrize(
+    "variables",
+    [
+        pytest.param({"ADVERTISE_HOST": HERE}, id="lan"),
+        pytest.param({"ADVERTISE_HOST": HERE, "ROS2_LAN": "none", "ROS2_PEERS": THERE}, id="peers"),
+    ],
+)
+def test_example_with_ros_2(
+    variables: dict[str, str],
+    lan: Outside,
+    images: dict[str, str],
+    ros2_image: str,
+    tmp_path: Path,
+) -> None:
+    extra = tmp_path / "none.yaml"
+    extra.write_text("services: {}\n")
+    found = Example(ROS2, {**variables, **images, "ROS2_IMAGE": ros2_image}, extra)
+    try:
+        with running(found):
+            ear = lan.node("jazzy", "sub", "/chatter")
+            lan.node("jazzy", "pub", "/command", "--word", "hello")
+            wait_for_line(ear.log, "^got hello from inside ")
+            wait_until(
+                lambda: found.compose("logs", "listener").count("hello ") >= 3, 30,
+                lambda: found.compose("logs", "listener"),
+            )  # fmt: skip
+            status = found.compose(*STATUS)
+            assert "domain 0" in status
+            assert status.count("1 participant") == 2
+    finally:
+        lan.end()
+
+
 def test_examples_need_no_more_than_their_readme_says() -> None:
     """A variable without a default is one that the README tells to set."""
-    for directory in (EXAMPLES, SOCKET_PROXY):
+    for directory in (EXAMPLES, BY_ADDRESS, SOCKET_PROXY, ROS2):
         needed = set(re.findall(r"\$\{(\w+):\?", (directory / "compose.yaml").read_text()))
         told = set(re.findall(r"export (\w+)=", (directory / "README.md").read_text()))
         assert needed == told, directory

@@ -95,7 +95,7 @@ def test_proxy_containers_have_no_rights(controller: Controller, net: Inside) ->
         assert not host["Privileged"]
         assert not found["Mounts"]
         assert any(option.startswith("no-new-privileges") for option in host["SecurityOpt"])
-        assert host["RestartPolicy"]["Name"] == "unless-stopped"
+        assert host["RestartPolicy"]["Name"] == "always"
 
 
 def test_publishes_what_is_asked_for_by_ipv4_only(controller: Controller, net: Inside) -> None:

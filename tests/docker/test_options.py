@@ -1,12 +1,13 @@
 """Controllers with options of their own."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
 from tests.docker.controller import Controller, Proxy, managed, the_proxy
 from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.images import update
 from tests.docker.inside import ENABLE, Inside
 from tests.docker.nodes import LIBRARIES
 from tests.docker.robot import Robot
@@ -34,15 +35,6 @@ def test_master_of_the_controller_serves_those_who_name_none(
     wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
 
 
-@pytest.fixture
-def moving_image(proxy_image: str) -> Iterator[str]:
-    """A tag that tests give to other images."""
-    tag = "rosproxy-test-moving:latest"
-    docker("tag", proxy_image, tag)
-    yield tag
-    docker("rmi", "--force", tag, check=False)
-
-
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_updated_image_replaces_the_proxy(
     library: str, start_controller: Callable[..., Controller], moving_image: str, net: Inside,
@@ -56,20 +48,11 @@ def test_updated_image_replaces_the_proxy(
 
         update(moving_image)
 
-        wait_until(lambda: the_proxy().id != number, 60, "another container")
+        wait_until(lambda: the_proxy().id not in ("", number), 60, "another container")
         flow.wait(since=time.time())
         print(f"image updated: {flow.gaps(changed)}")
         after = the_proxy()
         assert (after.name, after.ports, secret(after)) == (name, ports, token)
-
-
-def update(tag: str) -> None:
-    """Give the tag to another image that does the same."""
-    made = docker("create", tag)
-    try:
-        docker("commit", "--change", f"LABEL made={time.time()}", made, tag)
-    finally:
-        docker("rm", made)
 
 
 def secret(proxy: Proxy) -> str:

@@ -8,7 +8,7 @@ from datetime import datetime
 import pytest
 
 from tests.docker.controller import Controller, Proxy, proxies, the_proxy
-from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.engine import docker, inspect, pause, wait_until
 from tests.docker.inside import Inside
 from tests.docker.robot import Robot
 from tests.docker.traffic import Traffic, crash, traffic
@@ -101,7 +101,7 @@ def started(proxy: Proxy) -> float:
 def test_paused_proxy_is_resumed(flow: Traffic) -> None:
     proxy = the_proxy()
 
-    docker("pause", proxy.name)
+    pause(proxy.name)
 
     wait_until(lambda: proxy.running, 60, "it is resumed")
     flow.wait(since=time.time())

@@ -88,10 +88,11 @@ def test_names_a_bad_setting_and_exits(proxy_image: str, container_name: str) ->
     assert len(logged.splitlines()) == 1
 
 
-def test_adds_little_to_its_base(proxy_image: str) -> None:
-    """What the build adds to a base that has Python."""
-    measure = ("--entrypoint", "du", proxy_image, "-sm", "/opt/rosproxy")
-    assert int(docker("run", "--rm", *measure).split()[0]) <= 25
+@pytest.mark.parametrize(("image", "most"), [("proxy_image", 25), ("controller_image", 135)])
+def test_adds_little_to_its_base(image: str, most: int, request: pytest.FixtureRequest) -> None:
+    """What the build adds to a base that has Python, in MiB."""
+    measure = ("--entrypoint", "du", request.getfixturevalue(image), "-sm", "/opt/rosproxy")
+    assert int(docker("run", "--rm", *measure).split()[0]) <= most
 
 
 def test_ships_no_installer(proxy_image: str) -> None:

@@ -21,6 +21,22 @@ class Move:
     at: float
 
 
+def after_move(ros1: bool, ros2: bool) -> str:
+    """What becomes of those behind a proxy that had to leave its range, and what to do.
+
+    ROS 1's nodes have to register anew. Participants of ROS 2 meet anew by themselves, if the
+    operator has seen what ports they had.
+    """
+    lost = []
+    if ros1:
+        text = "nodes that had registered under the old ones can't be reached: restart them"
+        lost.append(text)
+    if ros2:
+        text = "participants of ROS 2 meet outside anew; restart those that do not in a minute"
+        lost.append(text)
+    return "; ".join(lost)
+
+
 class PortsExhausted(Exception):
     """A window has not as many free ports in a row as were asked for.
 

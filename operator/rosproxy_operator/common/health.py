@@ -1,4 +1,4 @@
-"""The operator's own endpoint: /healthz, /readyz, /metrics."""
+"""The operator's own endpoint: /healthz, /readyz, /metrics, and the live page of its proxies."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,18 +8,20 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from rosproxy.net.addresses import HostPort
+from rosproxy.page.routes import Page
 from rosproxy.settings import SettingError
 
-GREETING = "rosproxy-operator: /healthz /readyz /metrics\n"
 Check = Callable[[], str | None]
 
 
 class HealthServer:
     """Serves what orchestrators ask. ``alive`` and ``ready`` give None or the reason why not."""
 
-    def __init__(self, metrics: CollectorRegistry, alive: Check, ready: Check) -> None:
+    def __init__(self, metrics: CollectorRegistry, alive: Check, ready: Check, page: Page) -> None:
+        self._page = page
         app = web.Application()
-        app.router.add_get("/", _greet)
+        for (method, path), handler in page.routes.items():
+            app.router.add_route(method, path, handler)
         app.router.add_get("/healthz", partial(_check, alive))
         app.router.add_get("/readyz", partial(_check, ready))
         app.router.add_get("/metrics", partial(_show, metrics))
@@ -36,11 +38,8 @@ class HealthServer:
 
     async def stop(self) -> None:
         """Stop listening."""
+        await self._page.close()
         await self._runner.cleanup()
-
-
-async def _greet(request: web.Request) -> web.Response:
-    return web.Response(text=GREETING)
 
 
 async def _check(check: Check, request: web.Request) -> web.Response:

@@ -2,13 +2,26 @@
 
 import re
 from collections import Counter as Tally
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, ProcessCollector
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    Info,
+    ProcessCollector,
+    disable_created_metrics,
+)
 
 from rosproxy import __version__
 
+# A second series for each counter: when it began, which nobody asks for.
+disable_created_metrics()  # type: ignore[no-untyped-call]
+
+OUTCOMES = ("ok", "unavailable", "failed")
+"""How a look ends."""
 STATES = ("created", "restarting", "running", "paused", "exited", "dead", "removing")
 """The states of a container, in the engine's words."""
 POD_STATES = ("ready", "starting", "stuck")
@@ -36,6 +49,8 @@ class CommonMetrics:
         )
         text = f"Looks at the {of} by outcome (ok, unavailable, failed)."
         self.looks = self._counter("looks", text, ["outcome"])
+        for outcome in OUTCOMES:  # one that begins with 1 has no increase, for an alert
+            self.looks.labels(outcome)
         text = "Time for a look: listing everything and planning."
         self.look_time = Histogram(
             "look_seconds", text, namespace=_PREFIX, registry=registry, buckets=_BUCKETS
@@ -45,12 +60,19 @@ class CommonMetrics:
         self.up = self._gauge(up, f"Whether the {of} answers.")
         self.problems = self._gauge("problems", "Problems that are there now.")
         self.proxies = self._gauge("proxies", "Proxies by state.", ["state"])
+        text = "What is to be done, by state (busy, failed: it is tried again)."
+        self._jobs = self._gauge("jobs", text, ["state"])
 
     def show_proxies(self, states: Iterable[str]) -> None:
         """Set the number of proxies in each state."""
         tally = Tally(states)
         for state in self._states:
             self.proxies.labels(state).set(tally[state])
+
+    def watch_jobs(self, busy: Callable[[], int], failed: Callable[[], int]) -> None:
+        """Ask for what is to be done whenever somebody reads the metrics."""
+        self._jobs.labels("busy").set_function(busy)
+        self._jobs.labels("failed").set_function(failed)
 
     def count(self, action: object, outcome: str) -> None:
         """Count an action, named after its class."""
@@ -73,9 +95,23 @@ class ClusterMetrics(CommonMetrics):
         super().__init__("API server", "cluster", POD_STATES, up="api_up")
         self.rosproxies = self._gauge("rosproxies", "RosProxies that can be read.")
         self.pods = self._gauge("pods", "Running pods that a RosProxy selects.")
+        text = "Participants of ROS 2 behind the proxies, by domain."
+        self.participants = self._gauge("participants", text, ["domain"])
         text = "Pods at admission by outcome (wired, left, failed)."
         self.admissions = self._counter("admissions", text, ["outcome"])
         text = "When the admission webhook's certificate expires, in seconds of Unix time."
         self.certificate_expiry = self._gauge("certificate_expiry_seconds", text)
-        text = "How often watching had to be started anew; looks go on meanwhile."
+        text = "Whether this operator leads: of several, one acts."
+        self.leader = self._gauge("leader", text)
+        text = "How often another operator was seen to lead than before."
+        self.leader_changes = self._counter("leader_changes", text)
+        text = "How often a watch was lost, or had to begin anew."
         self.watch_restarts = self._counter("watch_restarts", text)
+        text = "Objects of which the watches had told something else than a full list."
+        self.view_corrections = self._counter("view_corrections", text)
+
+    def show_participants(self, domains: Mapping[int, int]) -> None:
+        """Set the number of participants in each domain that has a proxy."""
+        self.participants.clear()
+        for domain, count in domains.items():
+            self.participants.labels(str(domain)).set(count)

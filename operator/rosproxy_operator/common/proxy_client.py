@@ -1,21 +1,36 @@
 """Asking and telling running proxies, over their admin endpoints."""
 
+import asyncio
 import errno
+import socket
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
+from urllib.parse import quote
 
 import aiohttp
 import msgspec
 
 from rosproxy.access.layers import PolicyLayer, layers_as_json
-from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status
+from rosproxy.admin.status_document import NotAStatus, ProxyStatus, parse_status, read_status
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.http_client import TooLong, read_bounded
+from rosproxy.page.document import Document
+from rosproxy_operator.common.merged_page import read_document
 
 Json = dict[str, Any]
 WITHIN = 3.0
 """Seconds that a proxy has to answer."""
+PAGES_AT_ONCE = 8
+"""Proxies that are asked for their page at the same time."""
+LONGEST = 16 * 1024 * 1024
+"""Bytes of an answer at most. A proxy that somebody has taken over leads its operator nowhere: no
+redirect is followed, and nothing is inflated."""
+WITHIN_PAGE = 12.0
+"""The same where it makes the page's document first, for which it may take ten."""
 WITHIN_MASTER = 40.0
 """The same where it asks its master first, which may hang for 30 s."""
+_KEEP_ALIVE = {socket.TCP_KEEPIDLE: 10, socket.TCP_KEEPINTVL: 3, socket.TCP_KEEPCNT: 3}
+"""Seconds of silence, seconds between questions, and how many go unanswered, see tcp(7)."""
 
 
 class ProxyError(Exception):
@@ -49,6 +64,53 @@ class ProxyClient:
         except NotAStatus:
             raise _no_rosproxy(where) from None
 
+    async def changes(
+        self, where: HostPort, token: str, since: str, within: float
+    ) -> tuple[str, ProxyStatus]:
+        """Its status and the version of that, once it is another version than ``since``.
+
+        After ``within`` seconds in any case. A proxy of a former release does not know this (404).
+        """
+        path = f"/status/changes?since={quote(since)}&within={within:g}"
+        found = _read(await self._ask("GET", where, path, token, within=within + WITHIN), where)
+        version, status = found.get("version"), found.get("status")
+        if not isinstance(version, str):
+            raise _no_rosproxy(where)
+        try:
+            return version, read_status(status)
+        except NotAStatus:
+            raise _no_rosproxy(where) from None
+
+    async def document(self, where: HostPort, token: str) -> Document:
+        """What a proxy's live page shows."""
+        try:
+            text = await self._ask("GET", where, "/graph", token, within=WITHIN_PAGE)
+        except ProxyError as error:
+            if error.status == 404:
+                text = "it has no live page: its image is that of a former release"
+                raise ProxyError(text, status=404) from None
+            raise
+        try:
+            return read_document(text)
+        except ValueError:
+            raise _no_rosproxy(where) from None
+
+    async def documents(
+        self, proxies: Mapping[str, tuple[HostPort, str]]
+    ) -> dict[str, Document | str]:
+        """The same of many, by their names; of one that can't be asked why."""
+        room = asyncio.Semaphore(PAGES_AT_ONCE)
+
+        async def ask(where: HostPort, token: str) -> Document | str:
+            async with room:
+                try:
+                    return await self.document(where, token)
+                except ProxyError as error:
+                    return str(error)
+
+        found = await asyncio.gather(*(ask(*way) for way in proxies.values()))
+        return dict(zip(proxies, found, strict=True))
+
     async def master_address(self, where: HostPort, token: str, address: str) -> None:
         """Tell where the master's host is now."""
         await self._ask("POST", where, "/master-address", token, {"address": address})
@@ -80,9 +142,25 @@ class ProxyClient:
             if error.status not in (404, 503):
                 raise
 
-    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
-        """Tell which addresses may use it as their master: those of what its labels select."""
-        await self._ask("POST", where, "/containers", token, {"selected": sorted(addresses)})
+    async def selected(
+        self,
+        where: HostPort,
+        token: str,
+        addresses: Collection[str],
+        peers: Collection[str] | None = None,
+        former: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
+        """Tell which addresses may use it as their master: those of what its labels select.
+
+        And its peers of ROS 2, and the ports of participants at the proxy before it, by their GUID
+        prefixes, if there are any to be told.
+        """
+        body: dict[str, Any] = {"selected": sorted(addresses)}
+        if peers is not None:
+            body["peers"] = sorted(peers)
+        if former:
+            body["former"] = {prefix: list(ports) for prefix, ports in former.items()}
+        await self._ask("POST", where, "/containers", token, body)
 
     async def retire(self, where: HostPort, token: str) -> Json:
         """Let it unregister everything it holds at the master."""
@@ -104,23 +182,38 @@ class ProxyClient:
     ) -> str:
         """The body of the answer, if that is HTTP 200."""
         if self._session is None:
-            self._session = aiohttp.ClientSession()
+            # One connection for each proxy that is waited for; who asks bounds the others.
+            connector = aiohttp.TCPConnector(limit=0, socket_factory=_kept_alive)
+            self._session = aiohttp.ClientSession(connector=connector, auto_decompress=False)
         limits = aiohttp.ClientTimeout(total=within, sock_connect=WITHIN)
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        headers = {"Accept-Encoding": "identity"}
+        if token:
+            headers["Authorization"] = f"Bearer {token}"
         url = f"http://{where}{path}"
         try:
             async with self._session.request(
-                method, url, json=body, headers=headers, timeout=limits
+                method, url, json=body, headers=headers, timeout=limits, allow_redirects=False
             ) as reply:
-                text = await reply.text()
+                text = (await read_bounded(reply.content, LONGEST)).decode(errors="replace")
                 if reply.status == 200:
                     return text
                 message = f"{method} {url} answers HTTP {reply.status}: {text.strip()[:200]}"
                 raise ProxyError(message, status=reply.status)
         except TimeoutError:
             raise ProxyError(f"{where} does not answer", away=True) from None
+        except TooLong:
+            raise _no_rosproxy(where) from None
         except (OSError, aiohttp.ClientError) as error:
             raise _no_answer(where, error) from None
+
+
+def _kept_alive(info: aiohttp.AddrInfoType) -> socket.socket:
+    """A socket by which the kernel notices that a machine is gone while nothing is sent."""
+    found = socket.socket(family=info[0], type=info[1], proto=info[2])
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in _KEEP_ALIVE.items():
+        found.setsockopt(socket.IPPROTO_TCP, option, value)
+    return found
 
 
 def _read(text: str, where: HostPort) -> Json:

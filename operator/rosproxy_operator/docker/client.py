@@ -27,6 +27,8 @@ READ_TIMEOUT = 20
 """Seconds that the engine has to answer a question."""
 WRITE_TIMEOUT = 300
 """Seconds that it has to do something: publishing or freeing 1000 ports takes it a minute."""
+RUN_TIMEOUT = 60
+"""Seconds for a command in a container: the doctor tries what may not answer."""
 FILTERS = {
     "type": ["container", "network", "image"],
     "event": [
@@ -71,6 +73,12 @@ class DockerClient:
             return str(self._call(READ_TIMEOUT, "inspect_image", image)["Id"])
         except Gone:
             return ""
+
+    def run(self, container: str, *command: str) -> bytes:
+        """What a command prints in a running container, to its end."""
+        made = self._call(READ_TIMEOUT, "exec_create", container, list(command), stderr=False)
+        found: bytes = self._call(RUN_TIMEOUT, "exec_start", made["Id"])
+        return found
 
     def events(self) -> Iterator[Json]:
         """What happens from now on that may change a plan; ends when the connection does.
@@ -131,11 +139,11 @@ class DockerClient:
             raise Unavailable(f"what answers at {self.url} is no Docker engine: {error}") from error
 
 
-def listen(engine: DockerClient, tell: Callable[[bool], None]) -> None:
+def listen(engine: DockerClient, tell: Callable[[Json | None], None]) -> None:
     """Listen to the engine for good, in a thread of its own. Needs a running event loop.
 
-    ``tell`` is called in the event loop, with False when something has changed and with True after
-    each connect: the engine is there, and what happened before that was missed.
+    ``tell`` is called in the event loop, with each event of FILTERS, and with None after each
+    connect: the engine is there, and what happened before that was missed.
     """
     loop = asyncio.get_running_loop()
 
@@ -146,9 +154,9 @@ def listen(engine: DockerClient, tell: Callable[[bool], None]) -> None:
             with contextlib.suppress(EngineError, RuntimeError):
                 events = engine.events()
                 failures = 0
-                loop.call_soon_threadsafe(tell, True)
-                for _ in events:
-                    loop.call_soon_threadsafe(tell, False)
+                loop.call_soon_threadsafe(tell, None)
+                for event in events:
+                    loop.call_soon_threadsafe(tell, event)
             time.sleep(PAUSES[min(failures, len(PAUSES) - 1)])
             failures += 1
 

@@ -15,13 +15,16 @@ import time
 from rosproxy import __version__
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
+from rosproxy.page.document import Document
 from rosproxy_operator.common.control_loop import ControlLoop, LookFailed, Pace
 from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import DockerMetrics
+from rosproxy_operator.common.operator_page import operator_page
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.proxy_client import ProxyClient
 from rosproxy_operator.common.resolver import AGAIN_UNRESOLVED, MasterResolver
-from rosproxy_operator.docker.client import DockerClient, listen
+from rosproxy_operator.docker import engine_json
+from rosproxy_operator.docker.client import DockerClient, Json, listen
 from rosproxy_operator.docker.errors import EngineError, Unavailable
 from rosproxy_operator.docker.executor import DockerApplier, Executor
 from rosproxy_operator.docker.planner.model import PlanSettings
@@ -61,7 +64,8 @@ def run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
 async def _run(settings: PlanSettings, resync: float, admin: HostPort) -> None:
     metrics = DockerMetrics()
     controller = DockerController(settings, resync, metrics)
-    health = HealthServer(metrics.registry, controller.dead, controller.unready)
+    page = operator_page(controller.documents)
+    health = HealthServer(metrics.registry, controller.dead, controller.unready, page)
     await health.start(admin)
     log.info("rosproxy-operator %s: health and metrics at http://%s", __version__, admin)
     running = asyncio.create_task(controller.run())
@@ -86,7 +90,8 @@ class DockerController:
         self._masters = MasterResolver(loop.wake)
         self._observer = DockerObserver(engine, settings, self._masters, loop.wake)
         self._applier = DockerApplier(engine, settings, self._proxies)
-        self._executor = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
+        self._executor = doing = Executor(self._tasks, loop.wake, self._port_taken, metrics.count)
+        metrics.watch_jobs(lambda: len(doing.busy), lambda: len(doing.problems))
         self._proxy_sync = DockerProxySync(self._tasks, self._proxies, settings, loop.wake)
         self._memory = DockerMemory()
         self._shown: list[Problem] = []
@@ -113,6 +118,12 @@ class DockerController:
             return self._unsolved()
         finally:
             await self._close()
+
+    async def documents(self) -> dict[str, Document | str]:
+        """What the live pages of all running proxies show, or why one can't be asked."""
+        access = self._last[0].access if self._last else {}
+        where = {name: (one.admin, one.token) for name, one in access.items()}
+        return await self._proxies.documents(where)
 
     async def look(self) -> float | None:
         """One look and what follows from it; when to look again. Raises LookFailed."""
@@ -193,10 +204,13 @@ class DockerController:
     def _port_taken(self, name: str, port: int | None) -> None:
         self._memory = self._memory.port_taken(name, port, time.monotonic())
 
-    def _hear(self, connected: bool) -> None:
-        """Take note of an event, or of a new connection: what happened before was missed."""
-        if connected:
+    def _hear(self, event: Json | None) -> None:
+        """Take note of an event; None is a new connection: what happened before was missed."""
+        if event is None:
+            self._observer.doubt(None)
             self._loop.retry()
+        elif container := engine_json.container_of(event):
+            self._observer.doubt(container)
         self._loop.wake()
         self._loop.wake_in(SETTLED)
 

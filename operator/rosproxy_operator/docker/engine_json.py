@@ -16,11 +16,17 @@ from rosproxy_operator.docker.planner.own import Making
 from rosproxy_operator.docker.planner.specs import SECRET
 
 _NEVER = "0001-"
+_VARIABLES = frozenset(
+    {"ROS_VERSION", "ROS_DISTRO", "ROS_DOMAIN_ID", "ROS_LOCALHOST_ONLY", "RMW_IMPLEMENTATION"}
+    | {"ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_IP", "ROS_HOSTNAME"}
+)
+"""What says of a container which ROS it is, and how its nodes find each other."""
 
 
 class _State(TypedDict, total=False):
     Status: str | None
     StartedAt: str | None
+    ExitCode: int | None
 
 
 class _Config(TypedDict, total=False):
@@ -86,6 +92,14 @@ def dig(found: Any, *keys: str) -> Any:
     return found
 
 
+def container_of(event: Json) -> str:
+    """The id of the container that an event is about, or whose network it is; empty if of none."""
+    actor = event.get("Actor") or {}
+    if event.get("Type") == "container":
+        return str(actor.get("ID") or "")
+    return str(dig(actor, "Attributes", "container") or "")
+
+
 def environment(inspected: Json | None) -> dict[str, str]:
     """A container's variables, from its inspection."""
     return dict(text.partition("=")[::2] for text in dig(inspected, "Config", "Env") or ())
@@ -98,10 +112,12 @@ def endpoints(row: Json | None) -> dict[str, Json]:
 
 
 def signature(row: Json) -> tuple[tuple[str, str], ...]:
-    """What of a container's row in the list changes whenever its aliases may have changed."""
-    return tuple(
-        sorted((name, end.get("EndpointID") or "") for name, end in endpoints(row).items())
-    )
+    """What of a container's row in the list changes whenever its aliases may have changed.
+
+    Of one without a network of its own: its state.
+    """
+    found = sorted((name, end.get("EndpointID") or "") for name, end in endpoints(row).items())
+    return tuple(found) or (("", str(row.get("State"))),)
 
 
 def read_making(inspected: Json | None) -> Making:
@@ -142,6 +158,7 @@ def read_container(
     name, short_id = name_of(row), row["Id"][:12]
     aliases = {key: _aliases(end) for key, end in endpoints(inspected).items()}
     started = dig(inspected, "State", "StartedAt") or ""
+    variables = environment(inspected)
     return Container(
         id=row["Id"],
         name=name,
@@ -158,10 +175,13 @@ def read_container(
             )
             for key, end in endpoints(row).items()
         ),
-        master_uri=environment(inspected).get("ROS_MASTER_URI", ""),
-        host_ports=_bound_ports(inspected) | _public_ports(row),
+        master_uri=variables.get("ROS_MASTER_URI", ""),
+        variables={name: text for name, text in variables.items() if name in _VARIABLES},
+        host_ports=_bound_ports(inspected, "tcp") | _public_ports(row, "tcp"),
+        udp_ports=_bound_ports(inspected, "udp") | _public_ports(row, "udp"),
         hostname=dig(inspected, "Config", "Hostname") or "",
         started_at="" if started.startswith(_NEVER) else started,
+        exit_code=dig(inspected, "State", "ExitCode") or 0,
     )
 
 
@@ -185,12 +205,12 @@ def _aliases(endpoint: Json) -> list[str]:
     return [*(endpoint.get("Aliases") or ()), *(endpoint.get("DNSNames") or ())]
 
 
-def _bound_ports(inspected: Json | None) -> frozenset[int]:
-    """The TCP ports of the host that it asks for; all of a range, of which one is chosen."""
+def _bound_ports(inspected: Json | None, protocol: str) -> frozenset[int]:
+    """The ports of the host that it asks for; all of a range, of which one is chosen."""
     return frozenset(
         port
         for key, wanted in (dig(inspected, "HostConfig", "PortBindings") or {}).items()
-        if key.endswith("/tcp") or "/" not in key
+        if (key.partition("/")[2] or "tcp") == protocol
         for binding in wanted or ()
         for port in _host_ports(binding.get("HostPort") or "")
     )
@@ -204,10 +224,10 @@ def _host_ports(text: str) -> range:
     return range(int(first), int(last or first) + 1)
 
 
-def _public_ports(row: Json) -> frozenset[int]:
+def _public_ports(row: Json, protocol: str) -> frozenset[int]:
     """Those that the engine has given it."""
     return frozenset(
         port["PublicPort"]
         for port in row.get("Ports") or ()
-        if port.get("PublicPort") and port.get("Type") == "tcp"
+        if port.get("PublicPort") and port.get("Type") == protocol
     )

@@ -24,22 +24,27 @@ from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
+    CreateEar,
     CreateNetwork,
+    CreateRedirect,
     CreateSandbox,
     Disconnect,
     Remove,
     Rename,
     Restart,
+    Run,
     Start,
     Unpause,
 )
 from rosproxy_operator.docker.planner.model import Key, PlanSettings
 from rosproxy_operator.docker.planner.own import gives_away
 from rosproxy_operator.docker.planner.plan import Group
+from rosproxy_operator.docker.planner.redirect import redirect_config
 from rosproxy_operator.docker.planner.specs import (
     MANAGED,
     SECRET,
     container_config,
+    ear_config,
     master,
     proxy_name,
     read_own,
@@ -59,6 +64,7 @@ DONE: dict[type, tuple[str, ...]] = {
     CreateNetwork: ("already exists",),
     Start: ("is not running",),
     Restart: (),
+    Run: ("non running container",),
     Unpause: ("is not paused",),
     Rename: ("same name as its current name",),
     Connect: ("already exists in network", "already attached"),
@@ -67,7 +73,15 @@ DONE: dict[type, tuple[str, ...]] = {
 }
 """What the engine says when there is nothing left to do; nor is there for what is gone."""
 
+LONGEST_RUN = 10.0
+"""Seconds after which what does one thing, and takes milliseconds, is given up."""
+RUNNING = 0.03
+"""Seconds between looks whether it has ended."""
+
 CarryOut = Callable[[Action], Awaitable[None]]
+Job = tuple[Key | None, str]
+"""What is worked on apart from all else: a group's key, and what it is about."""
+UPLINK: Job = (None, "")
 
 
 @dataclass(slots=True)
@@ -97,9 +111,9 @@ class Executor:
     ) -> None:
         self._tasks, self._finished = tasks, finished
         self._port_taken, self._counted = port_taken, counted
-        self._busy: dict[Key | None, asyncio.Task[None]] = {}
-        self._failures: dict[Key | None, _Failure] = {}
-        self._over: dict[Key | None, float] = {}
+        self._busy: dict[Job, asyncio.Task[None]] = {}
+        self._failures: dict[Job, _Failure] = {}
+        self._over: dict[Job, float] = {}
         self._refused: dict[Action, tuple[str, float]] = {}
 
     @property
@@ -115,7 +129,7 @@ class Executor:
     @property
     def again_in(self) -> float | None:
         """Seconds until something that has failed may be tried again; None if nothing has."""
-        times = [f.again for key, f in self._failures.items() if key not in self._busy]
+        times = [f.again for job, f in self._failures.items() if job not in self._busy]
         return max(min(times) - time.monotonic(), 0.0) if times else None
 
     def start(self, groups: Iterable[Group], carry_out: CarryOut, seen: float) -> None:
@@ -126,45 +140,44 @@ class Executor:
         """
         now = time.monotonic()
         self._refused = {a: each for a, each in self._refused.items() if each[1] > now - QUIET}
-        by_key: dict[Key | None, list[Group]] = {}
+        by_job: dict[Job, list[Group]] = {}
         for group in groups:
-            if self._over.get(group.key, 0.0) < seen:
-                by_key.setdefault(group.key, []).append(group)
+            job = group.key, group.about
+            if self._over.get(job, 0.0) < seen:
+                by_job.setdefault(job, []).append(group)
+        self._over = {job: at for job, at in self._over.items() if at >= seen}
         self._failures = {
-            key: each
-            for key, each in self._failures.items()
-            if key in by_key or self._over.get(key, 0.0) >= seen
+            job: each for job, each in self._failures.items() if job in by_job or job in self._over
         }
-        for key in sorted(by_key, key=lambda key: key is not None):  # the uplink first
-            actions = [action for group in by_key[key] for action in group.actions]
-            failure = self._failures.get(key)
+        for job in sorted(by_job, key=lambda job: job[0] is not None):  # the uplink first
+            actions = [action for group in by_job[job] for action in group.actions]
+            failure = self._failures.get(job)
             waiting = failure and failure.actions == actions and now < failure.again
-            if actions and not waiting and key not in self._busy:
-                work = self._run(key, by_key[key], actions, carry_out)
-                name = f"work for {key.master_uri if key else 'the uplink'}"
-                self._busy[key] = self._tasks.spawn(work, name)
+            if actions and not waiting and job not in self._busy:
+                work = self._run(job, by_job[job], actions, carry_out)
+                self._busy[job] = self._tasks.spawn(work, f"work for {_subject(job)}")
 
     async def _run(
-        self, key: Key | None, groups: list[Group], actions: list[Action], carry_out: CarryOut
+        self, job: Job, groups: list[Group], actions: list[Action], carry_out: CarryOut
     ) -> None:
         """Carry out all groups, after the uplink's, and note the first thing that goes wrong."""
         problem: Problem | None = None
         try:
-            if key and None in self._busy:
-                await asyncio.wait([self._busy[None]])
+            if job != UPLINK and UPLINK in self._busy:
+                await asyncio.wait([self._busy[UPLINK]])
             problems = [await self._group(group, carry_out) for group in groups]
             problem = next(filter(None, problems), None)
         except Exception as error:  # a mistake of ours: no reason to try it in a tight loop
-            log.exception("work for %s failed", key)
-            problem = Problem(_subject(key), f"the operator failed: {error!r}")
+            log.exception("work for %s failed", _subject(job))
+            problem = Problem(_subject(job), f"the operator failed: {error!r}")
         finally:
-            before = self._failures.pop(key, None)
+            before = self._failures.pop(job, None)
             if problem is not None:
                 count = before.count + 1 if before and before.actions == actions else 1
                 again = time.monotonic() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
-                self._failures[key] = _Failure(actions, count, again, problem)
-            del self._busy[key]
-            self._over[key] = time.monotonic()
+                self._failures[job] = _Failure(actions, count, again, problem)
+            del self._busy[job]
+            self._over[job] = time.monotonic()
             self._finished()
 
     async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
@@ -180,7 +193,7 @@ class Executor:
                 self._port_taken(action.name, error.port)
                 break
             except EngineError as error:
-                problem = Problem(_subject(group.key), f"{action}: {error}")
+                problem = Problem(_subject((group.key, group.about)), f"{action}: {error}")
                 if not isinstance(action, Connect | Disconnect):
                     break
         return problem
@@ -209,8 +222,9 @@ class Executor:
             log.debug("%s: %s in %.3f s", action, outcome, time.monotonic() - started)
 
 
-def _subject(key: Key | None) -> str:
-    return f"proxy {proxy_name(key)}" if key else "uplink"
+def _subject(job: Job) -> str:
+    key, about = job
+    return about or (f"proxy {proxy_name(key)}" if key else "uplink")
 
 
 class DockerApplier:
@@ -251,16 +265,13 @@ class DockerApplier:
             case CreateNetwork(name):
                 labels = {MANAGED: "true", SECRET: look.fresh}
                 do("create_network", name, driver="bridge", labels=labels, check_duplicate=True)
-            case CreateSandbox(name):
-                config = sandbox_config(action, self._settings)
-                self._create(name, config, look.state.image_id)
-            case Create(name, key):
-                secret, masters = look.state.secret, look.state.masters
-                address = masters.get(master(key).host.lower(), "")
-                config = container_config(action, self._settings, secret, address)
-                self._create(name, config, look.state.image_id)
+            case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
+                self._create(action.name, self._config(action, look), look.state.image_id)
             case Start(name):
                 do("start", name)
+            case Run(name):
+                do("start", name)
+                self._await_end(name)
             case Restart(name):
                 do("restart", name, timeout=STOP_TIMEOUT)
             case Unpause(name):
@@ -274,6 +285,30 @@ class DockerApplier:
             case Remove():
                 self._remove(action, look)
 
+    def _await_end(self, name: str) -> None:
+        """Wait until what does one thing has done it. Raises EngineError if it could not."""
+        since = time.monotonic()
+        while (state := self._engine.container(name)["State"])["Running"]:
+            if time.monotonic() > since + LONGEST_RUN:
+                self._engine.do("remove_container", name, force=True)
+                raise EngineError(f"has not ended in {LONGEST_RUN:.0f} s, and is removed")
+            time.sleep(RUNNING)
+        if state["ExitCode"]:
+            raise EngineError(f"ended with {state['ExitCode']}, docker logs {name} says why")
+
+    def _config(
+        self, action: CreateSandbox | Create | CreateEar | CreateRedirect, look: DockerSnapshot
+    ) -> Json:
+        if isinstance(action, CreateSandbox):
+            return sandbox_config(action, self._settings)
+        if isinstance(action, CreateEar):
+            return ear_config(action, self._settings)
+        if isinstance(action, CreateRedirect):
+            return redirect_config(action, self._settings)
+        secret, masters, key = look.state.secret, look.state.masters, action.key
+        address = "" if key.is_ros2 else masters.get(master(key).host.lower(), "")
+        return container_config(action, self._settings, secret, address)
+
     def _remove(self, action: Remove, look: DockerSnapshot) -> None:
         name = action.name
         if action.stop:
@@ -285,7 +320,7 @@ class DockerApplier:
         # when it ends, which takes 2 s per network.
         networks = self._engine.container(name)["NetworkSettings"].get("Networks") or {}
         for network in networks:
-            if network != self._settings.uplink:
+            if network not in (self._settings.uplink, "host"):  # an ear can't leave the latter
                 self._do(Disconnect(name, network), look)
         self._engine.do("remove_container", name, force=True)
 

@@ -1,6 +1,6 @@
 """What the operating system knows of this host's ports and addresses."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from rosproxy.leases.ports import PortRange
@@ -27,10 +27,25 @@ def listening_ports() -> frozenset[int]:
     return parse_listening(_text("/proc/net/tcp")) | parse_listening(_text("/proc/net/tcp6"))
 
 
+def bound_udp_ports() -> frozenset[int]:
+    """The UDP ports that anything has, in this network namespace."""
+    return parse_bound(_text("/proc/net/udp")) | parse_bound(_text("/proc/net/udp6"))
+
+
+def parse_bound(text: str) -> frozenset[int]:
+    """The ports of all sockets in ``/proc/net/udp`` or ``/proc/net/udp6``."""
+    return frozenset(_port(line.split()) for line in text.splitlines()[1:])
+
+
 def parse_listening(text: str) -> frozenset[int]:
     """The ports of listening sockets in ``/proc/net/tcp`` or ``/proc/net/tcp6``."""
     rows = (line.split()[:4] for line in text.splitlines()[1:])
-    return frozenset(int(row[1].rpartition(":")[2], 16) for row in rows if row[3] == _LISTEN)
+    return frozenset(_port(row) for row in rows if row[3] == _LISTEN)
+
+
+def _port(row: Sequence[str]) -> int:
+    """The local port of a row in one of these files."""
+    return int(row[1].rpartition(":")[2], 16)
 
 
 def has(address: str) -> bool:
@@ -50,9 +65,14 @@ def own_address_towards(master: str, gateways: Collection[str]) -> str:
     """
     own = address_towards(master)
     if own in gateways or is_loopback(own):
-        far = address_towards(_ELSEWHERE)
-        own = own if is_loopback(far) else far
+        own = far_address() or own
     return "" if is_loopback(own) else own
+
+
+def far_address() -> str:
+    """This host's address for hosts far away; empty if it has no way there."""
+    far = address_towards(_ELSEWHERE)
+    return "" if is_loopback(far) else far
 
 
 def _text(path: str) -> str:

@@ -1,11 +1,15 @@
-"""Options of ``rosproxy-operator docker`` by which an administrator bounds labels and proxies."""
+"""Options of ``rosproxy-operator docker`` by which an administrator bounds labels and proxies.
+
+And those for ROS 2, who is outside.
+"""
 
 import click
 
 from rosproxy.cli.options import Command, Parsed, with_options
-from rosproxy_operator.docker.planner.labels.bounds import read_master_pattern
+from rosproxy_operator.common.ros2 import read_peer_name
+from rosproxy_operator.docker.planner.labels.bounds import read_host_pattern
 from rosproxy_operator.docker.planner.model import MOST_PORTS
-from rosproxy_operator.docker.settings import read_memory, read_pids, read_secret
+from rosproxy_operator.docker.settings import read_lan, read_memory, read_pids, read_secret
 
 _OPTIONS = (
     click.option(
@@ -16,10 +20,23 @@ _OPTIONS = (
     ),
     click.option(
         "--allow-master",
-        type=Parsed("HOST[:PORT]", read_master_pattern),
+        type=Parsed("HOST[:PORT]", read_host_pattern),
         multiple=True,
         help="A master that containers may name, * and ? stand for others (repeatable). Default: "
         "any from port 1024 on.",
+    ),
+    click.option(
+        "--redirect/--no-redirect",
+        default=True,
+        help="Whether a master that ROS_MASTER_URI gives by address leads to the proxy, by a rule "
+        "in the container's network.",
+    ),
+    click.option(
+        "--allow-peer",
+        type=Parsed("HOST[:PORT]", read_host_pattern),
+        multiple=True,
+        help="ROS 2: a host outside that labels may have told of participants, * and ? stand for "
+        "others (repeatable). Default: any.",
     ),
     click.option(
         "--max-ports",
@@ -33,6 +50,22 @@ _OPTIONS = (
         type=click.Choice(["auto", "kernel", "splice", "copy"]),
         multiple=True,
         help="A data plane that labels may ask for (repeatable). Default: all but kernel.",
+    ),
+    click.option(
+        "--ros2-peer",
+        type=Parsed("host[:port]", read_peer_name),
+        envvar="ROSPROXY_ROS2_PEERS",
+        multiple=True,
+        help="ROS 2: a host outside that every proxy tells of its participants, or another proxy, "
+        "with the first port of its range (repeatable).",
+    ),
+    click.option(
+        "--ros2-lan",
+        type=Parsed("address", read_lan),
+        default="",
+        show_default=False,
+        help="ROS 2: this host's address on the LAN whose multicast is heard, or none. Default: "
+        "the advertised address, else that towards hosts far away.",
     ),
     click.option(
         "--proxy-memory",
@@ -59,5 +92,5 @@ _OPTIONS = (
 
 
 def bound_options(command: Command) -> Command:
-    """What labels may ask for, what each proxy may take, and the secret of their tokens."""
+    """What labels may ask for, who is outside, what each proxy may take, the tokens' secret."""
     return with_options(command, _OPTIONS)

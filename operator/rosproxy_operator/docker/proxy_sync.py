@@ -3,6 +3,9 @@
 Who may use a proxy as its master goes to it by itself and first: the call of a new container waits
 for that, while all other news may take a proxy long (it asks nodes and its master). Before either
 goes its policy, if that is another one than before: nobody is let in whose policy it does not have.
+
+A proxy for ROS 2 that had to leave its ports is told who had some of them, so that it has these
+meet everybody anew: outside heeds no other locators of participants that it knows.
 """
 
 import asyncio
@@ -12,10 +15,11 @@ import time
 from collections.abc import Callable, Collection
 
 from rosproxy.access.layers import PolicyLayer
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
-from rosproxy_operator.common.proxy_status import nodes_by_address
+from rosproxy_operator.common.proxy_status import Leases, inside_addresses, leases
 from rosproxy_operator.docker.planner.model import Member, PlanSettings
 from rosproxy_operator.docker.planner.proxy_news import NetworkFacts, ProxyNews, facts
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
@@ -34,12 +38,21 @@ class ProxyUpdater:
     After each look the proxy is told its policy if that has changed, and who may use it as its
     master, whether or not that has, asked for its nodes, and told what is new (`ProxyNews`).
     ``silent_since`` is when it ceased to answer (monotonic), or was started; None while it answers.
+    ``leases`` are what its participants of ROS 2 have; it is told the ``former`` ones until it has
+    some.
     """
 
     def __init__(
-        self, name: str, access: ProxyAccess, proxies: ProxyClient, answered: Callable[[], None]
+        self,
+        name: str,
+        access: ProxyAccess,
+        proxies: ProxyClient,
+        answered: Callable[[], None],
+        former: Leases,
     ) -> None:
         self.access = access
+        self.leases: Leases = {}
+        self._former = former
         self.error: ProxyError | None = None
         self.silent_since: float | None = time.monotonic()
         self._name, self._proxies, self._answered = name, proxies, answered
@@ -69,7 +82,10 @@ class ProxyUpdater:
             addresses = self._news.facts.selected
             try:
                 await self._tell_policy()
-                await self._proxies.selected(self.access.admin, self.access.token, addresses)
+                former = None if self.leases else self._former
+                await self._proxies.selected(
+                    self.access.admin, self.access.token, addresses, former=former
+                )
                 failures, told = 0, ""
             except ProxyError as error:
                 if not error.away and failures >= len(PAUSES) and str(error) != told:
@@ -110,6 +126,7 @@ class ProxyUpdater:
         where, token = self.access.admin, self.access.token
         refusal = await self._policy_refusal()
         status = await self._proxies.status(where)
+        self.leases = leases(status)
         # The facts are not older than need be: its nodes may have come since the last look.
         address = self._news.facts.master_address
         if address and status.master.address != address:
@@ -117,7 +134,7 @@ class ProxyUpdater:
             text = "%s: its master is now at %s"
             log.info(text, self._name, address, extra={"proxy": self._name})
         now = time.monotonic()
-        body = self._news.body(nodes_by_address(status).keys(), now)
+        body = self._news.body(inside_addresses(status), now)
         if refusal:
             body.pop("arrived", None)  # who is adopted would not be kept to the policy
         if body:
@@ -160,6 +177,7 @@ class DockerProxySync:
         self._tasks, self._proxies = tasks, proxies
         self._settings, self._answered = settings, answered
         self._running: dict[str, tuple[ProxyUpdater, asyncio.Task[None]]] = {}
+        self._leases: dict[str, Leases] = {}
 
     def update(self, look: DockerSnapshot, members: Collection[Member]) -> None:
         """Begin to tell every running proxy what a look has found."""
@@ -167,15 +185,29 @@ class DockerProxySync:
             if look.access.get(name) != updater.access:
                 task.cancel()
                 del self._running[name]
+                if updater.leases:
+                    self._leases[name] = updater.leases
         for proxy in look.state.proxies:
             name = proxy.container.name
             if name not in look.access:
                 continue
             if name not in self._running:
-                updater = ProxyUpdater(name, look.access[name], self._proxies, self._answered)
+                updater = ProxyUpdater(
+                    name,
+                    look.access[name],
+                    self._proxies,
+                    self._answered,
+                    self._left_behind(name, proxy.range),
+                )
                 self._running[name] = updater, self._tasks.spawn(updater.run(), f"updating {name}")
             known = facts(look.state, proxy, members, self._settings.policy)
             self._running[name][0].update(known)
+
+    def _left_behind(self, name: str, ports: PortRange) -> Leases:
+        """What its participants had, if not all of that is among the ports that a proxy has now."""
+        had = self._leases.get(name, {})
+        kept = all(port in ports for some in had.values() for port in some)
+        return {} if kept else had
 
     def answers(self, name: str) -> bool:
         """Whether a proxy answers and knows everything."""

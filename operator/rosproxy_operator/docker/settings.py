@@ -11,10 +11,10 @@ from typing import Any
 
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import SettingError, read_master_uri
+from rosproxy.settings import SettingError, read_address, read_master_uri
 from rosproxy_operator.common.policy import administrators_policy
 from rosproxy_operator.common.proxy_bounds import make_proxy_bounds
-from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.planner.model import NOWHERE, PlanSettings
 
 DEFAULT_ADMIN = HostPort("127.0.0.1", 11313)
 LEAST_MEMORY, MOST_MEMORY = 64 * 1024**2, 1024**4
@@ -50,6 +50,16 @@ def read_shared_master_uri(text: str) -> str:
             "master's host, or http://host.docker.internal:PORT for this one"
         )
     return text
+
+
+def read_lan(text: str) -> str:
+    """An IPv4 address of this host on the LAN, or the word for none. Raises ValueError."""
+    if text in ("", NOWHERE):
+        return text
+    address = read_address(text)
+    if address is None or ":" in address:
+        raise ValueError(f"{text[:40]!r} is not an IPv4 address such as 192.0.2.10, or {NOWHERE}")
+    return address
 
 
 def read_memory(text: str) -> int:

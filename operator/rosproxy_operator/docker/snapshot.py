@@ -8,8 +8,10 @@ they say decides which masters' names are resolved.
 import asyncio
 import logging
 import secrets
+import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import msgspec
 
@@ -22,15 +24,22 @@ from rosproxy_operator.docker.errors import EngineError
 from rosproxy_operator.docker.planner.labels.members import LabelReading, master_hosts, read_labels
 from rosproxy_operator.docker.planner.model import (
     STARTED,
+    Container,
+    EarContainer,
     HostState,
     Network,
+    OwnContainer,
     PlanSettings,
     Proxy,
+    RedirectContainer,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.own import gives_away, has_own_name
 from rosproxy_operator.docker.planner.specs import (
     FORMER_TOKEN,
+    ROLE_EAR,
+    ROLE_PROXY,
+    ROLE_REDIRECT,
     ROLE_SANDBOX,
     OwnLabels,
     admin_port,
@@ -42,6 +51,16 @@ log = logging.getLogger(__name__)
 
 PATIENCE = 0.1
 """Seconds that a look waits for inspections; later ones count from the next look on."""
+_KINDS: Mapping[str, type[OwnContainer]] = {
+    ROLE_SANDBOX: Sandbox,
+    ROLE_PROXY: Proxy,
+    ROLE_EAR: EarContainer,
+    ROLE_REDIRECT: RedirectContainer,
+}
+DOUBT = 1.0
+"""Seconds for which a container is inspected with each look after something has happened to it."""
+CHECK = 30.0
+"""Seconds after which the operator's own containers are inspected whatever was heard."""
 MOST_INSPECTIONS = 16
 """Inspections that are under way at once."""
 
@@ -79,22 +98,35 @@ class Inspector:
     The engine's list answers in milliseconds whatever happens. An inspection waits until the
     container's start is over, which takes 26 s with 1000 ports to publish. Nothing that is read
     from it changes but the aliases, and those only with the endpoints, whose ids are in the list.
+
+    The operator's own containers can be started anew without a trace in the list: a proxy's has no
+    network of its own, and the list is late to tell that one has ended. The engine's events tell
+    it (`doubt`), and those are inspected with each look for a moment; all of them once in a while,
+    beside the look, in case an event was missed.
+
     One that can't be read is told in the log, once, and is as good as none: it harms no other
-    container. ``late`` is called when some come after a look.
+    container. ``late`` is called when something new comes after a look.
     """
 
     def __init__(self, engine: DockerClient, late: Callable[[], None]) -> None:
         self._engine, self._late = engine, late
         self._known: dict[str, tuple[object, Json]] = {}
-        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._asking: dict[str, asyncio.Task[bool]] = {}
         self._marks: dict[str, object] = {}
         self._unreadable: set[str] = set()
         self._turns = asyncio.Semaphore(MOST_INSPECTIONS)
+        self._doubted: dict[str, float] = {}
+        self._all_doubted = -DOUBT
+        self._updated = time.monotonic()
+        self._looks = 0
+        self._doubtful_look: dict[str, int] = {}
+        self._checked = time.monotonic()
+        self._checking: set[str] = set()
 
     @property
     def waiting(self) -> bool:
         """Whether inspections are under way, which are going to be told."""
-        return bool(self._asking)
+        return bool(self._asking.keys() - self._checking)
 
     def get(self, container: str) -> Json | None:
         """The last known inspection of a container; None if there is none yet."""
@@ -106,28 +138,71 @@ class Inspector:
         fresh = mark == self._marks[row["Id"]]
         return fresh and engine_json.dig(inspected, "State", "Status") == row["State"]
 
-    async def update(self, rows: Iterable[Json], always: Collection[str], patience: float) -> None:
+    def doubt(self, container: str | None) -> None:
+        """Something has happened to a container; None: perhaps to any, unheard."""
+        if container is None:
+            self._all_doubted = time.monotonic()
+        else:
+            self._doubted[container] = time.monotonic()
+
+    async def update(self, rows: Iterable[Json], own: Mapping[str, str], patience: float) -> None:
         """Inspect what is new or has changed in the list; wait for it for so many seconds.
 
-        ``always`` are the ids of those that may have been started anew without a trace in the list.
+        ``own`` are those that may have been started anew without a trace in the list, by id, with
+        what they are for. A doubt is good for one look at least, however late that is.
         """
-        self._marks = {
-            row["Id"]: object() if row["Id"] in always else engine_json.signature(row)
-            for row in rows
-        }
+        now = time.monotonic()
+        since, self._updated = min(now - DOUBT, self._updated), now
+        self._looks += 1
+        self._doubted = {key: at for key, at in self._doubted.items() if at >= since}
+        doubtful = own.keys() if self._all_doubted >= since else self._doubted.keys() & own.keys()
+        self._marks = {row["Id"]: self._mark(row, own, doubtful) for row in rows}
         self._known = {key: known for key, known in self._known.items() if key in self._marks}
+        self._doubtful_look = {
+            key: look for key, look in self._doubtful_look.items() if key in self._marks
+        }
         self._unreadable &= self._marks.keys()
-        asked = []
-        for key, mark in self._marks.items():
-            if key not in self._asking and self._known.get(key, (None,))[0] != mark:
-                self._asking[key] = asyncio.create_task(self._inspect(key, mark))
-                asked.append(self._asking[key])
+        asked = [
+            self._ask(key, mark)
+            for key, mark in self._marks.items()
+            if self._known.get(key, (None,))[0] != mark and key not in self._asking
+        ]
         if asked:
             _, late = await asyncio.wait(asked, timeout=patience)
             for task in late:
                 task.add_done_callback(lambda _: self._late())
+        if self._checked < now - CHECK:
+            self._checked = now
+            self._check(key for key, role in own.items() if role != ROLE_REDIRECT)
 
-    async def _inspect(self, container: str, mark: object) -> None:
+    def _mark(self, row: Json, own: Collection[str], doubtful: Collection[str]) -> object:
+        """What an inspection is for; it is asked for anew when that changes."""
+        key, seen = row["Id"], engine_json.signature(row)
+        if key not in own:
+            return seen
+        if key in doubtful:
+            self._doubtful_look[key] = self._looks
+        return row["State"], seen, self._doubtful_look.get(key)
+
+    def _check(self, those: Iterable[str]) -> None:
+        """Inspect all of these beside the looks, and tell if something is new."""
+        for key in those:
+            if key in self._marks and key not in self._asking:
+                self._checking.add(key)
+                self._ask(key, self._marks[key]).add_done_callback(self._checked_one)
+
+    def _checked_one(self, done: asyncio.Task[bool]) -> None:
+        if not done.cancelled() and done.result():
+            self._late()
+
+    def _ask(self, container: str, mark: object) -> asyncio.Task[bool]:
+        task = asyncio.create_task(self._inspect(container, mark))
+        self._asking[container] = task
+        return task
+
+    async def _inspect(self, container: str, mark: object) -> bool:
+        """Inspect it; whether it is not as it was known."""
+        before = self.get(container)
         try:
             async with self._turns:
                 inspected = await in_thread(self._engine.container, container)
@@ -141,6 +216,8 @@ class Inspector:
             self._unreadable.add(container)
         finally:
             del self._asking[container]
+            self._checking.discard(container)
+        return self.get(container) != before
 
 
 class DockerObserver:
@@ -162,26 +239,38 @@ class DockerObserver:
         """Whether inspections are under way, whose end is going to be told."""
         return self._inspector.waiting
 
+    def doubt(self, container: str | None) -> None:
+        """The engine tells that something has happened to a container, by id; None: to any."""
+        self._inspector.doubt(container)
+
     async def look(self, patience: float = PATIENCE) -> DockerSnapshot:
         """What there is now. Raises EngineError.
 
         Containers whose inspection takes longer than ``patience`` seconds are left out until it is
         there, unless an older one is known.
         """
-        listening = host.listening_ports()  # first: what the engine starts meanwhile is no stranger
+        # First: what the engine starts meanwhile is no stranger.
+        listening, bound = host.listening_ports(), host.bound_udp_ports()
         rows, found, image = await asyncio.gather(
             in_thread(self._engine.containers),
             in_thread(self._engine.networks),
             in_thread(self._engine.image_id, self._settings.proxy_image),
         )
-        # What is the operator's own is inspected at each look: a proxy's container has no network
-        # by which to see that it was started anew, and the list is late to tell that one has ended.
-        mine = [row["Id"] for row in rows if self._read_own(row)]
+        every = ((row["Id"], self._read_own(row)) for row in rows)
+        mine = {key: own.role for key, own in every if own}
         await self._inspector.update(rows, mine, patience)
         networks = tuple(map(engine_json.read_network, found))
         bridges = [n.gateway for n in networks if n.driver == "bridge" and n.gateway]
         at_host = any(map(host.has, bridges))
-        state = self._read(rows, networks, image, listening if at_host else frozenset())
+        state = self._read(rows, networks, image)
+        if at_host:
+            busy = [box for box in state.sandboxes if box.container.name in state.busy]
+            state = replace(
+                state,
+                listening=strangers(busy, (), listening),
+                listening_udp=strangers(busy, state.ears, bound),
+                far=host.far_address(),
+            )
         secret = self._settings.secret or engine_json.uplink_secret(found, self._settings.uplink)
         state = replace(state, image_id=image, secret=secret or self._fresh)
         labels = read_labels(state, self._settings)
@@ -211,14 +300,14 @@ class DockerObserver:
         rows: list[Json],
         networks: tuple[Network, ...],
         image: str,
-        listening: frozenset[int],
     ) -> HostState:
         """The containers, the operator's own apart from others.
 
         One that only claims to be its own is like any other. One that is not inspected yet counts
         as own if its name is right: until it is known, nothing is done to it.
         """
-        containers, sandboxes, proxies = [], [], []
+        containers: list[Container] = []
+        own_ones: dict[str, list[Any]] = {role: [] for role in _KINDS}
         busy: set[str] = set()
         for row in rows:
             own, forged = self._read_own(row), ""
@@ -233,19 +322,19 @@ class DockerObserver:
             if own is None or forged:
                 containers.append(replace(container, forged=forged))
                 own = None
-            elif own.role == ROLE_SANDBOX:
-                sandboxes.append(Sandbox(own.key, container, own.range, own.fingerprint))
             else:
-                proxies.append(Proxy(own.key, container, own.range, own.fingerprint))
+                made = _KINDS[own.role](own.key, container, own.range, own.fingerprint)
+                own_ones[own.role].append(made)
             if own and not self._inspector.sure(row):
                 busy.add(container.name)
         return HostState(
             containers=tuple(containers),
             networks=networks,
-            proxies=tuple(proxies),
+            proxies=tuple(own_ones[ROLE_PROXY]),
             ephemeral=host.ephemeral_ports(),
-            listening=strangers(sandboxes, busy, listening),
-            sandboxes=tuple(sandboxes),
+            sandboxes=tuple(own_ones[ROLE_SANDBOX]),
+            ears=tuple(own_ones[ROLE_EAR]),
+            redirects=tuple(own_ones[ROLE_REDIRECT]),
             busy=frozenset(busy),
             addresses=frozenset(
                 end.get("IPAddress") or ""
@@ -276,15 +365,15 @@ class DockerObserver:
 
 
 def strangers(
-    sandboxes: Iterable[Sandbox], busy: Collection[str], listening: frozenset[int]
+    starting: Iterable[Sandbox], ears: Iterable[EarContainer], listening: frozenset[int]
 ) -> frozenset[int]:
     """Which of the host's ports on which something listens may be somebody else's.
 
     Not those of a sandbox that is just being started: the engine takes them one by one before it
-    says that it runs.
+    says that it runs. Nor those of the ears.
     """
-    starting = (box for box in sandboxes if box.container.name in busy)
-    return listening - {port for box in starting for port in box.range.ports()}
+    own = {port for box in starting for port in box.range.ports()}
+    return listening - own - {ear.range.last for ear in ears}
 
 
 def address_in(state: HostState, name: str, uplink: str) -> str:

@@ -1,52 +1,93 @@
-"""The commands ``status`` and ``plan``: what there is on a host, without a running operator."""
+"""The commands ``status`` and ``plan``: what there is on a host, without a running operator.
+
+Their exit codes tell scripts: of ``status`` 0 if all is as wanted, of ``plan`` 0 if nothing is to
+be done and STEPS_LEFT if something is; 1 of both if something is wrong.
+"""
 
 import asyncio
 import json
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 
 from rosproxy import __version__
-from rosproxy.admin.status_document import ProxyStatus
+from rosproxy.admin.status_document import ParticipantStatus, ProxyStatus
 from rosproxy.cli.terminal import size, watch, write
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import Json, ProxyClient, ProxyError
-from rosproxy_operator.common.proxy_status import nodes_by_address
+from rosproxy_operator.common.proxy_status import nodes_by_address, participants_by_address
 from rosproxy_operator.common.resolver import MasterResolver
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.label_policy import network_owner
 from rosproxy_operator.docker.planner.model import (
     Container,
     HostState,
     Key,
+    Member,
     OwnContainer,
     PlanSettings,
 )
 from rosproxy_operator.docker.planner.plan import plan
+from rosproxy_operator.docker.planner.redirect import in_place
 from rosproxy_operator.docker.planner.report import render
-from rosproxy_operator.docker.planner.specs import proxy_name, sandbox_name
+from rosproxy_operator.docker.planner.specs import ear_name, proxy_name, sandbox_name
 from rosproxy_operator.docker.planner.state import DockerMemory
 from rosproxy_operator.docker.proxy_sync import silence
 from rosproxy_operator.docker.snapshot import DockerObserver, DockerSnapshot
 
 Said = Mapping[str, ProxyStatus]
 """What the proxies that answer say, by the names of their containers."""
+STEPS_LEFT = 3
+"""The exit code of ``plan`` if there is something to do."""
+WAIT_INTERVAL = 1.0
+"""Seconds between two looks of ``--wait``."""
 PATIENCE = 3.0
 """Seconds that are waited for inspections: nobody looks a second time."""
 
 
-def show_plan(settings: PlanSettings) -> None:
-    """Print what would be done now, and what is wrong. Raises EngineError."""
-    status = asyncio.run(survey(settings))
-    write("\n".join(status["actions"]) or "Nothing to do.")
-    for problem in status["problems"]:
-        write(f"{problem['subject']}: {problem['text']}")
+def show_plan(settings: PlanSettings, as_json: bool, wait: float) -> int:
+    """Print what would be done now, and what is wrong; the exit code. Raises EngineError.
+
+    ``wait`` are the seconds in which there may come to be nothing to do.
+    """
+    found = _await(settings, wait, lambda status: not status["actions"])
+    told = {key: found[key] for key in ("actions", "problems")}
+    if as_json:
+        write(json.dumps(told, indent=2))
+    else:
+        write("\n".join(found["actions"]) or "Nothing to do.")
+        for problem in found["problems"]:
+            write(f"{problem['subject']}: {problem['text']}")
+    return STEPS_LEFT if found["actions"] else int(_is_wrong(found))
 
 
-def show_status(settings: PlanSettings, as_json: bool) -> None:
-    """Print what there is on the host. Raises EngineError."""
-    status = asyncio.run(survey(settings))
+def show_status(settings: PlanSettings, as_json: bool, wait: float) -> int:
+    """Print what there is on the host; the exit code. Raises EngineError.
+
+    ``wait`` are the seconds in which all may come to be as wanted.
+    """
+    status = _await(settings, wait, _is_as_wanted)
     write(json.dumps(status, indent=2) if as_json else render(status, size()[0]))
+    return int(not _is_as_wanted(status))
+
+
+def _await(settings: PlanSettings, seconds: float, good: Callable[[Json], bool]) -> Json:
+    """A survey that is good, or the last one after so many seconds. Raises EngineError."""
+    end = time.monotonic() + seconds
+    while not good(found := asyncio.run(survey(settings))) and time.monotonic() < end:
+        time.sleep(WAIT_INTERVAL)
+    return found
+
+
+def _is_as_wanted(status: Json) -> bool:
+    """Whether nothing is left to do, nothing is wrong, and every proxy answers."""
+    silent = [proxy for proxy in status["proxies"] if not proxy["reachable"]]
+    return not status["actions"] and not silent and not _is_wrong(status)
+
+
+def _is_wrong(status: Json) -> bool:
+    return any(problem["fatal"] for problem in status["problems"])
 
 
 def watch_status(settings: PlanSettings) -> None:
@@ -64,8 +105,8 @@ def watch_status(settings: PlanSettings) -> None:
 async def survey(settings: PlanSettings) -> Json:
     """What there is, what would be done, and what the proxies say. Raises EngineError.
 
-    Containers are those that have a proxy or whose labels are wrong. Actions are all but those for
-    what the engine is busy with and tells nothing of.
+    Containers are those that have a proxy or whose labels are wrong; one with both versions of ROS
+    is there twice. Actions are all but those for what the engine is busy with and tells nothing of.
     """
     proxies = ProxyClient()
     # Nobody has to be woken: there is no second look.
@@ -81,19 +122,20 @@ async def survey(settings: PlanSettings) -> Json:
     silent = [each for each in answers.values() if isinstance(each, Problem)]
     problems = [*planned.problems, *silent]
     wrong = {problem.subject for problem in problems}
-    keys = {
-        member.container.id: member.key
-        for member in planned.members
-        if member.key in look.state.keys
-    }
+    redirects = _redirects(planned.members, look.state)
+    keys: dict[str, list[Key]] = {}
+    for member in planned.members:
+        if member.key in look.state.keys:
+            keys.setdefault(member.container.id, []).append(member.key)
     return {
         "version": __version__,
         "uplink": settings.uplink,
         "proxies": [_proxy(key, look.state, said, settings) for key in sorted(look.state.keys)],
         "containers": [
-            _container(container, keys.get(container.id), said)
+            _container(container, key, said, redirects.get((container.id, key)))
             for container in look.state.containers
             if container.id in keys or f"container {container.name}" in wrong
+            for key in keys.get(container.id, [None])
         ],
         "problems": [asdict(problem) for problem in problems],
         "actions": [
@@ -124,8 +166,16 @@ def _proxy(key: Key, observed: HostState, said: Said, settings: PlanSettings) ->
     if home != "running":
         held = f"the container {sandbox_name(key)}, which holds its ports and networks"
         problems.insert(0, f"{held}, is {home}")
+    ear = _best(observed.ears_of(key), ear_name(key))
+    if ear and ear.container.state != "running":
+        problems.append(f"the container {ear_name(key)}, its ear, is {ear.container.state}")
+    domain = told.domains[0] if told and told.domains else None
     return {
         "name": proxy_name(key),
+        "ros": "2" if key.is_ros2 else "1",
+        "domain": key.domain,
+        "peers": list(domain.peers) if domain else [],
+        "ear": ear.container.state if ear else None,
         "master_uri": key.master_uri,
         "master_address": (told.master.address if told else None) or "",
         "master_up": told.master.up if told else None,
@@ -150,15 +200,55 @@ def _best(found: Iterable[OwnContainer], name: str) -> OwnContainer | None:
     )
 
 
-def _container(container: Container, key: Key | None, said: Said) -> Json:
+def _participant(one: ParticipantStatus) -> Json:
+    return {
+        "guid_prefix": one.guid_prefix,
+        "vendor": one.vendor,
+        "address": one.address,
+        "ports": [lease.port for lease in one.leases],
+        "publishes": list(one.publishes),
+        "subscribes": list(one.subscribes),
+        "services": list(one.services),
+        "problem": one.problem,
+    }
+
+
+def _redirects(
+    members: Iterable[Member], observed: HostState
+) -> dict[tuple[str, Key | None], Json]:
+    """What is led to proxies in containers' networks, by container and proxy."""
+    by_id = {container.id: container for container in observed.containers}
+    return {
+        (member.container.id, member.key): {
+            "master": str(member.by_address),
+            "in_place": bool(
+                in_place(observed, member.key, network_owner(member.container, by_id))
+            ),
+        }
+        for member in members
+        if member.by_address and member.container.alive
+    }
+
+
+def _container(
+    container: Container, key: Key | None, said: Said, redirect: Json | None = None
+) -> Json:
     proxy = proxy_name(key) if key else None
     addresses = {a.network: a.address for a in container.attachments if a.address}
     told = said.get(proxy or "")
     nodes = nodes_by_address(told) if told else {}
+    participants = participants_by_address(told) if told else {}
     return {
         "name": container.name,
         "state": container.state,
         "proxy": proxy,
+        "ros": ("2" if key.is_ros2 else "1") if key else None,
+        "participants": [
+            _participant(one)
+            for address in dict.fromkeys(addresses.values())
+            for one in participants.get(address, ())
+        ],
+        "redirect": redirect,
         "networks": sorted(container.networks),
         "addresses": addresses,
         "nodes": [

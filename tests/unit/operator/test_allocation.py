@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.allocation import (
     PortsExhausted,
+    after_move,
     extended,
     is_free,
     negotiate,
@@ -96,3 +97,10 @@ def test_the_range_of_a_usual_host() -> None:
     assert negotiate(32, window, listening, [ephemeral]) == PortRange(11406, 11437)
     assert negotiate(32, PortRange(32000, 65535), (), [ephemeral]) == PortRange(32000, 32031)
     assert negotiate(1000, PortRange(32000, 65535), (), [ephemeral]) == PortRange(61000, 61999)
+
+
+@pytest.mark.parametrize(("ros1", "ros2"), [(True, False), (False, True), (True, True)])
+def test_what_to_do_after_a_move_is_told(ros1: bool, ros2: bool) -> None:
+    told = after_move(ros1, ros2)
+    assert ("nodes that had registered" in told, "ROS 2" in told) == (ros1, ros2)
+    assert "restart" in told

@@ -10,6 +10,7 @@ import msgspec
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.docker.planner.model import Key
@@ -44,7 +45,7 @@ class CreateNetwork(Action, frozen=True):
 
 
 class _CreateContainer(Action, frozen=True):
-    """Create one of a proxy's two containers, without starting it."""
+    """Create one of a proxy's containers, without starting it."""
 
     does = "create container"
     key: Key
@@ -54,21 +55,24 @@ class _CreateContainer(Action, frozen=True):
 class CreateSandbox(_CreateContainer, frozen=True):
     """Create a sandbox on the uplink network.
 
-    With ``forwards`` the kernel may forward packets in its network namespace.
+    With ``forwards`` the kernel may forward packets in its network namespace. With ``udp`` one of
+    ROS 1 publishes its ports for UDP as well.
     """
 
     fingerprint: str = ""
     forwards: bool = False
+    udp: bool = False
 
     def _more(self) -> str:
-        return f": it holds ports {self.range} for the proxy of the master {self.key.master_uri}"
+        return f": it holds ports {self.range} for the proxy of the {self.key.graph}"
 
 
 class Create(_CreateContainer, frozen=True):
     """Create the container in which a proxy runs, in the namespace of the one named ``sandbox``.
 
     ``replaces`` names the one in whose place it comes, if any. ``policy`` are the layers of its
-    containers' labels.
+    containers' labels. Of ROS 2: ``peers`` are told of its participants, and ``ear`` is where its
+    ear listens, on the uplink's gateway.
     """
 
     sandbox: str
@@ -77,15 +81,63 @@ class Create(_CreateContainer, frozen=True):
     replaces: str = ""
     slave_control: SlaveControl = "any"
     direction: Direction = "out"
+    udp: bool = False
     policy: tuple[PolicyLayer, ...] = ()
+    peers: tuple[str, ...] = ()
+    ear: HostPort | None = None
 
     def _more(self) -> str:
         instead = f", instead of {self.replaces}" if self.replaces else ""
         rights = ", with NET_ADMIN" if self.data_plane == "kernel" else ""
         return (
-            f": proxy of the master {self.key.master_uri} at {self.key.advertise_host}, "
+            f": proxy of the {self.key.graph} at {self.key.advertise_host}, "
             f"ports {self.range} of {self.sandbox}{rights}{instead}"
         )
+
+
+class CreateEar(_CreateContainer, frozen=True):
+    """Create the ear of a proxy for ROS 2, in the host's network.
+
+    ``lan`` is this host's address on the LAN, ``bind`` where the ear hears the proxy, ``proxy``
+    where the proxy hears the ear.
+    """
+
+    lan: str
+    bind: HostPort
+    proxy: HostPort
+    fingerprint: str = ""
+
+    def _more(self) -> str:
+        return (
+            f": it carries announcements of the {self.key.graph} between the LAN at {self.lan} and "
+            f"the proxy at {self.proxy}"
+        )
+
+
+class CreateRedirect(_CreateContainer, frozen=True):
+    """Create what sets rules in the network of a container, and ends.
+
+    ``target`` is that container's id, ``started`` when it was started. There ``master``, an address
+    and port, is to lead to ``proxy``; where both are None, what led there is taken away.
+    """
+
+    target: str
+    started: str
+    master: HostPort | None = None
+    proxy: HostPort | None = None
+    fingerprint: str = ""
+
+    def _more(self) -> str:
+        where = f"in the network of container {self.target[:12]}"
+        if self.master is None:
+            return f": it takes the redirect of the {self.key.graph} away {where}"
+        return f": {where} it leads {self.master} to the proxy at {self.proxy}"
+
+
+class Run(Action, frozen=True):
+    """Start a container that does one thing, and wait until it has ended."""
+
+    does = "run container"
 
 
 class Start(Action, frozen=True):

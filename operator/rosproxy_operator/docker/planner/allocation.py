@@ -1,6 +1,6 @@
 """Which range of ports each proxy of a Docker host gets, and when it must leave it."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 from rosproxy.leases.ports import PortRange
@@ -8,6 +8,7 @@ from rosproxy_operator.common.allocation import (
     RETRY_FOR,
     Move,
     PortsExhausted,
+    after_move,
     extended,
     is_free,
     negotiate,
@@ -67,7 +68,11 @@ class _Allocation:
     """Ranges being given out, one key after the other."""
 
     def __init__(
-        self, observed: HostState, settings: PlanSettings, memory: DockerMemory, live: set[Key]
+        self,
+        observed: HostState,
+        settings: PlanSettings,
+        memory: DockerMemory,
+        live: Mapping[Key, Desired],
     ) -> None:
         self.observed = observed
         self.settings = settings
@@ -77,8 +82,15 @@ class _Allocation:
         self.problems: list[Problem] = []
         self.serving = {s.key for s in observed.sandboxes if s.container.state in SERVING}
         """The keys that have ports on which a proxy serves."""
-        self.claimed = _published(observed.containers) | memory.taken.keys()
-        self.blocked = self.claimed | observed.listening
+
+    def claimed(self, key: Key) -> frozenset[int]:
+        """The ports that other containers publish, by a key's protocols, and those refused."""
+        return self._published(self.observed.containers, key) | self.memory.taken.keys()
+
+    def blocked(self, key: Key) -> frozenset[int]:
+        """These, and on which something listens."""
+        seen = self.observed
+        return self.claimed(key) | self._for(key, seen.listening, seen.listening_udp)
 
     def order(self, key: Key) -> tuple[int, Key]:
         """Who has ports comes before who had some, and that one before who wants some."""
@@ -105,8 +117,19 @@ class _Allocation:
             if one.key != key and (one.key not in self.live or one.key in self.serving)
         ]
         started = [one for one in self.observed.containers if one.state in STARTED]
-        taken = _published(started) | self.memory.taken.keys()
+        taken = self._published(started, key) | self.memory.taken.keys()
         return is_free(ports, taken, [*others, *self.given_to_others(key)])
+
+    def _for(self, key: Key, tcp: frozenset[int], udp: frozenset[int]) -> frozenset[int]:
+        """Those of some TCP ports and UDP ports that a key's proxy publishes as well."""
+        if key.is_ros2:
+            return udp
+        return tcp | udp if self.live[key].udp else tcp
+
+    def _published(self, containers: Collection[Container], key: Key) -> frozenset[int]:
+        """The ports that containers publish by the protocols of a key's proxy."""
+        tcp = frozenset(port for one in containers for port in one.host_ports)
+        return self._for(key, tcp, frozenset(port for one in containers for port in one.udp_ports))
 
     def keep(self, key: Key) -> None:
         """Give a key the range where its proxy serves, has served, or is being made."""
@@ -117,14 +140,14 @@ class _Allocation:
         created = [one.range for one in self.observed.sandboxes_of(key)]
         ports = self.memory.planned.get(key) or (created[0] if created else None)
         # What listens on ports of a sandbox that is there may be the engine, which is starting it.
-        blocked = self.claimed if ports in created else self.blocked
+        blocked = self.claimed(key) if ports in created else self.blocked(key)
         if ports and is_free(ports, blocked | reserved_ports(key), self.held(key)):
             self.given[key] = ports
 
     def fill(self, desired: Desired, frozen: bool) -> None:
         """Give a key more ports if it has too few, or a range if it has none."""
         key, count, window = desired.key, desired.ports, self.settings.port_window
-        blocked, held = self.blocked | reserved_ports(key), self.held(key)
+        blocked, held = self.blocked(key) | reserved_ports(key), self.held(key)
         kept = self.given.get(key)
         if kept is None:
             try:
@@ -162,7 +185,7 @@ def allocate(
     no range gets longer: nothing can be created.
     """
     live = {one.key: one for one in desired if one.live}
-    allocation = _Allocation(observed, settings, memory, set(live))
+    allocation = _Allocation(observed, settings, memory, live)
     order = sorted(live, key=allocation.order)
     for key in order:
         allocation.keep(key)
@@ -175,16 +198,11 @@ def allocate(
         if key in moved and not within(moved[key].ports, ports):
             text = (
                 f"HAS LEFT ITS PORTS {moved[key].ports} for {ports}, since something else has "
-                "taken them: nodes that had registered under the old ones can't be reached until "
-                "they register anew"
+                f"taken them: {after_move(not key.is_ros2, key.is_ros2)}"
             )
             allocation.problems.append(_problem(key, text))
     memory = replace(memory, served=served, planned=given, moved=moved)
     return memory, allocation.problems
-
-
-def _published(containers: Iterable[Container]) -> frozenset[int]:
-    return frozenset(port for one in containers for port in one.host_ports)
 
 
 def _problem(key: Key, text: str, fatal: bool = False) -> Problem:

@@ -4,6 +4,7 @@ An engine answers with all containers that have a name, in any order. So no name
 another one holds: nodes would reach now this, now that.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -11,7 +12,14 @@ from rosproxy.net.addresses import is_address
 from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels.values import ALIAS, BUILT_IN, DATA_PLANE
+from rosproxy_operator.common.ros2 import LEAST_PORTS
+from rosproxy_operator.docker.planner.labels.values import (
+    ALIAS,
+    BUILT_IN,
+    DATA_PLANE,
+    DIRECTION,
+    UDP,
+)
 from rosproxy_operator.docker.planner.model import (
     Container,
     Desired,
@@ -19,6 +27,7 @@ from rosproxy_operator.docker.planner.model import (
     Key,
     Member,
     PlanSettings,
+    Sandbox,
 )
 from rosproxy_operator.docker.planner.specs import master, proxy_name
 from rosproxy_operator.docker.planner.state import DockerMemory
@@ -64,12 +73,14 @@ def desire(
             Desired(
                 key,
                 bool(own),
-                ports,
+                max(ports, LEAST_PORTS) if key.is_ros2 else ports,
                 networks & usable,
                 own,
                 chosen_plane(every, settings.data_plane),
-                chosen_control(every, settings.slave_control),
+                "any" if key.is_ros2 else chosen_control(every, settings.slave_control),
                 chosen_direction(every, settings.direction),
+                not key.is_ros2 and chosen_udp(every, settings),
+                _peers(every, settings) if key.is_ros2 else (),
             )
         )
     told = [_bad_network(name, settings.uplink) for name in sorted(bad & _networks(alive))]
@@ -100,6 +111,20 @@ def chosen_direction(members: Iterable[Member], default: Direction) -> Direction
     return "both" if "both" in asked else "out"
 
 
+def chosen_udp(members: Collection[Member], settings: PlanSettings) -> bool:
+    """Whether a proxy with these containers has its ports for UDP, too: if one of them asks for it.
+
+    That is of no use without the other direction: datagrams outwards need no port.
+    """
+    both = chosen_direction(members, settings.direction) == "both"
+    return both and any(settings.udp if one.udp is None else one.udp for one in members)
+
+
+def _peers(members: Iterable[Member], settings: PlanSettings) -> tuple[str, ...]:
+    """Whom a proxy for ROS 2 tells of participants: whom the operator says, and each container."""
+    return tuple(sorted({*settings.ros2_peer, *(peer for each in members for peer in each.peers)}))
+
+
 def _networks(members: Iterable[Member]) -> frozenset[str]:
     return frozenset(name for member in members for name in member.networks)
 
@@ -127,10 +152,17 @@ def _bad_network(name: str, uplink: str) -> Problem:
 
 
 def _outvoted(desired: Iterable[Desired]) -> Iterator[Problem]:
-    """Tell the containers that share a proxy with one that asks for something else."""
+    """Tell the containers what their proxy is not that they ask for."""
     for one in desired:
         winners = [m.container.name for m in one.members if m.data_plane == one.data_plane]
         for member in one.members:
+            if member.udp and one.direction == "out":
+                yield Problem(
+                    f"container {member.container.name}",
+                    f"label {UDP}=true is ignored: datagrams get in with both directions alone; "
+                    f"add the label {DIRECTION}=both, or take this one off",
+                    fatal=False,
+                )
             if member.data_plane not in (None, one.data_plane):
                 yield Problem(
                     f"container {member.container.name}",
@@ -174,10 +206,14 @@ def assign(desired: Collection[Desired], observed: HostState) -> tuple[Aliases, 
     """
     given: dict[Key, dict[str, tuple[str, ...]]] = {}
     problems: list[Problem] = []
+    neighbours: dict[str, list[Container]] = defaultdict(list)
+    for container in observed.containers:
+        for network in container.networks:
+            neighbours[network].append(container)
     for network in sorted({name for one in desired if one.live for name in one.networks}):
         there = [one for one in desired if network in one.networks]
         for alias in sorted({name for one in there if one.live for name in _names(one.key)}):
-            claim = _claim(network, alias, there, observed)
+            claim = _claim(network, alias, there, neighbours[network], observed.sandboxes)
             if claim.owner is not None:
                 names = given.setdefault(claim.owner, {})
                 names[network] = (*names.get(network, ()), alias)
@@ -205,17 +241,25 @@ def holds(container: Container, network: str, alias: str) -> bool:
 
 def _names(key: Key) -> tuple[str, ...]:
     """The names that a proxy is to have: its container's own, too, which has no endpoint itself."""
+    if key.is_ros2:  # found by multicast, or as a peer
+        return (proxy_name(key),)
     host = master(key).host
     return (ALIAS, proxy_name(key), *(() if is_address(host) else (host,)))
 
 
-def _claim(network: str, alias: str, there: list[Desired], observed: HostState) -> _Claim:
+def _claim(
+    network: str,
+    alias: str,
+    there: Iterable[Desired],
+    neighbours: Iterable[Container],
+    sandboxes: Iterable[Sandbox],
+) -> _Claim:
     others = [
         container.name
-        for container in observed.containers
+        for container in neighbours
         if container.state not in _GONE and holds(container, network, alias)
     ]
-    having = [box for box in observed.sandboxes if holds(box.container, network, alias)]
+    having = [box for box in sandboxes if holds(box.container, network, alias)]
     staying = [one.key for one in there if one.key in {box.key for box in having}]
     # One that is restarting can't leave the network: it answers there again in a moment.
     stuck = sorted(box.key for box in having if box.container.state == "restarting")

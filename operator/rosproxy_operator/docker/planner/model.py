@@ -7,6 +7,7 @@ from ipaddress import IPv4Network
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import Rule
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy.settings import DataPlane, Direction, SlaveControl
 from rosproxy_operator.common.proxy_bounds import OWN_BOUNDS, ProxyBounds
 
@@ -18,6 +19,10 @@ SERVING = STARTED | {"restarting"}
 MOST_PORTS = 1000
 """Ports that a proxy can have: each costs rules and, by default, a process of the engine."""
 GIBIBYTE = 1024 * 1024 * 1024
+NOWHERE = "none"
+"""What stands for no LAN."""
+STARTED_LABEL = "io.rosproxy.started"
+"""On a redirect's container: when the one was started whose network it is in."""
 WINDOW = PortRange(11400, 65535)
 """Where ports are looked for: above the master's and the admin endpoint's."""
 
@@ -26,16 +31,22 @@ WINDOW = PortRange(11400, 65535)
 class PlanSettings:
     """The operator's options that decide what is planned, by their names.
 
-    ``master_uri``, ``advertise_host`` (None if not given), ``data_plane`` and ``direction`` are for
-    containers without a label of their own. ``ports`` is the least number that a proxy gets,
-    ``port_window`` where they are looked for, ``publish_address`` the host's addresses on which
-    they are published.
+    ``master_uri``, ``advertise_host`` (None if not given), ``data_plane``, ``direction`` and
+    ``udp`` are for containers without a label of their own. ``ports`` is the least number that a
+    proxy gets, ``port_window`` where they are looked for, ``publish_address`` the host's addresses
+    on which they are published.
     ``grace`` is in seconds: how long a proxy outlives its last container.
 
+    Of ROS 2: ``ros2_peer`` are hosts outside (``host`` or ``host:port``) that every proxy tells of
+    its participants; ``ros2_lan`` is this host's address on the LAN where participants are heard by
+    multicast, ``none`` if nowhere, empty: where the advertised host is, or far hosts.
+
     What labels may ask for at most: a master that one of ``allow_master`` means (patterns as
-    `labels.bounds.read_master_pattern` gives them; none: see there), ``max_ports``, the planes of
-    ``allow_data_plane`` (none: all but kernel), and ``slave_control`` or less. The operator's own
-    options are allowed in any case.
+    `labels.bounds.read_host_pattern` gives them; none: see there), peers that one of ``allow_peer``
+    means (none: any), ``max_ports``, the planes of ``allow_data_plane`` (none: all but kernel), and
+    ``slave_control`` or less. The operator's own options are allowed in any case. ``redirect``:
+    nodes whose master is given by address are led to their proxy by a rule in their container's
+    network, unless its label says no.
 
     Each proxy may take ``proxy_memory`` bytes and have ``proxy_pids`` threads and processes; 0: any
     number. The defaults are several times what a thousand connections take at full rate
@@ -59,13 +70,18 @@ class PlanSettings:
     uplink: str = "0-rosproxy"
     data_plane: DataPlane = "auto"
     direction: Direction = "out"
+    udp: bool = False
     allow_master: tuple[str, ...] = ()
+    allow_peer: tuple[str, ...] = ()
     max_ports: int = 100
     allow_data_plane: tuple[DataPlane, ...] = ()
     slave_control: SlaveControl = "any"
+    redirect: bool = True
     proxy_memory: int = GIBIBYTE
     proxy_pids: int = 8192
     proxy_bounds: ProxyBounds = OWN_BOUNDS
+    ros2_peer: tuple[str, ...] = ()
+    ros2_lan: str = ""
     policy: tuple[PolicyLayer, ...] = ()
     secret: str = field(default="", repr=False)
 
@@ -92,10 +108,12 @@ class Container:
     """A container, in the engine's words.
 
     ``network_mode`` is ``bridge``, ``host``, ``none``, ``container:ID`` or a network's name,
-    ``master_uri`` ROS_MASTER_URI of its environment or empty. ``host_ports`` are the TCP ports that
-    it publishes on the host, or will once it is started. ``started_at`` is empty if it never was,
-    or if nobody asked. ``forged`` says of one that has the labels of this operator's own what shows
-    that it is none; it is empty for all others.
+    ``master_uri`` ROS_MASTER_URI of its environment or empty, ``variables`` those that say what it
+    is of ROS 2, and how its nodes call their host. ``host_ports`` are the TCP ports that it
+    publishes on the host, or will once it is started, ``udp_ports`` the UDP ports. ``started_at``
+    is empty if it never was, or if nobody asked; ``exit_code`` is how it ended last. ``forged``
+    says of one that has the labels of this operator's own what shows that it is none; it is empty
+    for all others.
     """
 
     id: str
@@ -107,8 +125,11 @@ class Container:
     master_uri: str = ""
     host_ports: frozenset[int] = frozenset()
     hostname: str = ""
+    variables: Mapping[str, str] = field(default_factory=dict)
+    udp_ports: frozenset[int] = frozenset()
     started_at: str = ""
     forged: str = ""
+    exit_code: int = 0
 
     @property
     def alive(self) -> bool:
@@ -141,10 +162,25 @@ class Network:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Key:
-    """What tells proxies of one host apart: the master's URI and the advertised host."""
+    """What tells proxies of one host apart: master's URI or domain, and the advertised host.
+
+    ROS 1 has a master. ROS 2 has a domain, and its ``master_uri`` is empty: a container with both
+    has two proxies, since the containers of a master are not those of a domain.
+    """
 
     master_uri: str
     advertise_host: str
+    domain: int | None = None
+
+    @property
+    def is_ros2(self) -> bool:
+        """Whether it is of a proxy for ROS 2, which publishes UDP ports instead of TCP ports."""
+        return self.domain is not None
+
+    @property
+    def graph(self) -> str:
+        """What its nodes have in common, as users are told of it."""
+        return f"ROS 2 domain {self.domain}" if self.is_ros2 else f"master {self.master_uri}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,18 +208,43 @@ class Proxy(OwnContainer):
     """A proxy runs in it, in the namespace of the sandbox that it `shares`, by id."""
 
 
+class EarContainer(OwnContainer):
+    """The ear of a proxy for ROS 2 runs in it, in the host's network."""
+
+
+class RedirectContainer(OwnContainer):
+    """It has set, or taken away, rules in the network namespace that it `shares`, by id, and ended.
+
+    It is kept as the record of them. ``started`` is when the container was started whose namespace
+    that is: each start of it makes another one.
+    """
+
+    @property
+    def started(self) -> str:
+        """When the container was started whose network it has been in."""
+        return self.container.labels.get(STARTED_LABEL, "")
+
+    @property
+    def done(self) -> bool:
+        """Whether its rules are as it was to make them."""
+        return self.container.state == "exited" and self.container.exit_code == 0
+
+
 @dataclass(frozen=True, slots=True)
 class HostState:
     """A Docker host at one moment.
 
     ``containers`` are all but the operator's own: the proxies and their sandboxes. ``ephemeral``
     is the range from which the kernel takes ports for connections, ``listening`` are TCP ports on
-    which something listens in the operator's own network namespace. ``image_id`` is the id of the
-    proxy's image, empty if the host does not have it. ``advertise`` gives, for a master's host
-    name, this host's address towards it; without an entry it is not known. ``masters`` are the
+    which something listens in the operator's own network namespace, ``listening_udp`` UDP ports.
+    ``image_id`` is the id of the proxy's image, empty if the host does not have it. ``advertise``
+    gives, for a master's host name, this host's address towards it; without an entry it is not
+    known. ``far`` is its address towards hosts far away, empty where unknown. ``masters`` are the
     addresses of the masters' hosts, by name, empty where unknown. ``busy`` are the names of own
     containers of which not everything is known yet, so that nothing can be done to them, and
     ``addresses`` those of all containers. ``secret`` is what the tokens of proxies are made of.
+    ``redirects`` are the records of rules in containers' networks; they are not among its ``own``,
+    as no proxy is made of them.
     """
 
     containers: tuple[Container, ...]
@@ -191,9 +252,13 @@ class HostState:
     proxies: tuple[Proxy, ...]
     ephemeral: PortRange
     listening: frozenset[int] = frozenset()
+    listening_udp: frozenset[int] = frozenset()
     image_id: str = ""
     advertise: Mapping[str, str] = field(default_factory=dict)
+    far: str = ""
     sandboxes: tuple[Sandbox, ...] = ()
+    ears: tuple[EarContainer, ...] = ()
+    redirects: tuple[RedirectContainer, ...] = ()
     masters: Mapping[str, str] = field(default_factory=dict)
     busy: frozenset[str] = frozenset()
     addresses: frozenset[str] = frozenset()
@@ -202,7 +267,7 @@ class HostState:
     @property
     def own(self) -> tuple[OwnContainer, ...]:
         """All that is the operator's own."""
-        return (*self.sandboxes, *self.proxies)
+        return (*self.sandboxes, *self.proxies, *self.ears)
 
     @property
     def keys(self) -> frozenset[Key]:
@@ -217,6 +282,14 @@ class HostState:
         """The proxies of a key."""
         return tuple(one for one in self.proxies if one.key == key)
 
+    def gateway(self, name: str) -> str:
+        """The gateway of a network; empty if it has none or is not there."""
+        return next((one.gateway for one in self.networks if one.name == name), "")
+
+    def ears_of(self, key: Key) -> tuple[EarContainer, ...]:
+        """The ears of a key."""
+        return tuple(one for one in self.ears if one.key == key)
+
     def sandbox_of(self, proxy: Proxy) -> Sandbox | None:
         """The sandbox in whose network namespace a proxy is; None if it is there no more."""
         home = proxy.container.shares
@@ -228,11 +301,14 @@ class Member:
     """A labelled container, and what it wants of its proxy: labels and settings put together.
 
     ``ports`` is 0, ``data_plane`` and ``slave_control`` are None without a label, ``direction`` is
-    None if any will do. ``networks`` are the names of those on which it wants to meet its proxy.
-    ``needs`` is the host in its ROS_MASTER_URI: the name by which it looks for the proxy,
-    ``rosproxy`` if it has no such variable, empty where no alias can help it. ``policy`` are rules
-    for its own nodes alone. A container that is not alive only keeps networks joined, and what else
-    its labels made its proxy, for a while.
+    None if any will do, ``udp`` if the option says. ``networks`` are the names of those on which it
+    wants to meet its proxy. ``needs`` is the host in its ROS_MASTER_URI: the name by which it looks
+    for the proxy, ``rosproxy`` if it has no such variable, empty where no alias can help it.
+    ``policy`` are rules for its own nodes alone. ``peers`` are hosts outside, for a member of a
+    ROS 2 domain, which has none of the others but ``ports`` and ``networks``. ``redirect`` is what
+    its label says, None without one; ``by_address`` the address and port of its master that are to
+    lead to its proxy, in its network, None if nothing is to. A container that is not alive only
+    keeps networks joined, and what else its labels made its proxy, for a while.
     """
 
     container: Container
@@ -243,7 +319,11 @@ class Member:
     data_plane: DataPlane | None = None
     slave_control: SlaveControl | None = None
     direction: Direction | None = None
+    udp: bool | None = None
     policy: tuple[Rule, ...] = ()
+    peers: frozenset[str] = frozenset()
+    redirect: bool | None = None
+    by_address: HostPort | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +331,9 @@ class Desired:
     """What one proxy is to be.
 
     Without ``live`` no running container wants it any more: it is left as it is, but for the
-    networks that it leaves, until its grace ends. ``ports`` is the least number of ports.
+    networks that it leaves, until its grace ends. ``ports`` is the least number of ports. ``udp``:
+    they are published for UDP as well. ``peers`` are whom a proxy for ROS 2 tells of its
+    participants.
     """
 
     key: Key
@@ -262,3 +344,5 @@ class Desired:
     data_plane: DataPlane = "auto"
     slave_control: SlaveControl = "any"
     direction: Direction = "out"
+    udp: bool = False
+    peers: tuple[str, ...] = ()

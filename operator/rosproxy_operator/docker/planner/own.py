@@ -21,14 +21,23 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from rosproxy_operator.common.ros2 import EAR_COMMAND
 from rosproxy_operator.docker.planner.specs import (
+    NFT,
     PROXY_COMMAND,
+    REDIRECT_USER,
+    ROLE_EAR,
+    ROLE_PROXY,
+    ROLE_REDIRECT,
     ROLE_SANDBOX,
     SANDBOX_COMMAND,
     USER,
     OwnLabels,
+    ear_name,
     is_kernel_host,
     proxy_name,
+    published_ports,
+    redirect_name,
     sandbox_name,
 )
 
@@ -41,6 +50,12 @@ _NEVER = (
 """Of the HostConfig what the operator never sets."""
 _OWN_IPC = (None, "", "private", "shareable")
 """What engines have for IpcMode where nothing was said."""
+_COMMANDS = {
+    ROLE_SANDBOX: SANDBOX_COMMAND,
+    ROLE_PROXY: PROXY_COMMAND,
+    ROLE_EAR: EAR_COMMAND,
+    ROLE_REDIRECT: (NFT,),
+}
 _SYSCTLS = {"net.ipv4.ip_local_port_range", "net.ipv4.ip_forward"}
 
 
@@ -71,18 +86,28 @@ def gives_away(own: OwnLabels, name: str, making: Making, image_id: str) -> str:
     """
     if not has_own_name(own, name):
         return f"its name is not {_name(own)}"
-    if making.user != USER:
-        return f"its user is not {USER}"
-    sandbox = own.role == ROLE_SANDBOX
-    command = SANDBOX_COMMAND if sandbox else PROXY_COMMAND
-    if making.command != command and (sandbox or making.image != image_id):
+    user = REDIRECT_USER if own.role == ROLE_REDIRECT else USER
+    if making.user != user:
+        return f"its user is not {user}"
+    command = _COMMANDS[own.role]
+    of_image = own.role == ROLE_PROXY and making.image == image_id
+    # What a redirect runs ends with its rules: they are in its fingerprint, and so in its name.
+    found = making.command[:1] if own.role == ROLE_REDIRECT else making.command
+    if found != command and not of_image:
         return f"its command is not {' '.join(command)}"
-    odd = _odd_sandbox(own, making.host) if sandbox else _odd_proxy(making.host)
-    return next((f"its HostConfig.{name} is none that it gives" for name in odd), "")
+    odd = {
+        ROLE_SANDBOX: _odd_sandbox(own, making.host),
+        ROLE_PROXY: _odd_proxy(making.host),
+        ROLE_EAR: _odd_ear(making.host),
+        ROLE_REDIRECT: _odd_redirect(making.host),
+    }
+    return next((f"its HostConfig.{name} is none that it gives" for name in odd[own.role]), "")
 
 
 def _name(own: OwnLabels) -> str:
-    return sandbox_name(own.key) if own.role == ROLE_SANDBOX else proxy_name(own.key)
+    if own.role == ROLE_REDIRECT:
+        return redirect_name(own.key, own.fingerprint)
+    return {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name}.get(own.role, proxy_name)(own.key)
 
 
 def _odd(host: Mapping[str, Any]) -> Iterator[str]:
@@ -106,16 +131,43 @@ def _odd_sandbox(own: OwnLabels, host: Mapping[str, Any]) -> Iterator[str]:
     if mode in ("host", "none") or mode.startswith("container:"):
         yield "NetworkMode"
     bindings = host.get("PortBindings") or {}
-    wanted = {f"{port}/tcp": {str(port)} for port in own.range.ports()}
+    wanted = [
+        {name: {str(port)} for name, port in published_ports(own.key, own.range, udp)}
+        for udp in (False, True)
+    ]
     found = {
         port: {str(each.get("HostPort")) for each in bound or ()}
         for port, bound in bindings.items()
     }
-    if found != wanted:
+    if found not in wanted:
         yield "PortBindings"
     sysctls = (host.get("Sysctls") or {}).keys()
     if "net.ipv4.ip_local_port_range" not in sysctls or not sysctls <= _SYSCTLS:
         yield "Sysctls"
+
+
+def _odd_ear(host: Mapping[str, Any]) -> Iterator[str]:
+    """An ear is in the host's network, and has no other right."""
+    yield from _odd(host)
+    if host.get("CapAdd"):
+        yield "CapAdd"
+    if host.get("SecurityOpt") != ["no-new-privileges:true"]:
+        yield "SecurityOpt"
+    if host.get("NetworkMode") != "host":
+        yield "NetworkMode"
+    yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
+
+
+def _odd_redirect(host: Mapping[str, Any]) -> Iterator[str]:
+    """It has NET_ADMIN in another container's network, and nothing else."""
+    yield from _odd(host)
+    if [str(name).removeprefix("CAP_") for name in host.get("CapAdd") or ()] != ["NET_ADMIN"]:
+        yield "CapAdd"
+    if host.get("SecurityOpt") != ["no-new-privileges:true"]:
+        yield "SecurityOpt"
+    if not str(host.get("NetworkMode")).startswith("container:"):
+        yield "NetworkMode"
+    yield from (name for name in ("PortBindings", "Sysctls") if host.get(name))
 
 
 def _odd_proxy(host: Mapping[str, Any]) -> Iterator[str]:

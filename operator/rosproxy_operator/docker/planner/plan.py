@@ -13,10 +13,12 @@ from rosproxy_operator.docker.planner.actions import (
 )
 from rosproxy_operator.docker.planner.allocation import allocate, refused
 from rosproxy_operator.docker.planner.desired import assign, desire
+from rosproxy_operator.docker.planner.ear import missing_ear, with_ear
 from rosproxy_operator.docker.planner.label_policy import within_bounds
 from rosproxy_operator.docker.planner.labels.members import LabelReading, find_members
 from rosproxy_operator.docker.planner.model import Desired, HostState, Key, Member, PlanSettings
-from rosproxy_operator.docker.planner.specs import master
+from rosproxy_operator.docker.planner.redirect import redirect_steps
+from rosproxy_operator.docker.planner.specs import master, unresolved_master
 from rosproxy_operator.docker.planner.state import DockerMemory, looked, noticed
 from rosproxy_operator.docker.planner.steps import PlanContext, leave, retired, wanted_steps
 
@@ -28,12 +30,15 @@ SOON = 1.0
 class Group:
     """Actions to be carried out one after the other, for one key (or for the uplink: no key).
 
+    Those ``about`` a container alone, a redirect, wait for nothing else of the key, nor else for
+    them.
     When one fails, the rest is left out, so that a proxy is only removed when the one that takes
     over was created; but a failed Connect or Disconnect keeps nothing else from being done.
     """
 
     key: Key | None
     actions: tuple[Action, ...]
+    about: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +46,9 @@ class DockerPlan:
     """What to do, group after group, and what to remember.
 
     ``deferred`` are groups that have to wait until the address of their master is known: without
-    it a proxy would find itself by its master's name. ``again_in`` is in how many seconds to look
-    again even if nothing happens; None: no need.
+    it a proxy would find itself by its master's name; or until the uplink is there, where an ear
+    listens. ``again_in`` is in how many seconds to look again even if nothing happens; None: no
+    need.
     """
 
     groups: tuple[Group, ...]
@@ -72,7 +78,7 @@ def plan(
     ``observed``. ``memory`` is that of the plan before, or an empty one. ``now`` is in seconds of a
     monotonic clock that goes on as long as the memory does.
     """
-    members, unplaced = find_members(labels, observed)
+    members, unplaced = find_members(labels, observed, settings)
     members, crowded = within_bounds(members, settings)
     memory = noticed(memory, members, now)
     desired, bad_networks = desire(observed, settings, members, memory, now)
@@ -89,14 +95,15 @@ def plan(
         if ports := memory.planned.get(one.key):  # else its problem is told already
             names = aliases.get(one.key, {})
             context = PlanContext(observed, settings, one, ports, names, creatable)
-            planned[one.key] = wanted_steps(context)
+            steps = wanted_steps(context)
+            planned[one.key] = steps if steps is None else with_ear(context, steps)
     problems = [*labels.problems, *unplaced, *crowded, *bad_networks, *missed, *tight]
     problems += _unwell(observed, live)
+    problems += _deaf(observed, settings, live)
     if obstacle:
         problems.append(replace(obstacle, fatal=None in planned.values()))
-    busy = {one.key for one in observed.own if one.container.name in observed.busy}
-    groups = [g for g in _groups(observed, settings.uplink, desired, planned) if g.key not in busy]
-    deferred = tuple(group for group in groups if _waits(group, observed))
+    groups = [*_possible(observed, settings, desired, planned)]
+    deferred = tuple(group for group in groups if _waits(group, observed, settings.uplink))
     found = DockerPlan(
         groups=tuple(group for group in groups if group not in deferred),
         deferred=deferred,
@@ -127,6 +134,20 @@ def _obstacle(observed: HostState, settings: PlanSettings) -> Problem | None:
     return None
 
 
+def _possible(
+    observed: HostState,
+    settings: PlanSettings,
+    desired: Collection[Desired],
+    planned: Mapping[Key, list[Action] | None],
+) -> Iterator[Group]:
+    """All groups but those of keys of which a container is busy, and the redirects'."""
+    busy = {one.key for one in observed.own if one.container.name in observed.busy}
+    every = _groups(observed, settings.uplink, desired, planned)
+    yield from (group for group in every if group.key not in busy)
+    for steps in redirect_steps(observed, settings, desired):
+        yield Group(steps.key, steps.actions, f"container {steps.container}")
+
+
 def _groups(
     observed: HostState,
     uplink: str,
@@ -147,12 +168,24 @@ def _groups(
             yield Group(one.key, tuple(actions))
 
 
-def _waits(group: Group, observed: HostState) -> bool:
-    """Whether a group makes a proxy whose master has no known address."""
+def _waits(group: Group, observed: HostState, uplink: str) -> bool:
+    """Whether a group makes a proxy that lacks an address: its master's, or that of its uplink."""
     return any(
-        isinstance(action, Create) and observed.masters.get(master(action.key).host) == ""
+        isinstance(action, Create) and _lacks(action.key, observed, uplink)
         for action in group.actions
     )
+
+
+def _lacks(key: Key, observed: HostState, uplink: str) -> bool:
+    if key.is_ros2:  # its ear is at the uplink's gateway
+        return uplink not in {network.name for network in observed.networks}
+    return observed.masters.get(master(key).host) == ""
+
+
+def _deaf(observed: HostState, settings: PlanSettings, live: Collection[Key]) -> Iterator[Problem]:
+    """Proxies for ROS 2 that lack an ear."""
+    found = (missing_ear(key, observed, settings) for key in sorted(live) if key.is_ros2)
+    yield from filter(None, found)
 
 
 def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
@@ -162,12 +195,7 @@ def _unwell(observed: HostState, live: Collection[Key]) -> Iterator[Problem]:
         if one.key in live and one.container.state == "restarting":
             yield Problem(f"proxy {name}", f"ends and is restarted: see docker logs {name}")
     for host in sorted(host for host, address in observed.masters.items() if not address):
-        yield Problem(
-            f"master {host}",
-            f"the name {host} can't be resolved where the operator runs: give the master's "
-            f"address instead, or the operator that name (/etc/hosts; in a container: "
-            f"--add-host {host}:ADDRESS)",
-        )
+        yield Problem(f"master {host}", unresolved_master(host))
 
 
 def _ends(
@@ -181,9 +209,11 @@ def _ends(
             yield settings.grace - (now - memory.absent[one.key])
         if one.live and any(e.state == "removing" or e.name in memory.refusals for e in own):
             yield SOON
+    if any(one.container.state == "removing" for one in observed.redirects):
+        yield SOON
     for member in found.members:
         boxes = [one.container for one in observed.sandboxes_of(member.key)]
         joined = any(b.networks & member.networks for b in boxes if b.state != "removing")
-        asks = member.data_plane or member.direction
+        asks = member.data_plane or member.direction or member.udp or member.peers
         if not member.container.alive and (joined or asks):
             yield settings.grace - (now - memory.exited[member.container.id])

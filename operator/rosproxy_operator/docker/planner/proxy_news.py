@@ -12,7 +12,7 @@ from ipaddress import IPv4Network
 from typing import Any
 
 from rosproxy.access.layers import PolicyLayer
-from rosproxy.net.addresses import is_address, is_inside
+from rosproxy.net.addresses import is_address, is_inside, is_loopback
 from rosproxy_operator.docker.planner.label_policy import (
     RecentLayers,
     label_layers,
@@ -26,6 +26,7 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     Proxy,
 )
+from rosproxy_operator.docker.planner.redirect import in_place
 from rosproxy_operator.docker.planner.specs import master
 
 AGAIN = (0.0, 1.0, 3.0, 10.0)
@@ -44,13 +45,18 @@ _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class ContainerArrival:
-    """A labelled container on a network of its proxy, since one start of it (``endpoint``)."""
+    """A labelled container on a network of its proxy, since one start of it (``endpoint``).
+
+    ``redirect`` is what leads its nodes to the proxy, if anything does: those that were quicker
+    are looked for again once it is there.
+    """
 
     container: str
     network: str
     address: str
     endpoint: str
     names: frozenset[str] = field(compare=False)
+    redirect: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,14 +211,18 @@ def facts(
     members: Collection[Member],
     policy: tuple[PolicyLayer, ...] = (),
 ) -> NetworkFacts:
-    """What a look says to a proxy. ``members`` are those of all, ``policy`` the administrator's."""
-    host, box = master(proxy.key).host.lower(), observed.sandbox_of(proxy)
+    """What a look says to a proxy. ``members`` are those of all, ``policy`` the administrator's.
+
+    One for ROS 2 has no master, and hears by itself of containers that come.
+    """
+    host = "" if proxy.key.is_ros2 else master(proxy.key).host.lower()
+    box = observed.sandbox_of(proxy)
     joined = {a.network for a in box.container.attachments if a.address} if box else set()
     by_id = {container.id: container for container in observed.containers}
     running = [container for container in observed.containers if container.state in STARTED]
     mine = [member for member in members if member.key == proxy.key]
     return NetworkFacts(
-        master_address="" if is_address(host) else observed.masters.get(host, ""),
+        master_address="" if not host or is_address(host) else observed.masters.get(host, ""),
         addresses={
             (container.id, place.network): place.address
             for container in running
@@ -226,7 +236,10 @@ def facts(
             for subnet in network.subnets
         ),
         arrivals=frozenset(
-            arrival for member in mine for arrival in _arrivals(member.container, by_id, joined)
+            arrival
+            for member in mine
+            if not proxy.key.is_ros2
+            for arrival in _arrivals(member, observed, by_id, joined)
         ),
         running=frozenset(container.id for container in running),
         selected=frozenset(
@@ -244,13 +257,19 @@ def _places(container: Container, networks: Collection[str]) -> list[Attachment]
 
 
 def _arrivals(
-    container: Container, by_id: Mapping[str, Container], joined: set[str]
+    member: Member, observed: HostState, by_id: Mapping[str, Container], joined: set[str]
 ) -> list[ContainerArrival]:
     """A container's places; of one that shares another's network, the other's."""
+    container = member.container
     host = network_owner(container, by_id)
     if container.state not in STARTED or host.state not in STARTED:
         return []
     own = {container.name, container.hostname, container.id[:12], host.hostname}
+    if (
+        member.by_address
+    ):  # by a name, none would have come to the master before its proxy was there
+        own |= {container.variables.get(name, "") for name in ("ROS_IP", "ROS_HOSTNAME")}
+        own = {name for name in own if not is_loopback(name)}
     return [
         ContainerArrival(
             container.id,
@@ -258,6 +277,7 @@ def _arrivals(
             place.address,
             place.endpoint,
             frozenset(name for name in place.names | own if _HOST_NAME.fullmatch(name)),
+            in_place(observed, member.key, host),
         )
         for place in _places(host, joined)
     ]

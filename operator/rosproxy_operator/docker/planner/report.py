@@ -12,7 +12,7 @@ from rosproxy.telemetry.text import clean, plural, shorten, wrap
 Status = Mapping[str, Any]
 """What ``rosproxy-operator docker status --json`` prints."""
 
-PROXIES = ("PROXY", "STATE", "MASTER", "OUTSIDE", "PORTS")
+PROXIES = ("PROXY", "STATE", "MASTER OR DOMAIN", "OUTSIDE", "PORTS")
 CONTAINERS = ("CONTAINER", "STATE", "PROXY", "PORTS", "NODES")
 LEAST_NAME = 20
 """Columns that a name gets at least, even where the line is then too long."""
@@ -22,7 +22,8 @@ INDENT = "    "
 
 def render(status: Status, columns: int, lines: int | None = None) -> str:
     """The whole status in ``columns``; in ``lines`` what matters most if there is a bound."""
-    proxies, containers = len(status["proxies"]), len(status["containers"])
+    proxies = len(status["proxies"])
+    containers = len({container["name"] for container in status["containers"]})
     head = wrap(
         f"rosproxy-operator {clean(status['version'])}: {plural(containers, 'container')}, "
         f"{proxies} {'proxy' if proxies == 1 else 'proxies'}, uplink network "
@@ -66,10 +67,17 @@ def _proxy_row(proxy: Status) -> tuple[str, ...]:
     return (
         clean(proxy["name"]),
         clean(proxy["state"]) + (", no answer" if lost else ""),
-        clean(proxy["master_uri"]) + (" DOWN" if proxy["master_up"] is False else ""),
+        _graph(proxy),
         clean(proxy["advertise_host"]),
         clean(proxy["range"]) + (f" {proxy['used']} used" if proxy["used"] is not None else ""),
     )
+
+
+def _graph(proxy: Status) -> str:
+    """What a proxy's nodes have in common."""
+    if proxy["ros"] == "2":
+        return f"domain {proxy['domain']}" + (", no ear" if proxy["ear"] is None else "")
+    return clean(proxy["master_uri"]) + (" DOWN" if proxy["master_up"] is False else "")
 
 
 def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
@@ -82,21 +90,42 @@ def _containers(status: Status, columns: int, details: bool) -> Iterator[str]:
         [CONTAINERS, *(_container_row(each, ranges) for each in containers)], columns
     )
     yield heading
+    told: set[str] = set()
     for container, row in zip(containers, rows, strict=True):
         yield row
+        if details and (redirect := container["redirect"]):
+            where = (
+                "leads to its proxy there"
+                if redirect["in_place"]
+                else "does not lead to its proxy yet"
+            )
+            yield from wrap(f"{redirect['master']} {where}", columns, INDENT)
         if details:
             names = [clean(name) for node in container["nodes"] for name in node["names"]]
             yield from wrap("  ".join(names), columns, INDENT, most=MOST_LINES)
+            for one in container["participants"]:
+                yield from wrap(_participant(one), columns, INDENT, most=MOST_LINES)
+        yield from _wrong(filter(None, (p["problem"] for p in container["participants"])), columns)
         subject = f"container {container['name']}"
-        yield from _wrong(
-            (each["text"] for each in status["problems"] if each["subject"] == subject), columns
-        )
+        if subject not in told:
+            yield from _wrong(
+                (each["text"] for each in status["problems"] if each["subject"] == subject), columns
+            )
+        told.add(subject)
+
+
+def _participant(one: Status) -> str:
+    """A participant's topics and services, in one line."""
+    words = (("publishes", "publishes"), ("subscribes to", "subscribes"), ("serves", "services"))
+    found = [f"{word} {'  '.join(map(clean, one[key]))}" for word, key in words if one[key]]
+    return f"{clean(one['vendor'])}: {'; '.join(found) or 'nothing announced yet'}"
 
 
 def _container_row(container: Status, ranges: Mapping[str, str]) -> tuple[str, ...]:
     name, state, proxy = container["name"], container["state"], container["proxy"]
     cells = map(clean, (name, state, proxy or "-", ranges.get(proxy, "-")))
-    return (*cells, str(len(container["nodes"])))
+    participants = plural(len(container["participants"]), "participant")
+    return (*cells, participants if container["ros"] == "2" else str(len(container["nodes"])))
 
 
 def _wrong(texts: Iterable[str], columns: int) -> Iterator[str]:

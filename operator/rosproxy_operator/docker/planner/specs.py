@@ -16,14 +16,28 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.settings import SettingError, hash_token, parse_range
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
-from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
-from rosproxy_operator.docker.planner.model import Key, PlanSettings
+from rosproxy_operator.common.ros2 import (
+    EAR_COMMAND,
+    LAST_DOMAIN,
+    ear_variables,
+    well_known_ports,
+)
+from rosproxy_operator.docker.planner.actions import (
+    Create,
+    CreateEar,
+    CreateRedirect,
+    CreateSandbox,
+)
+from rosproxy_operator.docker.planner.model import STARTED_LABEL, Key, PlanSettings
 
 MANAGED = "io.rosproxy.managed"
 ROLE = "io.rosproxy.role"
 ROLE_SANDBOX = "ports"
 ROLE_PROXY = "proxy"
+ROLE_EAR = "ear"
+ROLE_REDIRECT = "redirect"
 MASTER_URI = "io.rosproxy.master-uri"
+DOMAIN = "io.rosproxy.domain"
 ADVERTISE_HOST = "io.rosproxy.advertise-host"
 RANGE = "io.rosproxy.range"
 FINGERPRINT = "io.rosproxy.fingerprint"
@@ -33,22 +47,38 @@ SECRET = "io.rosproxy.secret"  # noqa: S105 - the label's name
 FORMER_TOKEN = "ROSPROXY_ADMIN_TOKEN"  # noqa: S105 - the variable's name
 """Where proxies had their token before they got the hash alone."""
 ADMIN_PORT = 11312
-_COMMON: Mapping[str, Any] = {
+DEFAULT_MASTER_PORT = 11311
+COMMON: Mapping[str, Any] = {
     "ReadonlyRootfs": True,
     "CapDrop": ["ALL"],
     "SecurityOpt": ["no-new-privileges:true"],
-    "RestartPolicy": {"Name": "unless-stopped"},
+    "RestartPolicy": {"Name": "always"},
 }
-"""The ``HostConfig`` of both containers of a proxy."""
+"""The ``HostConfig`` of all containers of a proxy.
+
+An engine that was killed stops what runs when it is back, and then takes it for stopped on purpose:
+of that, it starts again what is to run ``always``, not what is so ``unless-stopped``.
+"""
 _KERNEL = {"CapAdd": ["NET_ADMIN"], "SecurityOpt": ["no-new-privileges:false"]}
 """What a proxy needs besides so that the kernel forwards for it: see the proxy's Dockerfile.
 
 Said in so many words, as an engine may have no-new-privileges for its default.
 """
+_ROLES = {
+    CreateSandbox: ROLE_SANDBOX,
+    Create: ROLE_PROXY,
+    CreateEar: ROLE_EAR,
+    CreateRedirect: ROLE_REDIRECT,
+}
+EAR_MEMORY, EAR_PIDS = 128 * 1024**2, 64
+"""Bytes and threads of an ear, which has 30 MiB and one."""
 USER = "10001:10001"
 SANDBOX_COMMAND = ("sleep", "infinity")
 PROXY_COMMAND = ("rosproxy", "run")
 """What the proxy's image does by itself (its Dockerfile): the operator gives no other command."""
+NFT = "/usr/sbin/nft"
+REDIRECT_USER = "0:0"
+"""Whose capabilities count without a file that has them, which no-new-privileges would defeat."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +92,10 @@ class OwnLabels:
 
 
 def proxy_name(key: Key) -> str:
-    """The name of a key's proxy container: its master's host and six digits of the key's hash."""
-    digest = hashlib.sha256(f"{key.master_uri} {key.advertise_host}".encode()).hexdigest()
-    slug = re.sub(r"[^a-z0-9]+", "-", master(key).host.lower())[:30].strip("-")
+    """The name of a key's proxy container: master's host or domain, six digits of a hash."""
+    digest = hashlib.sha256(_text(key).encode()).hexdigest()
+    word = f"domain-{key.domain}" if key.is_ros2 else master(key).host.lower()
+    slug = re.sub(r"[^a-z0-9]+", "-", word)[:30].strip("-")
     return f"rosproxy-{slug or 'master'}-{digest[:6]}"
 
 
@@ -73,13 +104,40 @@ def sandbox_name(key: Key) -> str:
     return f"{proxy_name(key)}-ports"
 
 
+def ear_name(key: Key) -> str:
+    """The name of the container in which a key's ear runs."""
+    return f"{proxy_name(key)}-ear"
+
+
+def redirect_name(key: Key, fingerprint: str) -> str:
+    """The name of a container that sets a redirect to a key's proxy, by what it is made of."""
+    return f"{proxy_name(key)}-redirect-{fingerprint[:12]}"
+
+
 def is_proxy_name(name: str) -> bool:
-    """Whether a name is one that a proxy or its sandbox has, also if it is not there now."""
-    return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports)?", name) is not None
+    """Whether a name is one that a proxy's container has, also if it is not there now."""
+    return re.fullmatch(r"rosproxy-[a-z0-9-]+-[0-9a-f]{6}(-ports|-ear)?", name) is not None
+
+
+def _text(key: Key) -> str:
+    """What a key's proxy is known by."""
+    return f"{key.graph if key.is_ros2 else key.master_uri} {key.advertise_host}"
+
+
+def unresolved_master(host: str) -> str:
+    """What to do about a master whose host's name leads nowhere.
+
+    An address in its place is no cure: nodes that have one in ROS_MASTER_URI go around the proxy.
+    """
+    return (
+        f"the name {host} can't be resolved where the operator runs: let it know the name, and "
+        f"change nothing else: a line 'ADDRESS {host}' in /etc/hosts of this host; an operator in "
+        f"a container: docker run --add-host {host}:ADDRESS (Compose: extra_hosts)"
+    )
 
 
 def master(key: Key) -> HostPort:
-    """The host and port of a key's master."""
+    """The host and port of a key's master, which one of ROS 2 does not have."""
     where = parse_slave_uri(key.master_uri)
     if where is None:
         raise ValueError(f"{key.master_uri!r} is no master's URI")
@@ -88,7 +146,8 @@ def master(key: Key) -> HostPort:
 
 def admin_port(key: Key) -> int:
     """The port of a proxy's admin endpoint: 11312, or 11313 where nodes find their master there."""
-    return ADMIN_PORT + 1 if master(key).port == ADMIN_PORT else ADMIN_PORT
+    taken = not key.is_ros2 and master(key).port == ADMIN_PORT
+    return ADMIN_PORT + 1 if taken else ADMIN_PORT
 
 
 def proxy_token(key: Key, secret: str) -> str:
@@ -97,13 +156,29 @@ def proxy_token(key: Key, secret: str) -> str:
     It is made anew whenever it is needed, so that it is kept nowhere: the proxy has its hash, and
     the operator has no disk.
     """
-    text = f"{key.master_uri} {key.advertise_host}"
-    return hmac.new(secret.encode(), text.encode(), hashlib.sha256).hexdigest()
+    return hmac.new(secret.encode(), _text(key).encode(), hashlib.sha256).hexdigest()
 
 
 def reserved_ports(key: Key) -> frozenset[int]:
     """The ports on which a key's proxy listens besides its range, so never to be in it."""
+    if key.domain is not None:
+        return frozenset({DEFAULT_MASTER_PORT, ADMIN_PORT, *well_known_ports(key.domain)})
     return frozenset({master(key).port, admin_port(key)})
+
+
+def own_range(key: Key, ports: PortRange) -> PortRange:
+    """The proxy's own ports of those that are held for it: for ROS 2 the last one is its ear's."""
+    return PortRange(ports.first, ports.last - 1) if key.is_ros2 else ports
+
+
+def published_ports(key: Key, ports: PortRange, udp: bool) -> list[tuple[str, int]]:
+    """What a key's sandbox publishes, in the engine's words, each with the port of the host.
+
+    ``udp``: that of a proxy for ROS 1 publishes them for UDP as well, for UDPROS.
+    """
+    protocols = ["udp"] if key.is_ros2 else ["tcp", *(["udp"] if udp else [])]
+    own = own_range(key, ports).ports()
+    return [(f"{port}/{protocol}", port) for protocol in protocols for port in own]
 
 
 def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
@@ -112,34 +187,47 @@ def read_own(labels: Mapping[str, str]) -> OwnLabels | None:
     None if they are not those of one, or not whole.
     """
     role = labels.get(ROLE, "")
-    if labels.get(MANAGED) != "true" or role not in (ROLE_SANDBOX, ROLE_PROXY):
+    if labels.get(MANAGED) != "true" or role not in _ROLES.values():
         return None
-    key = Key(labels.get(MASTER_URI, ""), labels.get(ADVERTISE_HOST, ""))
+    key = _read_key(labels)
     try:
         ports = parse_range(RANGE, labels.get(RANGE, ""))
     except SettingError:
         return None
-    if parse_slave_uri(key.master_uri) is None or not key.advertise_host:
+    if key is None or (role == ROLE_EAR and not key.is_ros2):
         return None
     return OwnLabels(role, key, ports, labels.get(FINGERPRINT, ""))
 
 
-def own_labels(made: CreateSandbox | Create) -> dict[str, str]:
+def _read_key(labels: Mapping[str, str]) -> Key | None:
+    uri, host = labels.get(MASTER_URI, ""), labels.get(ADVERTISE_HOST, "")
+    domain = labels.get(DOMAIN, "")
+    if not host or bool(uri) == bool(domain):
+        return None
+    if uri:
+        return Key(uri, host) if parse_slave_uri(uri) else None
+    known = re.fullmatch(r"[0-9]{1,3}", domain, re.ASCII) and int(domain) <= LAST_DOMAIN
+    return Key("", host, int(domain)) if known else None
+
+
+def own_labels(made: CreateSandbox | Create | CreateEar | CreateRedirect) -> dict[str, str]:
     """The labels of a container, from which `read_own` reads it back."""
+    key = made.key
     return {
         MANAGED: "true",
-        ROLE: ROLE_SANDBOX if isinstance(made, CreateSandbox) else ROLE_PROXY,
-        MASTER_URI: made.key.master_uri,
-        ADVERTISE_HOST: made.key.advertise_host,
+        ROLE: _ROLES[type(made)],
+        **({DOMAIN: str(key.domain)} if key.is_ros2 else {MASTER_URI: key.master_uri}),
+        ADVERTISE_HOST: key.advertise_host,
         RANGE: str(made.range),
         FINGERPRINT: made.fingerprint,
+        **({STARTED_LABEL: made.started} if isinstance(made, CreateRedirect) else {}),
     }
 
 
 def sandbox_fingerprint(made: CreateSandbox, settings: PlanSettings) -> str:
     """What a sandbox is made of, in 16 hex digits. Its name and the image are not in it."""
     body = sandbox_config(replace(made, fingerprint=""), settings)
-    return _digest({**body, "Image": ""})
+    return digest({**body, "Image": ""})
 
 
 def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secret: str) -> str:
@@ -152,7 +240,7 @@ def proxy_fingerprint(made: Create, settings: PlanSettings, image_id: str, secre
     # is started again while the operator is away begins with the policy of its creation.
     body = container_config(replace(made, sandbox="", fingerprint=""), settings, secret, "")
     env = [one for one in body["Env"] if one.partition("=")[0] not in POLICY_VARIABLES]
-    return _digest({**body, "Image": image_id, "Env": env})
+    return digest({**body, "Image": image_id, "Env": env})
 
 
 def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any]:
@@ -165,8 +253,8 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
     if made.forwards:
         sysctls["net.ipv4.ip_forward"] = "1"
     bindings = {
-        f"{port}/tcp": [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
-        for port in made.range.ports()
+        name: [{"HostIp": ip, "HostPort": str(port)} for ip in settings.publish_address]
+        for name, port in published_ports(made.key, made.range, made.udp)
     }
     return {
         "Image": settings.proxy_image,
@@ -177,7 +265,7 @@ def sandbox_config(made: CreateSandbox, settings: PlanSettings) -> dict[str, Any
         "Labels": own_labels(made),
         "ExposedPorts": {port: {} for port in bindings},
         "HostConfig": {
-            **_COMMON,
+            **COMMON,
             "Init": True,
             "NetworkMode": settings.uplink,
             "PortBindings": bindings,
@@ -195,20 +283,7 @@ def container_config(
     ``secret`` is what its token is made of. ``master_address`` may be empty: then the proxy
     resolves its master's host itself.
     """
-    variables = {
-        "ROS_MASTER_URI": made.key.master_uri,
-        "ROSPROXY_ADVERTISE_HOST": made.key.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(made.range),
-        "ROSPROXY_MASTER_PORT": str(master(made.key).port),
-        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(made.key)}",
-        "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
-        "ROSPROXY_DIRECTION": "" if made.direction == "out" else made.direction,
-        "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
-        "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(made.key, secret)),
-        "ROSPROXY_MASTER_ADDRESS": master_address,
-        **bound_variables(settings.proxy_bounds),
-        **policy_variables((*settings.policy, *made.policy)),
-    }
+    variables = _variables(made, settings, secret, master_address)
     limits = {"Memory": settings.proxy_memory, "PidsLimit": settings.proxy_pids}
     return {
         "Image": settings.proxy_image,
@@ -216,13 +291,74 @@ def container_config(
         "Env": [f"{name}={value}" for name, value in variables.items() if value],
         "Labels": own_labels(made),
         "HostConfig": {
-            **_COMMON,
+            **COMMON,
             **(_KERNEL if made.data_plane == "kernel" else {}),
             "Init": False,
             **{name: most for name, most in limits.items() if most},
             "NetworkMode": f"container:{made.sandbox}",
         },
     }
+
+
+def _variables(
+    made: Create, settings: PlanSettings, secret: str, master_address: str
+) -> dict[str, str]:
+    """What a proxy is told; what is empty is left out. In another order it would be made anew."""
+    key = made.key
+    return {
+        "ROS_MASTER_URI": key.master_uri,
+        "ROSPROXY_ADVERTISE_HOST": key.advertise_host,
+        "ROSPROXY_PORT_RANGE": str(own_range(key, made.range)),
+        "ROSPROXY_MASTER_PORT": "" if key.is_ros2 else str(master(key).port),
+        "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{admin_port(key)}",
+        "ROSPROXY_DATA_PLANE": "" if made.data_plane == "auto" else made.data_plane,
+        "ROSPROXY_DIRECTION": "" if made.direction == "out" else made.direction,
+        "ROSPROXY_UDP": "1" if made.udp else "",
+        "ROSPROXY_SLAVE_CONTROL": "" if made.slave_control == "any" else made.slave_control,
+        "ROSPROXY_ADMIN_TOKEN_HASH": hash_token(proxy_token(key, secret)),
+        "ROSPROXY_MASTER_ADDRESS": master_address,
+        **({} if key.is_ros2 else bound_variables(settings.proxy_bounds)),
+        **policy_variables((*settings.policy, *made.policy)),
+        **(_ros2_variables(made) if key.is_ros2 else {}),
+    }
+
+
+def _ros2_variables(made: Create) -> dict[str, str]:
+    return {
+        "ROSPROXY_ROS": "2",
+        "ROSPROXY_ROS2_DOMAINS": str(made.key.domain),
+        "ROSPROXY_ROS2_PEERS": " ".join(made.peers),
+        "ROSPROXY_ROS2_EAR": str(made.ear or ""),
+    }
+
+
+def ear_config(made: CreateEar, settings: PlanSettings) -> dict[str, Any]:
+    """The body of the engine's ``POST /containers/create`` for an ear.
+
+    It has the host's network and nothing else of the host's.
+    """
+    variables = ear_variables(made.key.domain or 0, made.lan, made.bind, made.proxy)
+    return {
+        "Image": settings.proxy_image,
+        "User": USER,
+        "Cmd": [*EAR_COMMAND[1:]],
+        "Healthcheck": {"Test": ["NONE"]},
+        "Env": [f"{name}={value}" for name, value in variables.items()],
+        "Labels": own_labels(made),
+        "HostConfig": {
+            **COMMON,
+            "Init": False,
+            "Memory": EAR_MEMORY,
+            "PidsLimit": EAR_PIDS,
+            "NetworkMode": "host",
+        },
+    }
+
+
+def ear_fingerprint(made: CreateEar, settings: PlanSettings, image_id: str) -> str:
+    """What an ear is made of, in 16 hex digits; its name is not in it."""
+    body = ear_config(replace(made, fingerprint=""), settings)
+    return digest({**body, "Image": image_id})
 
 
 def is_kernel_host(host: Mapping[str, Any]) -> bool:
@@ -234,5 +370,6 @@ def is_kernel_host(host: Mapping[str, Any]) -> bool:
     return added == _KERNEL["CapAdd"] and host.get("SecurityOpt") == _KERNEL["SecurityOpt"]
 
 
-def _digest(body: Mapping[str, Any]) -> str:
+def digest(body: Mapping[str, Any]) -> str:
+    """What a container is made of, in 16 hex digits."""
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()[:16]

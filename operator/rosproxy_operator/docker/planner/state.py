@@ -78,7 +78,7 @@ def _served(memory: DockerMemory, observed: HostState) -> dict[Key, PortRange]:
     What has stopped may be older than what is remembered, unless it has more ports.
     """
     served = dict(memory.served)
-    for one in observed.own:
+    for one in (*observed.sandboxes, *observed.proxies):
         known = served.get(one.key)
         if one.container.state in _HAS_SERVED and (not known or within(known, one.range)):
             served[one.key] = one.range

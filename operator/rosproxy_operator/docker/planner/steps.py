@@ -15,10 +15,12 @@ from msgspec.structs import replace
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
+    CreateEar,
     CreateSandbox,
     Disconnect,
     Remove,
@@ -30,6 +32,7 @@ from rosproxy_operator.docker.planner.actions import (
 from rosproxy_operator.docker.planner.desired import holds, needed_by
 from rosproxy_operator.docker.planner.label_policy import label_layers
 from rosproxy_operator.docker.planner.model import (
+    NOWHERE,
     SERVING,
     STARTED,
     Attachment,
@@ -77,6 +80,14 @@ class PlanContext:
         by_id = {container.id: container for container in self.observed.containers}
         return label_layers(self.desired.members, by_id, self.desired.networks)
 
+    @property
+    def ear(self) -> HostPort | None:
+        """Where the proxy's ear listens; None if it is to have none."""
+        if not self.desired.key.is_ros2 or self.settings.ros2_lan == NOWHERE:
+            return None
+        gateway = self.observed.gateway(self.settings.uplink)
+        return HostPort(gateway, self.ports.last) if gateway else None
+
     def select(
         self, own: Collection[OwnContainer], name: str, made: str, fits: Callable[[Container], bool]
     ) -> Selection:
@@ -119,7 +130,7 @@ def wanted_steps(context: PlanContext) -> list[Action] | None:
 def retired(observed: HostState, key: Key) -> Iterator[Action]:
     """Remove everything of a key that nobody wants any more."""
     why = "no running container wants it any more"
-    for one in (*observed.proxies_of(key), *observed.sandboxes_of(key)):
+    for one in (*observed.ears_of(key), *observed.proxies_of(key), *observed.sandboxes_of(key)):
         state, name = one.container.state, one.container.name
         if state == "paused" and isinstance(one, Proxy):
             yield Unpause(name)
@@ -159,7 +170,8 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     # A sandbox where the kernel forwarded is not used without: a proxy that was killed has left its
     # rules there, and one without the capability can't take them away.
     forwards = context.desired.data_plane == "kernel"
-    made = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards)
+    udp = context.desired.udp
+    made = CreateSandbox(sandbox_name(key), key, context.ports, forwards=forwards, udp=udp)
     expected = sandbox_fingerprint(made, context.settings)
     found = context.select(
         sandboxes, made.name, expected, lambda box: _usable(box, context.observed)
@@ -170,9 +182,9 @@ def _sandbox_steps(context: PlanContext) -> tuple[list[Action] | None, _Home | N
     actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
     if kept is None and not found.waiting:
         made = replace(made, name=free_name(made.name, taken), fingerprint=expected)
-        former = _former_name(found.old, made.name, taken)
+        former = former_name(found.old, made.name, taken)
         ended = _emptied(context, found.old) if found.old else ()
-        actions += [*_created(found, made, former, ended), *_connect(context, made.name)]
+        actions += [*created(found, made, former, ended), *_connect(context, made.name)]
         return actions, _Home(made.name, starts=True)
     if kept is None or kept.state == "restarting":
         return actions, None
@@ -270,7 +282,10 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         context.desired.data_plane,
         slave_control=context.desired.slave_control,
         direction=context.desired.direction,
+        udp=context.desired.udp,
         policy=context.label_policy,
+        peers=context.desired.peers,
+        ear=context.ear,
     )
     observed = context.observed
     expected = proxy_fingerprint(made, context.settings, observed.image_id, observed.secret)
@@ -284,18 +299,19 @@ def _process_steps(context: PlanContext, home: _Home, gone: Collection[str]) -> 
         return None
     actions: list[Action] = [Remove(one.name, "left over") for one in found.others]
     if kept:
-        actions += _tended(found, kept, home)
+        actions += tended(found, kept, _lost(kept, home))
         if wanted not in (kept.name, *taken) and not found.waiting:
             actions.append(Rename(kept.name, wanted))
         return actions
-    former = _former_name(found.old, name, taken)
+    former = former_name(found.old, name, taken)
     before = [one.container.name for one in proxies if one.container.name in gone]
     replaces = former or next(iter(before), "")
     made = replace(made, fingerprint=expected, replaces=replaces)
-    return [*actions, *_created(found, made, former)]
+    return [*actions, *created(found, made, former)]
 
 
-def _tended(found: Selection, kept: Container, home: _Home) -> Iterator[Action]:
+def tended(found: Selection, kept: Container, lost: bool = False) -> Iterator[Action]:
+    """Have a container run that stays; one that is ``lost`` is to be started anew."""
     if found.old:
         yield Remove(found.old.name, "another one takes over")
     if kept.state == "paused":
@@ -304,7 +320,7 @@ def _tended(found: Selection, kept: Container, home: _Home) -> Iterator[Action]:
         return
     if kept.state not in SERVING:
         yield Start(kept.name)
-    elif _lost(kept, home):
+    elif lost:
         yield Restart(kept.name)
 
 
@@ -323,15 +339,18 @@ def _instant(text: str) -> tuple[str, str]:
     return seconds, fraction.ljust(9, "0")
 
 
-def _former_name(old: Container | None, name: str, taken: frozenset[str]) -> str:
+def former_name(old: Container | None, name: str, taken: Collection[str]) -> str:
     """What to call the old one, if any, so that the one that takes over can have the name."""
     if old is None:
         return ""
     return free_name(f"{name}-old", taken) if old.name == name else old.name
 
 
-def _created(
-    found: Selection, made: CreateSandbox | Create, former: str, ended: Iterable[Action] = ()
+def created(
+    found: Selection,
+    made: CreateSandbox | Create | CreateEar,
+    former: str,
+    ended: Iterable[Action] = (),
 ) -> Iterator[Action]:
     """Create and start a container, in the place of an old one, now to be ``former``, if any.
 

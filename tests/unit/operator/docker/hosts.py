@@ -1,4 +1,4 @@
-"""A host on which everything happens that happens on hosts, and what must always hold there.
+"""A host on which everything happens that happens on hosts.
 
 Each event is a method of two numbers, which choose what it happens to.
 """
@@ -8,43 +8,34 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from rosproxy.leases.ports import PortRange
-from rosproxy.settings import DataPlane, Direction
-from rosproxy_operator.common.allocation import overlap
-from rosproxy_operator.docker.planner.actions import Action, Create, CreateSandbox, Start
-from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane
-from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.actions import Action, CreateSandbox, Start
+from rosproxy_operator.docker.planner.model import STARTED
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
+    ROLE_EAR,
     ROLE_PROXY,
+    ROLE_REDIRECT,
     ROLE_SANDBOX,
-    OwnLabels,
+    ear_name,
     own_labels,
-    proxy_fingerprint,
     proxy_name,
-    reserved_ports,
-    sandbox_fingerprint,
+    read_own,
     sandbox_name,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
-from tests.unit.operator.docker.builders import read_members
-from tests.unit.operator.docker.simulation import SERVING, Box, Controller, Engine, Failed, Refused
+from tests.unit.operator.docker.invariants import ROBOT, SETTINGS, Invariants
+from tests.unit.operator.docker.simulation import SERVING, Box, Failed, Refused
 
-HERE = "192.0.2.10"
-ROBOT = Key("http://robot:11311", HERE)
-SETTINGS = PlanSettings(
-    advertise_host=HERE,
-    ports=2,
-    port_window=PortRange(11400, 11415),
-    grace=10.0,
-    max_ports=3,
-    allow_data_plane=("auto", "kernel", "splice"),
-)
-EPHEMERAL = PortRange(11414, 11500)
 MASTERS = ("http://robot:11311", "http://arm:11312", "http://192.0.2.9:11402")
+REDIRECTS = ("", "true", "", "false", "")
 NETWORKS = ("app", "lab", "inner", "0-early", "0-inner")
 COUNTS = ("2", "1", "3", "5", "nonsense")
 PLANES = ("", "kernel", "splice", "auto", "copy", "nonsense")
-ENVS = ("", "http://rosproxy:11311", "http://robot:11311", "http://arm:11312")
+VERSIONS = ("1", "2", "1,2", "1", "nonsense")
+DOMAINS = ("0", "16")
+PEERS = ("robot", "arm:11400", "")
+ADDRESSED = "http://192.0.2.9:11402"
+ENVS = ("", "http://rosproxy:11311", "http://robot:11311", "http://arm:11312", ADDRESSED)
 STATES = ("running", "exited", "created", "paused", "restarting", "dead", "removing")
 STRANGERS = ("robot", "rosproxy", "web", proxy_name(ROBOT), sandbox_name(ROBOT))
 T = TypeVar("T")
@@ -54,30 +45,8 @@ def pick(items: Sequence[T], number: int) -> T:
     return items[number % len(items)]
 
 
-class Hosts:
+class Hosts(Invariants):
     """A host with labelled containers, the operator, and people who meddle."""
-
-    def __init__(self) -> None:
-        self.engine = Engine(SETTINGS, EPHEMERAL)
-        self.controller = Controller(self.engine, SETTINGS)
-        for name in NETWORKS[:3]:
-            self.engine.add_network(name, internal="inner" in name)
-        self.served: dict[Key, PortRange] = {}
-        self.may_move: set[Key] = set()
-
-    def own(self, *states: str, role: str = "") -> list[tuple[Box, OwnLabels]]:
-        """The operator's containers."""
-        return [
-            (box, box.own)
-            for box in self.engine.boxes
-            if box.own and (not states or box.state in states) and role in ("", box.role)
-        ]
-
-    def boxes(self, *states: str, role: str = "") -> list[Box]:
-        return [box for box, _ in self.own(*states, role=role)]
-
-    def strangers(self) -> list[Box]:
-        return [box for box in self.engine.boxes if not box.own]
 
     # containers of users
 
@@ -87,17 +56,24 @@ class Hosts:
             "rosproxy.enable": "true",
             "rosproxy.master-uri": pick(MASTERS, n),
             "rosproxy.ports": pick(COUNTS, n // 3),
+            "rosproxy.ros": pick(VERSIONS, (2 * n + m) // 5),
+            "rosproxy.domain": pick(DOMAINS, n // 2),
+            "rosproxy.peers": pick(PEERS, m // 3),
         }
         if plane := pick(PLANES, (n + m) // 7):
             labels["rosproxy.data-plane"] = plane
+        if redirect := pick(REDIRECTS, n // 4):
+            labels["rosproxy.redirect"] = redirect
+        if (n + m) % 4 == 0:
+            labels |= {"rosproxy.udp": "true", "rosproxy.direction": "both"}
         if len(self.strangers()) > 6:
             return
         box = self.engine.add(
             f"node{next(self.engine.ids)}",
-            state=pick(STATES[:3], m // 20),
             env=pick(ENVS, m // 5),
             labels=labels,
         )
+        self.engine.begin(box, pick(STATES[:3], m // 20))
         if networks := sorted(self.engine.networks.keys() - {SETTINGS.uplink}):
             self.engine.join(box, pick(networks, m))
 
@@ -107,7 +83,20 @@ class Hosts:
         if boxes := self.strangers():
             box = pick(boxes, n)
             if state not in SERVING or not self.engine.conflicts(box):
-                box.state = state
+                self.engine.begin(box, state)
+
+    def share(self, n: int, m: int) -> None:
+        """A container whose master is given by address comes into the network of another one."""
+        homes = [box for box in self.strangers() if not box.mode]
+        if not homes or len(self.strangers()) > 6:
+            return
+        box = self.engine.add(
+            f"guest{next(self.engine.ids)}",
+            env=ADDRESSED,
+            labels={"rosproxy.enable": "true"},
+            mode=f"container:{pick(homes, n).id}",
+        )
+        self.engine.begin(box, pick(STATES[:3], m // 20))
 
     def remove(self, n: int, _: int) -> None:
         if boxes := self.strangers():
@@ -124,8 +113,10 @@ class Hosts:
             pick(boxes, n).networks.pop(pick(NETWORKS, m), None)
 
     def rename(self, n: int, m: int) -> None:
+        """Not one with forged labels: its HostConfig gives it away, which is not simulated."""
         name = pick(STRANGERS, m)
-        if (boxes := self.strangers()) and not self.engine.named(name):
+        boxes = [box for box in self.strangers() if read_own(box.labels) is None]
+        if boxes and not self.engine.named(name):
             pick(boxes, n).name = name
 
     def stranger(self, n: int, m: int) -> None:
@@ -133,7 +124,9 @@ class Hosts:
         name = pick(STRANGERS, n)
         if self.engine.named(name):
             return
-        box = self.engine.add(name, ports=frozenset({11400 + m % 16}))
+        ports = frozenset({11400 + m % 16})
+        udp = bool(m & 1)
+        box = self.engine.add(name, **{"udp" if udp else "ports": ports})
         network = pick(NETWORKS, m)
         if network in self.engine.networks:
             self.engine.join(box, network)
@@ -152,6 +145,10 @@ class Hosts:
         if networks := sorted(self.engine.networks.keys()):
             self.engine.join(box, pick(networks, m))
 
+    def fail_redirects(self, n: int, _: int) -> None:
+        """The kernel has no rules for it, for a while."""
+        self.engine.redirects_fail = bool(n & 1)
+
     # networks, ports, image
 
     def make_network(self, n: int, _: int) -> None:
@@ -168,7 +165,8 @@ class Hosts:
         """Another program listens; the operator may be unable to see it."""
         self.engine.names_ports = bool(m & 1)
         port = 11400 + n % 16
-        if not any(port in box.ports for box in self.engine.boxes if box.state in SERVING):
+        held = (box.ports | box.udp for box in self.engine.boxes if box.state in SERVING)
+        if not any(port in ports for ports in held):
             (self.engine.hidden if m & 2 else self.engine.open).add(port)
 
     def take_own_port(self, n: int, m: int) -> None:
@@ -176,7 +174,8 @@ class Hosts:
         if boxes := self.boxes(role=ROLE_SANDBOX):
             box = pick(boxes, n)
             box.state = "exited" if box.state in SERVING else box.state
-            self.take_port(min(box.ports) - 11400 + n % len(box.ports), m)
+            ports = sorted(box.ports | box.udp)
+            self.take_port(ports[n % len(ports)] - 11400, m)
 
     def let_ports_go(self, _n: int, _m: int) -> None:
         self.engine.hidden.clear()
@@ -194,7 +193,7 @@ class Hosts:
 
     def break_one(self, n: int, m: int) -> None:
         if boxes := self.boxes("exited"):
-            pick(boxes, n).state = pick(("dead", "removing"), m)
+            self.forget(pick(boxes, n)).state = pick(("dead", "removing"), m)
 
     def start_by_hand(self, n: int, _: int) -> None:
         if boxes := self.boxes("exited", "restarting"):
@@ -220,13 +219,19 @@ class Hosts:
 
     def remove_own(self, n: int, _: int) -> None:
         if boxes := self.boxes():
-            self.engine.boxes.remove(pick(boxes, n))
+            self.engine.boxes.remove(self.forget(pick(boxes, n)))
+
+    def forget(self, box: Box) -> Box:
+        """Of rules whose record somebody removes nobody knows once they are not wanted."""
+        if box.redirect is not None:
+            self.forgotten.add((box.namespace, box.redirect.key))
+        return box
 
     def rename_own(self, n: int, m: int) -> None:
         """Under any other name it would be a stranger, for all that the operator knows."""
-        if boxes := self.boxes():
+        if boxes := [box for box in self.boxes() if box.role != ROLE_REDIRECT]:
             box = pick(boxes, n)
-            own = sandbox_name if box.role == ROLE_SANDBOX else proxy_name
+            own = {ROLE_SANDBOX: sandbox_name, ROLE_EAR: ear_name}.get(box.role, proxy_name)
             name = own(box.own.key) + pick(("-old", "-2", "-old-2"), m) if box.own else ""
             if name and not self.engine.named(name):
                 box.name = name
@@ -256,6 +261,7 @@ class Hosts:
 
     def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
         """Nothing else happens: everything must be as wished after some looks."""
+        self.engine.redirects_fail = False
         for _ in range(100):
             found = self.controller.look()
             failed = self.carry_out(found)
@@ -290,105 +296,10 @@ class Hosts:
     def published(self, ports: PortRange) -> bool:
         """Whether a stranger that runs has some of these ports."""
         running = [box for box in self.strangers() if box.state in STARTED]
-        return any(port in ports for box in running for port in box.ports)
+        return any(port in ports for box in running for port in box.ports | box.udp)
 
     def lose_memory(self) -> None:
         """Ports are then only known as long as there is a container that has had them."""
         self.controller.memory = DockerMemory()
         kept = {own.key for box, own in self.own(role=ROLE_SANDBOX) if box.state != "created"}
         self.served = {key: ports for key, ports in self.served.items() if key in kept}
-
-    # what must hold
-
-    def check(self) -> None:
-        """What holds at any moment."""
-        running = [(own.key, own.role) for _, own in self.own(*SERVING)]
-        assert len(running) == len(set(running)), "one of each runs for each key"
-        for _, own in self.own(*SERVING, role=ROLE_SANDBOX):
-            served = self.served.get(own.key)
-            if served is not None and own.key not in self.may_move:
-                assert own.range.first == served.first, "who serves keeps its ports"
-                assert len(own.range) >= len(served)
-            self.served[own.key] = own.range
-            self.may_move.discard(own.key)
-        held = [(own.key, own.range) for _, own in self.own(role=ROLE_SANDBOX)]
-        for key, ports in held:
-            others = [other for one, other in held if one != key]
-            assert not any(overlap(ports, other) for other in others), "ports are one's own"
-
-    def check_new_ranges(self, found: DockerPlan) -> None:
-        """Ports of new sandboxes are nobody else's; who has ports keeps them."""
-        seen = self.engine.observe()
-        strangers = {port for one in seen.containers for port in one.host_ports}
-        for action in found.actions:
-            if not isinstance(action, CreateSandbox):
-                continue
-            key, ports = action.key, action.range
-            had = [own.range for _, own in self.own() if own.key == key]
-            had += [self.served[key]] if key in self.served else []
-            new = {port for port in ports.ports() if not any(port in one for one in had)}
-            assert not new & (strangers | seen.listening)
-            assert not any(port in EPHEMERAL or port in reserved_ports(key) for port in new)
-            for one in seen.sandboxes:
-                assert one.key == key or not overlap(one.range, ports)
-
-    def check_all_is_as_wished(self, found: DockerPlan) -> None:
-        members, _ = read_members(self.engine.observe(), SETTINGS)
-        fine = frozenset(
-            name
-            for name, network in self.engine.networks.items()
-            if network.internal or name >= SETTINGS.uplink
-        )
-        live = [member for member in members if member.container.alive and member.networks & fine]
-        assert {own.key for _, own in self.own()} <= {member.key for member in live}
-        fatal = {problem.subject for problem in found.problems if problem.fatal}
-        told = {problem.subject for problem in found.problems}
-        for key in sorted({member.key for member in live}):
-            if not fatal & {f"proxy image {SETTINGS.proxy_image}", f"proxy {proxy_name(key)}"}:
-                mine = [member for member in live if member.key == key]
-                plane = chosen_plane(mine, SETTINGS.data_plane)
-                direction = chosen_direction(mine, SETTINGS.direction)
-                wanted = {n for member in mine for n in member.networks & fine}
-                self.check_key(key, wanted, plane, direction)
-                for member in mine:
-                    if f"container {member.container.name}" not in told:
-                        self.check_names(member, member.networks & fine)
-
-    def check_key(self, key: Key, wanted: set[str], plane: DataPlane, direction: Direction) -> None:
-        own = [(box, own) for box, own in self.own() if own.key == key]
-        if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
-            return
-        assert sorted(box.role for box, _ in own) == [ROLE_SANDBOX, ROLE_PROXY]
-        (sandbox, is_), (proxy, runs) = sorted(own, key=lambda one: one[0].role == ROLE_PROXY)
-        assert sandbox.state == "running"
-        assert proxy.state in ("running", "restarting")
-        assert set(sandbox.networks) == {SETTINGS.uplink, *wanted}
-        assert self.is_named(sandbox, sandbox_name(key))
-        assert self.is_named(proxy, proxy_name(key))
-        assert self.engine.home(proxy) is sandbox
-        assert proxy.namespace == sandbox.namespace or proxy.state == "restarting"
-        assert runs.range == is_.range
-        if self.engine.image:
-            box = CreateSandbox("", key, is_.range, forwards=plane == "kernel")
-            assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
-            self.check_process(runs, Create("", key, is_.range, "", plane, direction=direction))
-
-    def check_process(self, runs: OwnLabels, proxy: Create) -> None:
-        assert runs.fingerprint == proxy_fingerprint(proxy, SETTINGS, self.engine.image, "")
-
-    def is_named(self, box: Box, name: str) -> bool:
-        """Whether it has its name, if no stranger has."""
-        return (box.name == name) != any(one.name == name for one in self.strangers())
-
-    def check_names(self, member: Member, networks: frozenset[str]) -> None:
-        """By the name that a container uses it finds its own proxy and nobody else."""
-        for network in networks if member.needs else ():
-            found = [
-                box.own.key if box.own else box.name
-                for box in self.engine.boxes
-                if network in box.networks
-                and member.needs in box.networks[network][1] | {box.name}
-                and box.state not in ("dead", "removing")
-            ]
-            restarting = [own.key for _, own in self.own("restarting", role=ROLE_SANDBOX)]
-            assert found == [member.key] or member.key in restarting

@@ -4,16 +4,20 @@ import itertools
 from dataclasses import dataclass, field
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.docker.planner.actions import (
     Action,
     Connect,
     Create,
+    CreateEar,
     CreateNetwork,
+    CreateRedirect,
     CreateSandbox,
     Disconnect,
     Remove,
     Rename,
     Restart,
+    Run,
     Start,
     Unpause,
 )
@@ -21,25 +25,33 @@ from rosproxy_operator.docker.planner.model import (
     STARTED,
     Attachment,
     Container,
+    EarContainer,
     HostState,
+    Key,
     Network,
     PlanSettings,
     Proxy,
+    RedirectContainer,
     Sandbox,
 )
 from rosproxy_operator.docker.planner.own import has_own_name
 from rosproxy_operator.docker.planner.plan import DockerPlan
 from rosproxy_operator.docker.planner.specs import (
+    ROLE_EAR,
     ROLE_PROXY,
+    ROLE_REDIRECT,
     ROLE_SANDBOX,
     OwnLabels,
     own_labels,
+    published_ports,
     read_own,
 )
 from rosproxy_operator.docker.planner.state import DockerMemory
 from tests.unit.operator.docker.builders import planned
 
 SERVING = {"running", "paused", "restarting"}
+GATEWAY = "172.30.0.1"
+"""That of the uplink, whenever there is one."""
 
 
 class Failed(Exception):
@@ -59,6 +71,7 @@ class Box:
     """A container of the engine. ``networks`` holds ids and names by network.
 
     ``namespace`` is when its network namespace came to be: for a proxy, its sandbox's start.
+    ``redirect`` is what it does to the rules of another's.
     """
 
     id: str
@@ -68,9 +81,12 @@ class Box:
     networks: dict[str, tuple[str, frozenset[str]]] = field(default_factory=dict)
     env: str = ""
     ports: frozenset[int] = frozenset()
+    udp: frozenset[int] = frozenset()
     mode: str = ""
     started: int = 0
     namespace: int = 0
+    redirect: CreateRedirect | None = None
+    exit_code: int = 0
 
     @property
     def own(self) -> OwnLabels | None:
@@ -81,6 +97,11 @@ class Box:
     @property
     def role(self) -> str:
         return self.own.role if self.own else ""
+
+    @property
+    def address(self) -> str:
+        """Its address on all of its networks: another one after each start."""
+        return f"172.30.{self.started // 250}.{2 + self.started % 250}" if self.started else ""
 
     @property
     def started_at(self) -> str:
@@ -101,12 +122,15 @@ class Engine:
         self.hidden: set[int] = set()
         self.image = "image-1"
         self.names_ports = True
+        self.redirects_fail = False
+        self.rules: dict[tuple[int, Key], tuple[HostPort | None, HostPort | None]] = {}
         self.ids = itertools.count()
 
     # what users do
 
     def add_network(self, name: str, internal: bool = False) -> None:
-        self.networks[name] = Network(f"net-{next(self.ids)}", name, internal=internal)
+        gateway = GATEWAY if name == self.settings.uplink else ""
+        self.networks[name] = Network(f"net-{next(self.ids)}", name, "bridge", internal, gateway)
 
     def add(self, name: str, **more: object) -> Box:
         box = Box(f"box-{next(self.ids)}", name)
@@ -125,18 +149,18 @@ class Engine:
 
     def conflicts(self, box: Box) -> set[int]:
         """The ports of a container that something else holds."""
-        others = {
-            port
-            for one in self.boxes
-            if one is not box and one.state in SERVING
-            for port in one.ports
-        }
-        return set(box.ports) & (others | self.open | self.hidden)
+        others = [one for one in self.boxes if one is not box and one.state in SERVING]
+        tcp = {port for one in others for port in one.ports} | self.open | self.hidden
+        udp = {port for one in others for port in one.udp} | self.open | self.hidden
+        return set(box.ports) & tcp | set(box.udp) & udp
 
     # what the operator sees
 
     def observe(self) -> HostState:
-        held = {port for box in self.boxes if box.state in STARTED for port in box.ports}
+        started = [box for box in self.boxes if box.state in STARTED]
+        held = {port for box in started for port in box.ports}
+        # As in `snapshot.strangers`, the port of an ear is not told.
+        held_udp = {port for box in started if box.role != ROLE_EAR for port in box.udp}
         own = [(box, box.own) for box in self.boxes]
         return HostState(
             containers=tuple(self._container(box) for box, role in own if role is None),
@@ -148,6 +172,17 @@ class Engine:
             ),
             ephemeral=self.ephemeral,
             listening=frozenset(self.open | held),
+            listening_udp=frozenset(self.open | held_udp),
+            ears=tuple(
+                EarContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                for box, is_ in own
+                if is_ and is_.role == ROLE_EAR
+            ),
+            redirects=tuple(
+                RedirectContainer(is_.key, self._container(box), is_.range, is_.fingerprint)
+                for box, is_ in own
+                if is_ and is_.role == ROLE_REDIRECT
+            ),
             image_id=self.image,
             sandboxes=tuple(
                 Sandbox(is_.key, self._container(box), is_.range, is_.fingerprint)
@@ -157,8 +192,9 @@ class Engine:
         )
 
     def _container(self, box: Box) -> Container:
+        running = box.state in STARTED
         places = tuple(
-            Attachment(name, "", names | {box.name}, known)
+            Attachment(name, box.address if running else "", names | {box.name}, known)
             for name, (known, names) in box.networks.items()
         )
         return Container(
@@ -170,7 +206,9 @@ class Engine:
             attachments=places,
             master_uri=box.env,
             host_ports=box.ports,
+            udp_ports=box.udp,
             started_at=box.started_at,
+            exit_code=box.exit_code,
             forged="" if box.own or read_own(box.labels) is None else "its name is not its own",
         )
 
@@ -183,8 +221,10 @@ class Engine:
                 if name in self.networks:
                     raise Failed(f"network {name} exists")
                 self.add_network(name)
-            case CreateSandbox() | Create():
+            case CreateSandbox() | Create() | CreateEar() | CreateRedirect():
                 self._create(action)
+            case Run(name):
+                self._run(self.own(name))
             case Start(name):
                 self.start(self.own(name))
             case Restart(name):
@@ -224,14 +264,23 @@ class Engine:
     def named(self, name: str) -> list[Box]:
         return [box for box in self.boxes if box.name == name]
 
-    def _create(self, action: CreateSandbox | Create) -> None:
+    def _create(self, action: CreateSandbox | Create | CreateEar | CreateRedirect) -> None:
         name, labels, uplink = action.name, own_labels(action), self.settings.uplink
         if self.named(name) or not self.image:
             raise Failed(f"can't create {name}")
         if isinstance(action, CreateSandbox):
             if uplink not in self.networks:
                 raise Failed("no uplink")
-            self.join(self.add(name, labels=labels, ports=frozenset(action.range.ports())), uplink)
+            published = published_ports(action.key, action.range, action.udp)
+            tcp = frozenset(port for what, port in published if what.endswith("/tcp"))
+            udp = frozenset(port for what, port in published if what.endswith("/udp"))
+            self.join(self.add(name, labels=labels, ports=tcp, udp=udp), uplink)
+        elif isinstance(action, CreateEar):
+            self.add(name, labels=labels, udp=frozenset({action.bind.port}), mode="host")
+        elif isinstance(action, CreateRedirect):
+            if action.target not in {box.id for box in self.boxes}:
+                raise Failed("no such container")
+            self.add(name, labels=labels, mode=f"container:{action.target}", redirect=action)
         else:
             home = self.own(action.sandbox)
             assert home.role == ROLE_SANDBOX
@@ -243,15 +292,43 @@ class Engine:
         for name, (known, _) in box.networks.items():
             if name not in self.networks or known not in ("", self.networks[name].id):
                 raise Failed(f"network {name} not found")
-        if taken := self.conflicts(box):
+        taken = self.conflicts(box)
+        if box.role == ROLE_REDIRECT:
+            self._run(box)
+            return
+        if box.role != ROLE_EAR and taken:
             raise Refused(min(taken) if self.names_ports else None)
         home = self.home(box)
-        if box.mode and (home is None or home.state not in STARTED):
+        shares = box.mode.startswith("container:")
+        if shares and (home is None or home.state not in STARTED):
             raise Failed("cannot join network of a non running container")
-        box.state = "running"
+        box.state = "restarting" if taken else "running"  # an ear takes its port by itself
         box.started = next(self.ids)
         box.namespace = home.namespace if home else box.started
         box.networks = {n: (self.networks[n].id, names) for n, (_, names) in box.networks.items()}
+
+    def _run(self, box: Box) -> None:
+        """Set the rules in the namespace that there is now, or fail at that."""
+        home = self.home(box)
+        if home is None or home.state not in STARTED:
+            raise Failed("cannot join network of a non running container")
+        assert home.own is None, "only users' containers are redirected"
+        assert box.redirect is not None
+        box.state, box.exit_code = "exited", int(self.redirects_fail)
+        box.namespace = home.namespace
+        if self.redirects_fail:
+            raise Failed("ended with 1")
+        place = home.namespace, box.redirect.key
+        self.rules[place] = box.redirect.master, box.redirect.proxy
+        if box.redirect.master is None:
+            del self.rules[place]
+
+    def begin(self, box: Box, state: str) -> None:
+        """Give a user's container a state; each start of it makes another namespace."""
+        if state in STARTED and box.state not in STARTED:
+            box.started = next(self.ids)
+            box.namespace = box.started
+        box.state = state
 
     def home(self, box: Box) -> Box | None:
         """The container whose network namespace another one shares."""

@@ -9,7 +9,7 @@ from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.docker.planner.actions import Connect, Create, CreateSandbox
 from rosproxy_operator.docker.planner.labels.bounds import (
     allowed_planes,
-    read_master_pattern,
+    read_host_pattern,
     refused_master,
 )
 from rosproxy_operator.docker.planner.model import Member, PlanSettings
@@ -49,7 +49,7 @@ def asked(settings: PlanSettings = SETTINGS, **labels: str) -> tuple[Member, str
 
 
 def allowing(*patterns: str) -> PlanSettings:
-    return replace(SETTINGS, allow_master=tuple(map(read_master_pattern, patterns)))
+    return replace(SETTINGS, allow_master=tuple(map(read_host_pattern, patterns)))
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_pattern(pattern: str, uri: str, allowed: bool) -> None:
                                   "robot:123456", "rob[o]t"])  # fmt: skip
 def test_what_is_no_pattern(text: str) -> None:
     with pytest.raises(ValueError, match="is not of the form HOST or HOST:PORT"):
-        read_master_pattern(text)
+        read_host_pattern(text)
 
 
 def test_a_master_that_is_not_allowed() -> None:

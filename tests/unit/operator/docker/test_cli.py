@@ -41,6 +41,7 @@ def test_the_defaults() -> None:
         ("--admin-bind", "11313", "'11313' is not of the form 127.0.0.1:11313"),
         ("--admin-bind", "none", "'none' is not of the form 127.0.0.1:11313"),
         ("--allow-master", "a b", "'a b' is not of the form HOST or HOST:PORT"),
+        ("--allow-peer", "a/b", "'a/b' is not of the form HOST or HOST:PORT"),
         ("--max-ports", "1001", "1001 is not in the range 1<=x<=1000; for example 100"),
         ("--allow-data-plane", "fast", "'fast' is not one of"),
         ("--slave-control", "none", "'none' is not one of"),
@@ -78,6 +79,7 @@ def test_lists_in_variables_and_a_secret_in_a_file(
     file.write_text(f" {'s' * 32}\n")
     for name, value in (
         ("ALLOW_MASTER", "robot arm*:11311"),
+        ("ALLOW_PEER", "robot *:11400"),
         ("ALLOW_DATA_PLANE", "kernel copy"),
         ("PROXY_MEMORY", "512m"),
         ("SECRET_FILE", str(file)),
@@ -88,6 +90,7 @@ def test_lists_in_variables_and_a_secret_in_a_file(
     )
     found = make_plan_settings(options)
     assert found.allow_master == ("robot:*", "arm*:11311")
+    assert found.allow_peer == ("robot:*", "*:11400")
     assert found.allow_data_plane == ("kernel", "copy")
     assert (found.proxy_memory, found.secret) == (512 * 1024**2, "s" * 32)
     file.write_text("short")

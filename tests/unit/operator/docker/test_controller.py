@@ -1,19 +1,23 @@
 """Looks at an engine that is given by the test, and what the controller makes of them."""
 
+import asyncio
 from dataclasses import replace
 from typing import Any
 
 import pytest
 from msgspec import structs
 
+from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.control_loop import LookFailed
 from rosproxy_operator.common.metrics import DockerMetrics
 from rosproxy_operator.common.resolver import MasterResolver
+from rosproxy_operator.docker import snapshot
 from rosproxy_operator.docker.client import DockerClient
 from rosproxy_operator.docker.controller import DockerController
-from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
+from rosproxy_operator.docker.planner.actions import Create, CreateRedirect, CreateSandbox
 from rosproxy_operator.docker.planner.model import PlanSettings
 from rosproxy_operator.docker.planner.plan import plan
+from rosproxy_operator.docker.planner.redirect import _named, redirect_config
 from rosproxy_operator.docker.planner.specs import (
     container_config,
     own_labels,
@@ -34,7 +38,9 @@ PROCESS = Create(proxy_name(KEY), KEY, RANGE, sandbox_name(KEY), fingerprint="f"
 TOKEN = proxy_token(KEY, "secret")
 
 
-def own(spec: CreateSandbox | Create, number: str, network: str, address: str) -> dict[str, Any]:
+def own(
+    spec: CreateSandbox | Create | CreateRedirect, number: str, network: str, address: str
+) -> dict[str, Any]:
     ends = {network: captured.end("e", address)} if address else {}
     return captured.running() | {
         "Id": number,
@@ -173,9 +179,100 @@ async def test_an_inspection_of_before_makes_busy(engine: FakeEngine) -> None:
     looking = observer()
     await looking.look(5.0)
     del engine.knows[f"/containers/{'p' * 64}/json"]
+    looking.doubt("p" * 64)
     look = await looking.look(5.0)
     assert look.state.busy == {proxy_name(KEY)}
     assert look.access[proxy_name(KEY)].token == TOKEN
+
+
+def inspected_again(engine: FakeEngine) -> set[str]:
+    """The first letters of the ids of containers that were inspected since the last question."""
+    asked = {call.split("/")[2][0] for call in engine.calls if call.endswith("/json")}
+    engine.calls.clear()
+    return asked & {row["Id"][0] for row in engine.rows}
+
+
+async def test_what_nothing_happened_to_is_not_inspected_again(engine: FakeEngine) -> None:
+    looking = observer()
+    await looking.look(5.0)
+    assert inspected_again(engine) == {row["Id"][0] for row in engine.rows}
+    await looking.look(5.0)
+    assert inspected_again(engine) == set()
+    for container, again in (("p" * 64, {"p"}), ("x" * 64, {"p"}), (None, {"p", "b"})):
+        looking.doubt(container)
+        assert not (await looking.look(5.0)).state.busy
+        assert inspected_again(engine) == again
+
+
+async def test_a_doubt_is_good_for_one_look_however_late(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(snapshot, "DOUBT", 0.0)
+    looking = observer()
+    first = (await looking.look(5.0)).access[proxy_name(KEY)].run
+    engine.knows[f"/containers/{'p' * 64}/json"]["State"]["StartedAt"] = "2"
+    for container in ("p" * 64, None):
+        looking.doubt(container)
+        await asyncio.sleep(0.01)
+        assert (await looking.look(5.0)).access[proxy_name(KEY)].run != first
+        engine.calls.clear()
+        await looking.look(5.0)
+        assert not inspected_again(engine)
+
+
+async def test_a_redirect_that_was_run_again_is_inspected_again(engine: FakeEngine) -> None:
+    """The list shows it as ended before and after."""
+    looking = observer()
+    seen = replace((await looking.look(5.0)).state, image_id=IMAGE)
+    there = HostPort("192.0.2.7", 11311)
+    made = CreateRedirect("", KEY, RANGE, "c" * 64, "1", there, HostPort("172.18.0.9", 11311))
+    made = _named(made, seen, SETTINGS)
+    row = own(made, "r" * 64, f"container:{'c' * 64}", "") | {"State": "exited"}
+    state = {"Status": "exited", "StartedAt": "1", "ExitCode": 1}
+    engine.add(row, inspection(redirect_config(made, SETTINGS)) | {"State": state})
+    assert [one.done for one in (await looking.look(5.0)).state.redirects] == [False]
+    state["ExitCode"] = 0
+    looking.doubt("r" * 64)
+    assert [one.done for one in (await looking.look(5.0)).state.redirects] == [True]
+
+
+async def test_the_list_tells_that_a_proxy_has_ended(engine: FakeEngine) -> None:
+    looking = observer()
+    await looking.look(5.0)
+    engine.rows[2]["State"] = "exited"
+    engine.knows[f"/containers/{'p' * 64}/json"]["State"] = {"Status": "exited"}
+    look = await looking.look(5.0)
+    assert not look.state.busy
+    assert not look.access
+    assert inspected_again(engine) >= {"p"}
+
+
+async def test_a_start_that_no_event_told_is_found(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the looks; one that finds nothing new brings about no look."""
+    monkeypatch.setattr(snapshot, "CHECK", 0.0)
+    told: list[bool] = []
+    resolver = MasterResolver(lambda: None)
+    looking = DockerObserver(DockerClient(), SETTINGS, resolver, lambda: told.append(True))
+
+    async def look() -> str:
+        found = await looking.look(5.0)
+        assert not looking.waiting
+        return found.access[proxy_name(KEY)].run
+
+    first = await look()
+    assert inspected_again(engine) >= {"p"}
+    while not inspected_again(engine):
+        assert await look() == first
+        await asyncio.sleep(0.01)
+    assert not told
+    engine.knows[f"/containers/{'p' * 64}/json"]["State"]["StartedAt"] = "2"
+    async with asyncio.timeout(5.0):
+        while not told:
+            await look()
+            await asyncio.sleep(0.01)
+    assert await look() != first
 
 
 async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
@@ -190,6 +287,8 @@ async def test_once_tells_what_is_not_as_wanted(engine: FakeEngine) -> None:
     assert controller.unready() is None
     assert metrics.registry.get_sample_value("rosproxy_operator_engine_up") == 1.0
     assert metrics.registry.get_sample_value("rosproxy_operator_containers") == 1.0
+    for state in ("busy", "failed"):
+        assert metrics.registry.get_sample_value("rosproxy_operator_jobs", {"state": state}) == 0
 
 
 async def test_once_without_an_engine(monkeypatch: pytest.MonkeyPatch) -> None:

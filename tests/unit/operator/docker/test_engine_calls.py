@@ -17,11 +17,13 @@ from rosproxy_operator.docker.planner.actions import (
     Connect,
     Create,
     CreateNetwork,
+    CreateRedirect,
     CreateSandbox,
     Disconnect,
     Remove,
     Rename,
     Restart,
+    Run,
     Start,
     Unpause,
 )
@@ -58,13 +60,17 @@ ACTIONS: list[Action] = [
     Connect("box", "app", ("robot",)),
     Disconnect("box", "app"),
     Remove("box", "", stop=True),
+    CreateRedirect("r", KEY, RANGE, "talker", "2026-01-01T10:00:00Z"),
+    Run("box"),
 ]
 
 
 @pytest.fixture(autouse=True)
 def container_on_two_networks(engine: FakeEngine) -> None:
     networks: dict[str, Any] = {"app": {}, SETTINGS.uplink: {}}
-    box = inspection(sandbox_config(BOX, SETTINGS), NetworkSettings={"Networks": networks})
+    ended = {"Running": False, "ExitCode": 0}
+    body = sandbox_config(BOX, SETTINGS)
+    box = inspection(body, NetworkSettings={"Networks": networks}, State=ended)
     for name in (BOX.name, "box"):
         engine.knows[f"/containers/{name}/json"] = box
     engine.knows["/images/rosproxy:latest/json"] = {"Id": "sha256:1"}
@@ -90,6 +96,23 @@ async def test_the_documentation_lists_exactly_what_is_called(engine: FakeEngine
     ] == []
 
 
+async def test_what_does_not_do_its_one_thing_is_told(engine: FakeEngine) -> None:
+    state = engine.knows["/containers/box/json"]["State"]
+    state["ExitCode"] = 1
+    with pytest.raises(EngineError, match="ended with 1, docker logs box says why"):
+        await carry_out(Run("box"))
+
+
+async def test_what_does_not_end_is_removed(
+    engine: FakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rosproxy_operator.docker.executor.LONGEST_RUN", 0.0)
+    engine.knows["/containers/box/json"]["State"]["Running"] = True
+    with pytest.raises(EngineError, match="has not ended in 0 s, and is removed"):
+        await carry_out(Run("box"))
+    assert "DELETE /containers/box" in engine.calls
+
+
 async def test_a_proxy_gets_its_tokens_hash_and_its_masters_address(engine: FakeEngine) -> None:
     await carry_out(ACTIONS[2])
     variables = engine.calls["POST /containers/create"]["Env"]
@@ -110,7 +133,7 @@ async def test_the_uplink_holds_the_secret(engine: FakeEngine) -> None:
 
 async def test_what_is_removed_leaves_its_networks_but_the_uplink(engine: FakeEngine) -> None:
     engine.refuses["POST /networks/app/disconnect"] = (404, "network app not found")
-    await carry_out(ACTIONS[-1])
+    await carry_out(ACTIONS[9])
     assert list(engine.calls)[1:] == [
         "POST /containers/box/stop",
         "GET /containers/box/json",

@@ -202,8 +202,12 @@ def test_a_proxy_is_no_master(host: str) -> None:
 def test_the_operators_master_is_for_those_who_name_the_proxy_or_nobody() -> None:
     settings = replace(SETTINGS, master_uri="http://arm:11311")
     arm = Key("http://arm:11311", HERE)
-    for env in ("", "http://rosproxy:11311", f"http://{proxy_name(arm)}:11311"):
+    for env in ("http://rosproxy:11311", f"http://{proxy_name(arm)}:11311"):
         assert good(container(labels=ON, env=env), settings).key == arm
+    member, told = read(container(labels=ON), settings)
+    assert member is not None
+    assert member.key == arm
+    assert "so it is taken for ROS 1" in told[0].text
     member, _ = read(container(labels=ON, env="http://rosproxy-zoo-0a1b2c:11311"), settings)
     assert member is not None
     assert good(container(labels=ON, env=ROBOT), settings).key == KEY
@@ -267,6 +271,36 @@ def test_an_address_that_is_not_known() -> None:
     text = refusal(container(), PlanSettings())
     assert text.startswith("this host's address towards the master http://robot:11311 is not known")
     assert "--advertise-host" in text
+
+
+def test_a_masters_name_that_leads_nowhere_is_the_cause_and_its_cure_the_whole() -> None:
+    text = refusal(container(), PlanSettings(), masters={"robot": ""})
+    assert text.startswith("its master is not found: the name robot can't be resolved")
+    assert "--add-host robot:ADDRESS" in text
+    assert "advertise-host" not in text
+
+
+@pytest.mark.parametrize(
+    ("label", "meant"),
+    [
+        ("ros-proxy.enable", "rosproxy.enable"),
+        ("ros_proxy.ports", "rosproxy.ports"),
+        ("rosproxi.enable", "rosproxy.enable"),
+        ("ros.proxy.master-uri", "rosproxy.master-uri"),
+        ("ROSPROXY.ENABEL", "rosproxy.enable"),
+    ],
+)
+def test_a_misspelt_label_is_told_with_the_one_that_was_meant(label: str, meant: str) -> None:
+    member, (told, *_) = read(container(labels={label: "true"}))
+    assert member is None
+    assert f"label {label} is unknown and ignored; did you mean {meant}?" in told.text
+
+
+@pytest.mark.parametrize(
+    "label", ["traefik.enable", "haproxy.enable", "com.docker.compose.project", "rosbridge.enable"]
+)
+def test_labels_of_others_are_left_alone(label: str) -> None:
+    assert read(container(labels={label: "true"})) == (None, [])
 
 
 def test_an_address_that_is_not_known_for_a_moment() -> None:

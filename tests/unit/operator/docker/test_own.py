@@ -63,6 +63,13 @@ def test_so_are_those_for_the_kernel_plane(capability: str) -> None:
     assert wrong(inspection(box), BOX.name) == wrong(process, PROCESS.name) == ""
 
 
+def test_so_is_one_with_ports_for_udp() -> None:
+    box = inspection(sandbox_config(structs.replace(BOX, udp=True), SETTINGS))
+    assert wrong(box, BOX.name) == ""
+    del box["HostConfig"]["PortBindings"]["11400/udp"]
+    assert "PortBindings" in wrong(box, BOX.name)
+
+
 def test_what_options_decide_makes_no_stranger() -> None:
     """What was made by an operator with other ones is made anew, which is for its planner."""
     other = replace(SETTINGS, uplink="0-other", publish_address=("::", "0.0.0.0"), proxy_memory=0,

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from rosproxy_operator.docker.planner.model import Container
 from tests.unit.operator.docker.builders import container, planned
-from tests.unit.operator.docker.hosts import SETTINGS, Hosts
+from tests.unit.operator.docker.hosts import Hosts
+from tests.unit.operator.docker.invariants import SETTINGS
 
 CONTAINERS = (
     Hosts.run, Hosts.change, Hosts.remove, Hosts.attach, Hosts.detach, Hosts.rename, Hosts.stranger,
-    Hosts.forge,
+    Hosts.forge, Hosts.share, Hosts.fail_redirects,
 )  # fmt: skip
 SURROUNDINGS = (
     Hosts.make_network, Hosts.remove_network, Hosts.take_port, Hosts.take_own_port,

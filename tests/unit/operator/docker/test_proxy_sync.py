@@ -1,7 +1,7 @@
 """Telling proxies their policy and who may use them, whatever else there is to be told."""
 
 import asyncio
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +9,13 @@ import pytest
 
 from rosproxy.access.layers import PolicyLayer
 from rosproxy.access.rules import parse_rules
+from rosproxy.admin.status_document import (
+    DomainStatus,
+    LocatorStatus,
+    ParticipantStatus,
+    ProxyStatus,
+)
+from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.policy import administrators_policy
@@ -18,14 +25,14 @@ from rosproxy_operator.docker.planner.labels.members import LabelReading
 from rosproxy_operator.docker.planner.model import Attachment, Member
 from rosproxy_operator.docker.proxy_sync import DockerProxySync, silence
 from rosproxy_operator.docker.snapshot import DockerSnapshot, ProxyAccess
-from tests.unit.operator.docker.builders import KEY, SETTINGS, both, container, observed
+from tests.unit.operator.docker.builders import KEY, RANGE, SETTINGS, both, container, observed
 
 WHERE = HostPort("172.30.0.2", 11312)
 FIRST, SECOND = ProxyAccess(WHERE, "token", "run 1"), ProxyAccess(WHERE, "token", "run 2")
 
 
 class Proxies(ProxyClient):
-    """A proxy that notes whom it is told of, and never answers anything else.
+    """A proxy that notes whom it is told of, and answers nothing else but what is ``known`` of it.
 
     ``calls`` are all that came, in order: addresses, or the names of layers.
     """
@@ -33,13 +40,20 @@ class Proxies(ProxyClient):
     def __init__(self) -> None:
         super().__init__()
         self.told: list[list[str]] = []
+        self.former: Mapping[str, Sequence[int]] | None = None
+        self.known: ProxyStatus | None = None
         self.calls: list[list[str]] = []
         self.refuses: ProxyError | None = None
         self.heard = asyncio.Event()
         self.errors: list[ProxyError] = []
 
     async def status(self, where: HostPort) -> Any:
-        await asyncio.Event().wait()
+        if self.known is None:
+            await asyncio.Event().wait()
+        return self.known
+
+    async def containers(self, where: HostPort, token: str, body: Mapping[str, Any]) -> Any:
+        return {}
 
     async def policy(self, where: HostPort, token: str, layers: Sequence[PolicyLayer]) -> None:
         assert (where, token) == (WHERE, "token")
@@ -47,10 +61,18 @@ class Proxies(ProxyClient):
         if self.refuses:
             raise self.refuses
 
-    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
+    async def selected(
+        self,
+        where: HostPort,
+        token: str,
+        addresses: Collection[str],
+        peers: Collection[str] | None = None,
+        former: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
         assert (where, token) == (WHERE, "token")
         if self.errors:
             raise self.errors.pop()
+        self.former = former
         self.calls.append(sorted(addresses))
         self.told.append(sorted(addresses))
         self.heard.set()
@@ -69,7 +91,7 @@ async def tasks() -> AsyncIterator[Tasks]:
 
 
 def look(
-    *addresses: str, access: ProxyAccess = FIRST, policy: str = ""
+    *addresses: str, access: ProxyAccess = FIRST, policy: str = "", ports: PortRange = RANGE
 ) -> tuple[DockerSnapshot, list[Member]]:
     """Containers at these addresses, which a proxy's labels select, on its network.
 
@@ -79,7 +101,7 @@ def look(
         container(f"node{number}", networks=[Attachment("app", address)])
         for number, address in enumerate(addresses)
     ]
-    own = both()
+    own = both(ports=ports)
     box = own["sandboxes"][0]
     home = Attachment("app", "172.18.0.2")
     own["sandboxes"] = [replace(box, container=replace(box.container, attachments=(home,)))]
@@ -106,6 +128,32 @@ async def test_it_is_told_anew_at_each_look_and_to_each_run_of_the_proxy(tasks: 
     for access in (FIRST, FIRST, SECOND):
         sync.update(*look("172.18.0.5", access=access))
         assert await proxies.next() == ["172.18.0.5"]
+
+
+@pytest.mark.parametrize(
+    ("ports", "told"),
+    [(RANGE, {}), (PortRange(11400, 11500), {}), (PortRange(11402, 11440), {"01.0f": (11401,)})],
+)
+async def test_a_proxy_that_had_to_leave_its_ports_is_told_who_had_some(
+    ports: PortRange, told: Mapping[str, Sequence[int]], tasks: Tasks
+) -> None:
+    proxies = Proxies()
+    sync = DockerProxySync(tasks, proxies, SETTINGS, lambda: None)
+    one = ParticipantStatus(
+        guid_prefix="01.0f", address="172.18.0.5", leases=(LocatorStatus(port=11401),)
+    )
+    proxies.known = ProxyStatus(domains=(DomainStatus(inside=(one,)),))
+    seen, members = look("172.18.0.5")
+    sync.update(seen, members)
+    await proxies.next()
+    while not sync.answers(seen.state.proxies[0].container.name):
+        await asyncio.sleep(0)
+    proxies.known = None
+
+    sync.update(*look("172.18.0.5", access=SECOND, ports=ports))
+
+    await proxies.next()
+    assert proxies.former == told
 
 
 async def test_what_was_not_heard_is_told_again(

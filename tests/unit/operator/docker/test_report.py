@@ -1,5 +1,6 @@
 """What people read."""
 
+import json
 from typing import Any
 
 import pytest
@@ -27,6 +28,10 @@ from tests.unit.operator.docker.builders import KEY, RANGE
 
 PROXY = {
     "name": "rosproxy-robot-eefee4",
+    "ros": "1",
+    "domain": None,
+    "peers": [],
+    "ear": None,
     "master_uri": "http://robot:11311",
     "master_address": "192.0.2.7",
     "advertise_host": "192.0.2.10",
@@ -48,13 +53,16 @@ NODES = [
         "state": "alive",
     },
 ]
-TALKER = {
+TALKER: dict[str, Any] = {
     "name": "talker",
     "state": "running",
     "proxy": "rosproxy-robot-eefee4",
     "networks": ["app"],
     "addresses": {"app": "172.18.0.2"},
     "nodes": NODES,
+    "ros": "1",
+    "participants": [],
+    "redirect": None,
 }
 LISTENER = {**TALKER, "name": "listener", "proxy": None, "nodes": []}
 STATUS = {
@@ -99,20 +107,33 @@ def test_each_action_is_one_line(action: Action, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("actions", "problems", "lines"),
+    ("actions", "problems", "lines", "code"),
     [
         (
             ["start container a", "start container b"],
             [],
             ["start container a", "start container b"],
+            3,
         ),
-        ([], [{"subject": "uplink", "text": "odd"}], ["Nothing to do.", "uplink: odd"]),
+        (
+            [],
+            [{"subject": "uplink", "text": "odd", "fatal": True}],
+            ["Nothing to do.", "uplink: odd"],
+            1,
+        ),
+        (
+            [],
+            [{"subject": "uplink", "text": "odd", "fatal": False}],
+            ["Nothing to do.", "uplink: odd"],
+            0,
+        ),
     ],
 )
-def test_a_plan_is_its_lines(
+def test_a_plan_is_its_lines_and_its_exit_code(
     actions: list[str],
-    problems: list[dict[str, str]],
+    problems: list[dict[str, Any]],
     lines: list[str],
+    code: int,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -120,15 +141,17 @@ def test_a_plan_is_its_lines(
         return {"actions": actions, "problems": problems}
 
     monkeypatch.setattr(status, "survey", survey)
-    status.show_plan(PlanSettings())
+    assert status.show_plan(PlanSettings(), as_json=False, wait=0) == code
     assert capsys.readouterr().out.splitlines() == lines
+    assert status.show_plan(PlanSettings(), as_json=True, wait=0) == code
+    assert json.loads(capsys.readouterr().out) == {"actions": actions, "problems": problems}
 
 
 def test_the_whole_status() -> None:
     assert render(STATUS, 100).splitlines() == [
         "rosproxy-operator 1.0: 2 containers, 1 proxy, uplink network 0-rosproxy",
         "",
-        "PROXY                  STATE    MASTER              OUTSIDE     PORTS",
+        "PROXY                  STATE    MASTER OR DOMAIN    OUTSIDE     PORTS",
         "rosproxy-robot-eefee4  running  http://robot:11311  192.0.2.10  11400-11431 2 used",
         "",
         "CONTAINER  STATE    PROXY                  PORTS        NODES",
@@ -192,3 +215,41 @@ def test_hostile_names_do_no_harm(name: str, columns: int, lines: int | None) ->
         assert width(text) >= 0
     action = Connect(name, name, (name,))
     assert str(action).isprintable()
+
+
+DOMAIN = {**PROXY, "name": "rosproxy-domain-0-7ec54e", "ros": "2", "domain": 0, "ear": "running",
+          "master_uri": "", "master_up": False, "range": "11432-11463", "used": 3}  # fmt: skip
+PARTICIPANT = {
+    "guid_prefix": "01.0f.56.e7.01.00.c2.37.00.00.00.00",
+    "vendor": "Fast DDS",
+    "address": "172.18.0.2",
+    "ports": [11433, 11434, 11435],
+    "publishes": ["/out", "/rosout"],
+    "subscribes": [],
+    "services": ["/talker/get_parameters"],
+    "problem": "",
+}
+
+
+def test_what_leads_to_the_proxy_is_told() -> None:
+    def told(in_place: bool) -> str:
+        redirect = {"master": "192.0.2.7:11311", "in_place": in_place}
+        return render({**STATUS, "containers": [{**TALKER, "redirect": redirect}]}, 120)
+
+    assert "    192.0.2.7:11311 leads to its proxy there" in told(True)
+    assert "    192.0.2.7:11311 does not lead to its proxy yet" in told(False)
+
+
+def test_both_versions_side_by_side() -> None:
+    again = {**TALKER, "proxy": DOMAIN["name"], "ros": "2", "nodes": []}
+    again["participants"] = [PARTICIPANT, {**PARTICIPANT, "problem": "no port is free"}]
+    every = {**STATUS, "proxies": [PROXY, DOMAIN], "containers": [TALKER, again]}
+    wrong = {"subject": "container talker", "text": "is odd", "fatal": False}
+    text = render({**every, "problems": [wrong]}, 120)
+    assert "1 container, 2 proxies" in text
+    assert "running  domain 0  " in text
+    assert text.count("Fast DDS: publishes /out  /rosout; serves /talker/get_parameters") == 2
+    assert "talker     running  rosproxy-domain-0-7ec54e  11432-11463  2 participants" in text
+    assert (text.count("! no port is free"), text.count("! is odd")) == (1, 1)
+    deaf = {**DOMAIN, "ear": None}
+    assert "domain 0, no ear" in render({**every, "proxies": [deaf]}, 120)

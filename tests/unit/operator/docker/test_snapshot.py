@@ -8,6 +8,7 @@ import pytest
 
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.docker.engine_json import (
+    container_of,
     environment,
     read_container,
     read_network,
@@ -16,6 +17,7 @@ from rosproxy_operator.docker.engine_json import (
 from rosproxy_operator.docker.planner.model import (
     Attachment,
     Container,
+    EarContainer,
     HostState,
     Key,
     Network,
@@ -105,6 +107,21 @@ def test_a_network_without_addresses() -> None:
     assert read_network(host).subnets == ()
 
 
+@pytest.mark.parametrize(
+    ("event", "container"),
+    [
+        ({"Type": "container", "Action": "die", "Actor": {"ID": "c1"}}, "c1"),
+        ({"Type": "network", "Actor": {"ID": "n1", "Attributes": {"container": "c1"}}}, "c1"),
+        ({"Type": "network", "Actor": {"ID": "n1", "Attributes": {"name": "app"}}}, ""),
+        ({"Type": "image", "Actor": {"ID": "sha256:1"}}, ""),
+        ({"Type": "container", "Actor": None}, ""),
+        ({}, ""),
+    ],
+)
+def test_which_container_an_event_is_about(event: dict[str, Any], container: str) -> None:
+    assert container_of(event) == container
+
+
 def test_the_signature_changes_with_each_connection() -> None:
     row: dict[str, Any] = captured.running()
     before = signature(row)
@@ -118,8 +135,14 @@ def test_ports_of_a_sandbox_that_is_being_started_are_no_strangers() -> None:
     key, ports = Key("http://robot:11311", "192.0.2.10"), PortRange(11400, 11401)
     box = Sandbox(key, Container("1", "box", "created"), ports, "")
     listening = frozenset({22, 11400, 11401})
-    assert strangers([box], {"box"}, listening) == {22}
-    assert strangers([box], set(), listening) == listening
+    assert strangers([box], [], listening) == {22}
+    assert strangers([], [], listening) == listening
+
+
+def test_the_port_of_an_ear_is_no_strangers() -> None:
+    key, ports = Key("", "192.0.2.10", 0), PortRange(11400, 11431)
+    ear = EarContainer(key, Container("1", "ear", "running"), ports, "")
+    assert strangers([], [ear], frozenset({11400, 11431})) == {11400}
 
 
 def test_the_engine_knows_names_that_no_name_server_has() -> None:

@@ -84,7 +84,7 @@ def test_both_are_hardened(body: dict) -> None:
     assert host["ReadonlyRootfs"] is True
     assert host["CapDrop"] == ["ALL"]
     assert host["SecurityOpt"] == ["no-new-privileges:true"]
-    assert host["RestartPolicy"] == {"Name": "unless-stopped"}
+    assert host["RestartPolicy"] == {"Name": "always"}
     assert not {"Privileged", "CapAdd", "Binds", "Devices"} & host.keys()
 
 
@@ -175,8 +175,8 @@ def test_what_makes_a_proxy_anew() -> None:
 
 def test_fingerprints_stay_as_they_were() -> None:
     """Else an update of the operator makes all proxies anew."""
-    assert sandbox_fingerprint(SANDBOX, SETTINGS) == "fc38dd94f5f167fd"
-    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET) == "711f77936ec9e3fc"
+    assert sandbox_fingerprint(SANDBOX, SETTINGS) == "a9291a3d8c5d7a0a"
+    assert proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET) == "fc7e3c97d41888da"
 
 
 def test_labels_are_read_back() -> None:

@@ -1,8 +1,9 @@
 """What labels may ask for: the administrator's word, which they can only narrow.
 
 Whoever starts a container chooses its image, and often does not know what labels that carries. A
-label can have ports of the host published, a capability given to a proxy, and a name taken on a
-network: the master's host name leads to the proxy there. The operator's options say how far.
+label can have ports of the host published, a capability given to a proxy, a name taken on a
+network (the master's host name leads to the proxy there), and announcements sent to other hosts.
+The operator's options say how far.
 
 A master that is not allowed leaves the container out. Of anything else that goes too far, the
 container gets what is allowed, and a warning.
@@ -15,7 +16,7 @@ from typing import get_args
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.settings import DataPlane
+from rosproxy.settings import DataPlane, read_peer
 from rosproxy_operator.docker.planner.model import Member, PlanSettings
 
 LEAST_PORT = 1024
@@ -29,8 +30,8 @@ _PATTERN = re.compile(
 )
 
 
-def read_master_pattern(text: str) -> str:
-    """Which masters are meant, ``host`` or ``host:port``, in lower case; * and ? stand for others.
+def read_host_pattern(text: str) -> str:
+    """Which masters or peers are meant, ``host:port`` in lower case; * and ? stand for others.
 
     What a master's URI is led by may stand before it. Raises ValueError.
     """
@@ -46,7 +47,7 @@ def refused_master(uri: str, settings: PlanSettings) -> str:
     """Why a container may not have a master, given as a URI; empty if it may."""
     where = parse_slave_uri(uri)
     option = parse_slave_uri((settings.master_uri or "").lower())
-    if where is None or where == option or _is_allowed(where, settings.allow_master):
+    if where is None or where == option or _is_allowed_master(where, settings.allow_master):
         return ""
     names = ", ".join(settings.allow_master)
     usual = f"names a port below {LEAST_PORT}, where no ROS master is"
@@ -84,12 +85,31 @@ def narrowed(asked: Member, settings: PlanSettings) -> tuple[Member, tuple[str, 
             "master, which labels can't widen"
         )
         asked = replace(asked, slave_control=None)
+    if asked.redirect and not settings.redirect:
+        told.append(
+            "label rosproxy.redirect=true is ignored: the operator's --no-redirect says otherwise, "
+            "which labels can't widen"
+        )
+    if refused := {peer for peer in asked.peers if not _is_allowed_peer(peer, settings)}:
+        told.append(
+            f"label rosproxy.peers names {', '.join(sorted(refused))}, which labels may not: it is "
+            "not told of participants; start the operator with "
+            f"{' '.join(f'--allow-peer {peer}' for peer in sorted(refused))} if it is to be"
+        )
+        asked = replace(asked, peers=asked.peers - refused)
     return asked, tuple(told)
 
 
-def _is_allowed(where: HostPort, patterns: tuple[str, ...]) -> bool:
-    if not patterns:
-        return where.port >= LEAST_PORT
+def _is_allowed_master(where: HostPort, patterns: tuple[str, ...]) -> bool:
+    return _matches(where, patterns) if patterns else where.port >= LEAST_PORT
+
+
+def _is_allowed_peer(peer: str, settings: PlanSettings) -> bool:
+    own = not settings.allow_peer or peer in settings.ros2_peer
+    return own or _matches(read_peer(peer), settings.allow_peer)
+
+
+def _matches(where: HostPort, patterns: tuple[str, ...]) -> bool:
     ends = (pattern.rpartition(":")[::2] for pattern in patterns)
     return any(
         fnmatchcase(where.host.lower(), host.strip("[]")) and fnmatchcase(str(where.port), port)

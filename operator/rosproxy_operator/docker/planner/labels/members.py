@@ -3,14 +3,16 @@
 import difflib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from rosproxy.telemetry.text import listed
 from rosproxy_operator.common.problem import Problem
-from rosproxy_operator.docker.planner.labels import bounds, values
+from rosproxy_operator.docker.planner.labels import bounds, ros2, values
 from rosproxy_operator.docker.planner.labels.values import (
     ADVERTISE_HOST,
     ENABLE,
     LABELS,
+    REDIRECT,
     UnusableLabel,
 )
 from rosproxy_operator.docker.planner.model import (
@@ -21,10 +23,12 @@ from rosproxy_operator.docker.planner.model import (
     Member,
     PlanSettings,
 )
-from rosproxy_operator.docker.planner.specs import MANAGED, master
+from rosproxy_operator.docker.planner.specs import MANAGED, master, unresolved_master
 
 _PREFIX = "rosproxy"
 _COUNTED = ALIVE | {"exited"}
+_LONGEST = 2 * max(map(len, LABELS))
+"""Characters of a name that may be a misspelt label; a longer one is like none by two thirds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +58,8 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
         wrong = [_problem(container, text, False) for text in _warnings(container, settings)]
         try:
             if values.enabled(container.labels, _exposed(container, settings)):
-                asked = _request(container, observed, settings, proxies)
-                request, texts = bounds.narrowed(asked, settings)
-                requests.append(request)
+                asked, texts = _requests(container, observed, settings, proxies)
+                requests += asked
                 wrong += [_problem(container, text, False) for text in texts]
         except UnusableLabel as error:
             wrong.append(_unusable(container, str(error)))
@@ -67,30 +70,94 @@ def read_labels(observed: HostState, settings: PlanSettings) -> LabelReading:
 def master_hosts(reading: LabelReading, observed: HostState) -> tuple[str, ...]:
     """The hosts of all masters that a proxy is wanted for or there for, in lower case, sorted."""
     wanted = {each.key for each in reading.requests if each.container.alive}
-    return tuple(sorted({master(key).host.lower() for key in observed.keys | wanted}))
+    keys = (key for key in observed.keys | wanted if not key.is_ros2)
+    return tuple(sorted({master(key).host.lower() for key in keys}))
 
 
 def find_members(
-    reading: LabelReading, observed: HostState
+    reading: LabelReading, observed: HostState, settings: PlanSettings
 ) -> tuple[tuple[Member, ...], tuple[Problem, ...]]:
     """The containers that belong to a proxy, and those of which it is not known to which."""
     members: list[Member] = []
     problems: list[Problem] = []
     for request in reading.requests:
-        container, uri = request.container, request.key.master_uri
-        key = Key(uri, request.key.advertise_host or _advertised(request, observed))
-        if key.advertise_host:
-            needs, text = values.looks_for(container, key)
+        container = request.container
+        host = request.key.advertise_host or _advertised(request, observed)
+        key = replace(request.key, advertise_host=host)
+        if host:
+            found, text = _placed(replace(request, key=key), observed, settings)
             wrong = [_problem(container, text, False)] if text else []
-            members.append(replace(request, key=key, needs=needs))
+            members.append(found)
         else:
-            text = (
-                f"this host's address towards the master {uri} is not known: add the label "
-                f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host"
-            )
+            text = _no_way(key, observed)
             wrong = [_unusable(container, text)]
         problems += wrong if container.alive else []
     return tuple(members), tuple(problems)
+
+
+def _placed(request: Member, observed: HostState, settings: PlanSettings) -> tuple[Member, str]:
+    """A container whose proxy is known, with how it finds that, and what is wrong with it."""
+    container, key = request.container, request.key
+    if key.is_ros2:
+        return request, ""
+    needs, text = values.looks_for(container, key)
+    given = values.master_by_address(container, key, observed.masters)
+    if given is None:
+        return replace(request, needs=needs), text
+    inner = {network.name for network in observed.networks if network.internal}
+    if not settings.redirect:
+        text += "; the operator's --no-redirect keeps it from being led to the proxy"
+    elif request.redirect is False:
+        text += f"; without {values.named(REDIRECT, container.labels)} it is led to the proxy"
+    elif (joined := values.owner(container, observed).networks) and joined <= inner:
+        text += "; it is not led to the proxy, since its networks have no way outwards"
+    else:
+        return replace(request, by_address=given), ""
+    return request, text
+
+
+def _no_way(key: Key, observed: HostState) -> str:
+    """Why it is not known how outside reaches this host, the first cause first.
+
+    It follows from the master's address, which often is what is not known.
+    """
+    if not key.is_ros2 and observed.masters.get(master(key).host.lower()) == "":
+        return f"its master is not found: {unresolved_master(master(key).host)}"
+    towards = "" if key.is_ros2 else f" towards the {key.graph}"
+    return (
+        f"this host's address{towards} is not known: add the label "
+        f"{ADVERTISE_HOST}=ADDRESS, or start the operator with --advertise-host"
+    )
+
+
+def _requests(
+    container: Container, observed: HostState, settings: PlanSettings, proxies: Collection[str]
+) -> tuple[list[Member], list[str]]:
+    """What a container gets of what it asks for, for each version of ROS, and what it is told."""
+    found = ros2.versions(container)
+    asked = [_request(container, observed, settings, proxies)] if "1" in found else []
+    if "2" in found:
+        asked.append(_ros2_request(container, observed, settings))
+    narrow = [bounds.narrowed(each, settings) for each in asked]
+    told = [*ros2.warnings(container, found)]
+    told += dict.fromkeys(text for _, texts in narrow for text in texts)
+    return [request for request, _ in narrow], told
+
+
+def _ros2_request(container: Container, observed: HostState, settings: PlanSettings) -> Member:
+    labels, host = container.labels, values.advertise_host(container.labels, settings)
+    ros2.refuse_unserved(container, host)
+    networks = values.networks(container, observed, settings.uplink)
+    return Member(
+        container,
+        Key("", host, ros2.domain(container)),
+        ports=values.ports(labels),
+        networks=networks,
+        data_plane=values.data_plane(labels),
+        direction=values.direction(labels, networks, observed.networks),
+        policy=values.policy(labels),
+        peers=ros2.peers(labels),
+    )
 
 
 def _request(
@@ -105,8 +172,10 @@ def _request(
         networks=networks,
         data_plane=values.data_plane(labels),
         direction=values.direction(labels, networks, observed.networks),
+        udp=values.udp(labels),
         slave_control=values.slave_control(labels),
         policy=values.policy(labels),
+        redirect=values.redirect(labels),
     )
 
 
@@ -121,7 +190,9 @@ def _unusable(container: Container, text: str) -> Problem:
 
 def _exposed(container: Container, settings: PlanSettings) -> bool:
     """Whether a container that does not say gets a proxy."""
-    return settings.expose_by_default and bool(_own(container) or container.master_uri)
+    if not settings.expose_by_default:
+        return False
+    return bool(_own(container) or container.master_uri or "2" in ros2.versions(container))
 
 
 def _own(container: Container) -> list[str]:
@@ -130,7 +201,7 @@ def _own(container: Container) -> list[str]:
         name
         for name in container.labels
         if name.lower().startswith(f"{_PREFIX}.")
-        or (name.lower().startswith(_PREFIX) and _near(name, 0.9))
+        or (_near(name, 0.9) and not name.startswith(f"io.{_PREFIX}."))
     )
 
 
@@ -153,14 +224,22 @@ def _warnings(container: Container, settings: PlanSettings) -> Iterator[str]:
     for name in own:
         if name not in LABELS:
             near = _near(name, 0.75)
-            fix = f"did you mean {near[0]}?" if near else f"there are {', '.join(LABELS)}"
+            fix = f"did you mean {near}?" if near else f"there are {', '.join(LABELS)}"
             yield f"label {name} is unknown and ignored; {fix}"
-    if own and ENABLE not in container.labels and not settings.expose_by_default:
+    meant = any(_near(name, 0.75) == ENABLE for name in own)  # that has been told
+    if own and not meant and ENABLE not in container.labels and not settings.expose_by_default:
         yield f"{listed(f'label {name}' for name in own)} ignored: add the label {ENABLE}=true"
 
 
-def _near(name: str, cutoff: float) -> list[str]:
-    return difflib.get_close_matches(name.lower(), LABELS, n=1, cutoff=cutoff)
+def _near(name: str, cutoff: float) -> str:
+    """The label that is spelt much like a name; empty if none is."""
+    return _nearest(name.lower(), cutoff) if len(name) <= _LONGEST else ""
+
+
+@lru_cache(maxsize=1024)
+def _nearest(name: str, cutoff: float) -> str:
+    """The same, kept: hundreds of containers have the same few names."""
+    return next(iter(difflib.get_close_matches(name, LABELS, n=1, cutoff=cutoff)), "")
 
 
 def _advertised(request: Member, observed: HostState) -> str:
@@ -168,9 +247,13 @@ def _advertised(request: Member, observed: HostState) -> str:
 
     A name that can't be resolved for a moment must not take a proxy away.
     """
-    towards = observed.advertise.get(master(request.key).host, "")
-    uri, networks = request.key.master_uri, request.container.networks
-    there = [box for box in observed.sandboxes if box.key.master_uri == uri]
+    key, networks = request.key, request.container.networks
+    towards = observed.far if key.is_ros2 else observed.advertise.get(master(key).host, "")
+    there = [
+        box
+        for box in observed.sandboxes
+        if (box.key.master_uri, box.key.domain) == (key.master_uri, key.domain)
+    ]
     if towards or not there:
         return towards
     near = {box.key for box in there if box.container.networks & networks}

@@ -31,11 +31,16 @@ ADVERTISE_HOST = "rosproxy.advertise-host"
 NETWORK = "rosproxy.network"
 DATA_PLANE = "rosproxy.data-plane"
 DIRECTION = "rosproxy.direction"
+UDP = "rosproxy.udp"
 SLAVE_CONTROL = "rosproxy.slave-control"
 POLICY = "rosproxy.policy"
+ROS = "rosproxy.ros"
+DOMAIN = "rosproxy.domain"
+PEERS = "rosproxy.peers"
+REDIRECT = "rosproxy.redirect"
 LABELS = (
     *(ENABLE, MASTER_URI, PORTS, ADVERTISE_HOST, NETWORK, DATA_PLANE, DIRECTION),
-    *(SLAVE_CONTROL, POLICY),
+    *(UDP, SLAVE_CONTROL, POLICY, ROS, DOMAIN, PEERS, REDIRECT),
 )
 
 ALIAS = "rosproxy"
@@ -69,13 +74,13 @@ def named(label: str, labels: Labels) -> str:
 
 def enabled(labels: Labels, otherwise: bool) -> bool:
     """Whether a container wants a proxy; ``otherwise`` if it does not say."""
-    if ENABLE not in labels:
-        return otherwise
-    word = labels[ENABLE].strip().lower()
-    if word not in ("true", "false"):
-        text = f"{named(ENABLE, labels)} is neither true nor false: write {ENABLE}=true"
-        raise UnusableLabel(text)
-    return word == "true"
+    found = _flag(ENABLE, labels)
+    return otherwise if found is None else found
+
+
+def redirect(labels: Labels) -> bool | None:
+    """Whether a master given by address may be led to the proxy, or None."""
+    return _flag(REDIRECT, labels, "false")
 
 
 def ports(labels: Labels) -> int:
@@ -108,6 +113,11 @@ def direction(
         return "both" if any(one.internal and one.name in joined for one in networks) else None
     fix = "both where its nodes have no way outwards but the proxy, or leave it out"
     return _word(DIRECTION, labels, get_args(Direction), fix)
+
+
+def udp(labels: Labels) -> bool | None:
+    """Whether the ports are to be published for UDP, too, or None if the option says."""
+    return _flag(UDP, labels)
 
 
 def slave_control(labels: Labels) -> SlaveControl | None:
@@ -145,13 +155,22 @@ def advertise_host(labels: Labels, settings: PlanSettings) -> str:
 
 def networks(container: Container, observed: HostState, uplink: str) -> frozenset[str]:
     """The container's user-defined networks but the uplink, or the one that its label names."""
-    owner = _owner(container, observed)
-    own = (owner.networks or _soon(owner, observed)) - BUILT_IN - {uplink}
+    place = owner(container, observed)
+    own = (place.networks or _soon(place, observed)) - BUILT_IN - {uplink}
     if NETWORK in container.labels:
         return frozenset({_named_network(container.labels, own)})
     if not own:
-        raise UnusableLabel(_why_none(owner))
+        raise UnusableLabel(_why_none(place))
     return own
+
+
+def _flag(label: str, labels: Labels, usual: str = "true") -> bool | None:
+    """Whether a label says true or false, None without it; ``usual`` is what most would want."""
+    word = labels.get(label, "").strip().lower()
+    if label in labels and word not in ("true", "false"):
+        text = f"{named(label, labels)} is neither true nor false: write {label}={usual}"
+        raise UnusableLabel(text)
+    return word == "true" if word else None
 
 
 def _word(label: str, labels: Labels, words: tuple[_Word, ...], fix: str) -> _Word | None:
@@ -201,7 +220,7 @@ def _named_network(labels: Labels, own: frozenset[str]) -> str:
     )
 
 
-def _owner(container: Container, observed: HostState) -> Container:
+def owner(container: Container, observed: HostState) -> Container:
     """The container whose networks it has: itself, or the one that it shares them with."""
     met = {container.id}
     while (wanted := container.shares) is not None:
@@ -269,6 +288,21 @@ def looks_for(container: Container, key: Key) -> tuple[str, str]:
             return host, ""
         return host, f"{variable}: the proxy stands at its master's port {right.port}: {fix}"
     return "", f"{variable} {_wrong_master(host, key, fix)}"
+
+
+def master_by_address(
+    container: Container, key: Key, addresses: Mapping[str, str]
+) -> HostPort | None:
+    """The address and port in a container's ROS_MASTER_URI, if they are those of its master.
+
+    ``addresses`` are those of masters' hosts, where names are known. None for a name, and for IPv6.
+    """
+    where, right = parse_slave_uri(container.master_uri), master(key)
+    if where is None or where.port != right.port or ":" in where.host:
+        return None
+    if not is_address(where.host) or where.host not in (right.host, addresses.get(right.host)):
+        return None
+    return HostPort(where.host, where.port)
 
 
 def _wrong_master(host: str, key: Key, fix: str) -> str:

@@ -1,0 +1,51 @@
+"""What both engines know of ROS 2: versions, domains, peers, well-known ports and the ear."""
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros2.discovery.domain_settings import PORTS_PER_DOMAIN, SPDP_MULTICAST, SPDP_UNICAST
+from rosproxy.settings import LEAST_PER_DOMAIN, read_peer
+
+LAST_DOMAIN = 232
+"""The last one whose well-known ports are ports (DDSI-RTPS 2.5, 9.6.2.3)."""
+MOST_PEERS = 32
+"""Hosts that one label or field may name: each announcement goes to 32 ports of each."""
+LEAST_PORTS = LEAST_PER_DOMAIN + 1
+"""Ports of a proxy for ROS 2 with an ear: what the proxy has at least, and one for the ear."""
+ROS1_DISTROS = frozenset(
+    {"fuerte", "groovy", "hydro", "indigo", "jade", "kinetic", "lunar", "melodic", "noetic"}
+)
+"""There will be no more of them, so any other is one of ROS 2."""
+EAR_COMMAND = ("rosproxy", "ear")
+"""What the proxy's image does as an ear."""
+ALONE = {"ROS_LOCALHOST_ONLY": ("1",), "ROS_AUTOMATIC_DISCOVERY_RANGE": ("LOCALHOST", "OFF")}
+"""Variables that keep participants from being found by others, and their values for that."""
+
+
+def discovery_port(domain: int) -> int:
+    """The well-known port at which the first participant of a machine is told of others."""
+    return SPDP_UNICAST + PORTS_PER_DOMAIN * domain
+
+
+def well_known_ports(domain: int) -> frozenset[int]:
+    """The ports on which a domain's proxy listens besides its range."""
+    return frozenset({SPDP_MULTICAST + PORTS_PER_DOMAIN * domain, discovery_port(domain)})
+
+
+def read_peer_name(text: str) -> str:
+    """A peer, ``host`` or ``host:port``, in its one form. Raises ValueError."""
+    where = read_peer(text)
+    return str(where) if where.port else where.host.lower()
+
+
+def is_dds(rmw: str) -> bool:
+    """Whether an RMW_IMPLEMENTATION, empty for the default, is one that can be proxied."""
+    return "zenoh" not in rmw
+
+
+def ear_variables(domain: int, lan: str, bind: HostPort, proxy: HostPort) -> dict[str, str]:
+    """What an ear is told; see `rosproxy.ros2.servers.ear.EarSettings`."""
+    return {
+        "ROSPROXY_EAR_DOMAIN": str(domain),
+        "ROSPROXY_EAR_LAN": lan,
+        "ROSPROXY_EAR_BIND": str(bind),
+        "ROSPROXY_EAR_PROXY": str(proxy),
+    }

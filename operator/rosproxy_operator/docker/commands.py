@@ -1,0 +1,79 @@
+"""The commands below ``rosproxy-operator docker``: they look, and need no running operator.
+
+They import what they need when they run: the Docker SDK may not be installed.
+"""
+
+import sys
+from collections.abc import Callable
+
+import click
+
+from rosproxy.cli.options import Command, Seconds
+from rosproxy_operator.common.words import one_line
+from rosproxy_operator.docker.planner.model import PlanSettings
+
+_json_option = click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
+
+
+def _wait_option(text: str) -> Callable[[Command], Command]:
+    return click.option("--wait", type=Seconds(0), default=0, help=text, allow_from_autoenv=False)
+
+
+@click.command()
+@_json_option
+@click.option("--watch", is_flag=True, help="Show it anew every two seconds, until Ctrl-C.")
+@_wait_option("Time in which all may come to be as wanted, before it is shown.")
+@click.pass_obj
+def status(settings: PlanSettings, as_json: bool, watch: bool, wait: float) -> None:
+    """Show the proxies, the labelled containers, their nodes, and what is wrong.
+
+    Needs no running controller. Exits with 0 if all is as wanted: nothing is wrong or left to be
+    done, and every proxy answers; else with 1.
+    """
+    if as_json and watch:
+        raise click.UsageError("--json or --watch, not both")
+    from rosproxy_operator.docker.errors import EngineError
+    from rosproxy_operator.docker.status import show_status, watch_status
+
+    if watch:
+        watch_status(settings)
+        return
+    with one_line(EngineError):
+        sys.exit(show_status(settings, as_json, wait))
+
+
+@click.command()
+@_json_option
+@_wait_option("Time in which there may come to be nothing to do, before it is shown.")
+@click.pass_obj
+def plan(settings: PlanSettings, as_json: bool, wait: float) -> None:
+    """Show what the operator would do now, and change nothing.
+
+    Exits with 0 if there is nothing to do, with 3 if there is, with 1 if something is wrong that
+    the operator can't mend.
+    """
+    from rosproxy_operator.docker.errors import EngineError
+    from rosproxy_operator.docker.status import show_plan
+
+    with one_line(EngineError):
+        sys.exit(show_plan(settings, as_json, wait))
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
+@_json_option
+@click.pass_obj
+def doctor(settings: PlanSettings, names: tuple[str, ...], as_json: bool) -> None:
+    """Find out what is wrong on this host, and say what mends it, the first cause first.
+
+    Looks at images, networks, masters and labels, and asks the doctor of each proxy, in its
+    container. With names: about those nodes, topics and services. Exits with 0 if nothing is wrong,
+    with 1 if something is.
+    """
+    from rosproxy.cli.questions import tell
+    from rosproxy_operator.docker.doctor import examine
+    from rosproxy_operator.docker.errors import EngineError
+
+    with one_line(EngineError):
+        found = examine(settings, names)
+    tell(found, as_json)

@@ -1,0 +1,83 @@
+"""``rosproxy-operator docker doctor``: what is wrong on a host, the first cause first.
+
+First comes what the operator sees: images, networks, masters, labels, and what is yet to be done.
+Then each proxy is asked by the doctor of its own container (``docker exec``), which looks from
+where the proxy is. What mends a proxy is said in labels and options of the operator, which made it.
+"""
+
+import asyncio
+from collections.abc import Iterator, Sequence
+
+from rosproxy.admin.findings import DoctorFinding, error, ok, warning
+from rosproxy.telemetry.text import plural
+from rosproxy_operator.common.proxy_client import Json
+from rosproxy_operator.common.proxy_doctor import command, read_findings
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.docker.client import DockerClient
+from rosproxy_operator.docker.errors import EngineError
+from rosproxy_operator.docker.planner.model import PlanSettings
+from rosproxy_operator.docker.status import survey
+
+AT_ONCE = 4
+"""Proxies that are asked at the same time: each doctor is a Python of its own."""
+_CAUSES = ("engine", "proxy image", "network", "master", "container", "proxy")
+"""What may follow from what: the kinds of subjects, first causes first."""
+_ADDRESS = "label rosproxy.advertise-host=ADDRESS on its containers, or --advertise-host"
+CURES = {
+    "advertised host": _ADDRESS,
+    "published range": f"let its ports through this host's firewall; or {_ADDRESS}",
+    "ports": "label rosproxy.ports=N on its containers, or --ports N",
+}
+"""What mends what proxies find about themselves, by their checks."""
+
+
+def examine(settings: PlanSettings, names: Sequence[str]) -> list[DoctorFinding]:
+    """All findings; of proxies about these nodes and topics, if any. Raises EngineError."""
+    return asyncio.run(_examine(settings, names))
+
+
+async def _examine(settings: PlanSettings, names: Sequence[str]) -> list[DoctorFinding]:
+    status = await survey(settings)
+    engine, limit = DockerClient(), asyncio.Semaphore(AT_ONCE)
+
+    async def ask(name: str) -> list[DoctorFinding]:
+        async with limit:
+            try:
+                said = await in_thread(engine.run, name, *command(names))
+            except EngineError as wrong:
+                text = f"its own doctor could not be asked: {wrong}"
+                return [warning("proxy", f"proxy {name}", text, f"docker logs {name}")]
+        return read_findings(f"proxy {name}", said, CURES)
+
+    running = [proxy["name"] for proxy in status["proxies"] if proxy["state"] == "running"]
+    said = await asyncio.gather(*map(ask, running))
+    return [*host_findings(status), *(found for each in said for found in each)]
+
+
+def host_findings(status: Json) -> Iterator[DoctorFinding]:
+    """What there is to say of a host, from its status, the first cause first."""
+    problems = sorted(status["problems"], key=_order)
+    for problem in problems:
+        say = error if problem["fatal"] else warning
+        yield say(problem["subject"].partition(" ")[0], problem["subject"], problem["text"])
+    for proxy in status["proxies"]:
+        if proxy["state"] != "running":
+            text = f"its container is {proxy['state']}"
+            fix = f"docker logs {proxy['name']}; is the operator running?"
+            yield error("proxy", f"proxy {proxy['name']}", text, fix)
+    if status["actions"]:
+        text = f"{plural(len(status['actions']), 'step')} yet to be done, the first: "
+        fix = "start the operator if it does not run; rosproxy-operator docker plan shows them"
+        yield warning("operator", "operator", text + status["actions"][0], fix)
+    members = {one["name"] for one in status["containers"] if one["proxy"]}
+    if members:
+        text = f"{plural(len(members), 'container')} with a proxy"
+        yield ok("host", "host", text)
+    elif not problems:
+        fix = "docker run --label rosproxy.enable=true ..."
+        yield warning("host", "host", "no container is labelled, so that none has a proxy", fix)
+
+
+def _order(problem: Json) -> tuple[bool, int]:
+    kinds = [kind for kind in _CAUSES if problem["subject"].startswith(kind)]
+    return not problem["fatal"], _CAUSES.index(kinds[0]) if kinds else len(_CAUSES)

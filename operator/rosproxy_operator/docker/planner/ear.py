@@ -1,0 +1,114 @@
+"""What is to be done for the ear of a proxy for ROS 2.
+
+The ear is in the host's network: it hears the LAN's multicast there, and the proxy at the uplink's
+gateway, at the last of the ports that are held for the proxy, which is not published. It has to
+know the proxy's address, so it is made once the sandbox has one, and anew when that is another.
+"""
+
+from collections.abc import Collection, Iterator
+
+from msgspec.structs import replace
+
+from rosproxy.net.addresses import HostPort, is_address
+from rosproxy_operator.common.problem import Problem
+from rosproxy_operator.docker.planner.actions import (
+    Action,
+    CreateEar,
+    CreateSandbox,
+    Remove,
+    Rename,
+    Start,
+)
+from rosproxy_operator.docker.planner.model import NOWHERE, HostState, Key, PlanSettings
+from rosproxy_operator.docker.planner.selection import free_name
+from rosproxy_operator.docker.planner.specs import ear_fingerprint, ear_name, proxy_name
+from rosproxy_operator.docker.planner.steps import PlanContext, created, former_name, tended
+
+
+def with_ear(context: PlanContext, steps: list[Action]) -> list[Action]:
+    """The steps for a proxy, and if it is for ROS 2 those for its ear.
+
+    Before a sandbox is started the ear goes: its port may become one that is published.
+    """
+    key = context.desired.key
+    if not key.is_ros2:
+        return steps
+    boxes = {box.container.name for box in context.observed.sandboxes_of(key)}
+    if any(_starts(step, boxes) for step in steps):
+        return [*_without(context, "its proxy gets another address"), *steps]
+    return [*steps, *_ear_steps(context)]
+
+
+def missing_ear(key: Key, observed: HostState, settings: PlanSettings) -> Problem | None:
+    """Why a proxy for ROS 2 has no ear though it ought to."""
+    if settings.ros2_lan == NOWHERE or _lan(key, observed, settings) or observed.ears_of(key):
+        return None
+    text = (
+        "does not hear the LAN, since this host's address there is not known: start the operator "
+        f"with --ros2-lan ADDRESS, or with --ros2-lan {NOWHERE} if peers are enough"
+    )
+    return Problem(f"proxy {proxy_name(key)}", text, fatal=False)
+
+
+def _starts(step: Action, boxes: Collection[str]) -> bool:
+    """Whether a sandbox, one of these or a new one, begins or ends by a step."""
+    begins = isinstance(step, Start | Remove) and step.name in boxes
+    return begins or isinstance(step, CreateSandbox)
+
+
+def _lan(key: Key, observed: HostState, settings: PlanSettings) -> str:
+    """This host's address on the LAN; empty if there is none, or it is not known."""
+    if settings.ros2_lan:
+        return "" if settings.ros2_lan == NOWHERE else settings.ros2_lan
+    return key.advertise_host if is_address(key.advertise_host) else observed.far
+
+
+def _wanted(context: PlanContext) -> CreateEar | None:
+    """The ear that there ought to be; None if there ought to be none, or its proxy is not found."""
+    key, observed, settings = context.desired.key, context.observed, context.settings
+    lan, bind = _lan(key, observed, settings), context.ear
+    near = next(
+        (
+            place.address
+            for box in observed.sandboxes_of(key)
+            for place in box.container.attachments
+            if place.network == settings.uplink and place.address
+        ),
+        "",
+    )
+    if not lan or not near or bind is None:
+        return None
+    proxy = HostPort(near, context.ports.first)
+    return CreateEar(ear_name(key), key, context.ports, lan, bind, proxy)
+
+
+def _ear_steps(context: PlanContext) -> Iterator[Action]:
+    made = _wanted(context)
+    if context.settings.ros2_lan == NOWHERE:
+        yield from _without(context, "the LAN is not to be heard")
+    elif made is not None:
+        yield from _made(context, made)
+
+
+def _made(context: PlanContext, made: CreateEar) -> Iterator[Action]:
+    """The steps to have this very ear, and no other."""
+    ears = context.observed.ears_of(made.key)
+    expected = ear_fingerprint(made, context.settings, context.observed.image_id)
+    found = context.select(ears, made.name, expected, lambda _: True)
+    if found.stuck or found.waiting:
+        return
+    yield from (Remove(one.name, "left over") for one in found.others)
+    taken = context.taken(ears)
+    if found.kept is None:
+        made = replace(made, name=free_name(made.name, taken), fingerprint=expected)
+        yield from created(found, made, former_name(found.old, made.name, taken))
+        return
+    yield from tended(found, found.kept)
+    if made.name not in (found.kept.name, *taken):
+        yield Rename(found.kept.name, made.name)
+
+
+def _without(context: PlanContext, why: str) -> Iterator[Action]:
+    for one in context.observed.ears_of(context.desired.key):
+        if one.container.state != "removing":
+            yield Remove(one.container.name, why)

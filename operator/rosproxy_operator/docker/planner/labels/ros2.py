@@ -1,0 +1,103 @@
+"""Which ROS a container is of, and what it wants of a proxy for ROS 2.
+
+A label says it, else the container's own variables, which most images with ROS have: ROS_VERSION,
+ROS_DISTRO. Where nothing says it a container is of ROS 1, as before there was anything else.
+"""
+
+import re
+from collections.abc import Collection, Iterator
+
+from rosproxy_operator.common.ros2 import (
+    ALONE,
+    LAST_DOMAIN,
+    MOST_PEERS,
+    ROS1_DISTROS,
+    is_dds,
+    read_peer_name,
+)
+from rosproxy_operator.docker.planner.labels.values import (
+    DOMAIN,
+    MASTER_URI,
+    PEERS,
+    REDIRECT,
+    ROS,
+    SLAVE_CONTROL,
+    UDP,
+    Labels,
+    UnusableLabel,
+    named,
+    quoted,
+)
+from rosproxy_operator.docker.planner.model import Container
+
+_OF_ROS1 = (MASTER_URI, REDIRECT, SLAVE_CONTROL, UDP)
+_OF_ROS2 = (DOMAIN, PEERS)
+
+
+def versions(container: Container) -> frozenset[str]:
+    """The versions of ROS that a container is of: 1, 2 or both. Raises UnusableLabel."""
+    if ROS in container.labels:
+        words = frozenset(re.split(r"[,\s]+", container.labels[ROS].strip()))
+        if not words <= {"1", "2"}:
+            text = f"{named(ROS, container.labels)} is none of 1, 2 and 1,2: write {ROS}=2"
+            raise UnusableLabel(text)
+        return words
+    version, distro = (container.variables.get(name, "") for name in ("ROS_VERSION", "ROS_DISTRO"))
+    if version in ("1", "2"):
+        return frozenset({version})
+    return frozenset({"1" if distro.lower() in ("", *ROS1_DISTROS) else "2"})
+
+
+def domain(container: Container) -> int:
+    """The domain of its participants: from the label, else its variable, else 0."""
+    if DOMAIN in container.labels:
+        source, text = named(DOMAIN, container.labels), container.labels[DOMAIN]
+    else:
+        text = container.variables.get("ROS_DOMAIN_ID", "") or "0"
+        source = f"its variable ROS_DOMAIN_ID={quoted(text)}"
+    word = text.strip()
+    if not re.fullmatch(r"[0-9]{1,3}", word, re.ASCII) or int(word) > LAST_DOMAIN:
+        fix = f"write {DOMAIN}=0 or whatever the domain is"
+        raise UnusableLabel(f"{source} is not a domain from 0 to {LAST_DOMAIN}: {fix}")
+    return int(word)
+
+
+def peers(labels: Labels) -> frozenset[str]:
+    """The hosts outside that are told of a container's participants; none without the label."""
+    words = [word for word in re.split(r"[,\s]+", labels.get(PEERS, "")) if word]
+    if len(words) > MOST_PEERS:
+        raise UnusableLabel(f"label {PEERS} names more than {MOST_PEERS} hosts: name fewer")
+    try:
+        return frozenset(map(read_peer_name, words))
+    except ValueError as error:
+        raise UnusableLabel(f"label {PEERS}: {error}") from None
+
+
+def refuse_unserved(container: Container, host: str) -> None:
+    """Raise UnusableLabel for what a proxy for ROS 2 can't do. ``host``: the advertised one."""
+    rmw = container.variables.get("RMW_IMPLEMENTATION", "")
+    if not is_dds(rmw):
+        text = f"its variable RMW_IMPLEMENTATION={quoted(rmw)} is no DDS, which alone is proxied"
+        raise UnusableLabel(f"{text}: use rmw_fastrtps_cpp or rmw_cyclonedds_cpp")
+    if ":" in host:
+        text = f"{host} can't be advertised for ROS 2, which is proxied by IPv4 alone"
+        raise UnusableLabel(f"{text}: give an IPv4 address")
+
+
+def warnings(container: Container, found: Collection[str]) -> Iterator[str]:
+    """What a container of these versions is told that has a proxy nevertheless."""
+    labels, variables = container.labels, container.variables
+    told = {ROS, MASTER_URI} & labels.keys() or container.master_uri
+    if not told and not {"ROS_VERSION", "ROS_DISTRO"} & variables.keys():
+        yield f"nothing says which ROS it is, so it is taken for ROS 1: add the label {ROS}=1 or 2"
+    for version, mine in (("1", _OF_ROS1), ("2", _OF_ROS2)):
+        if version not in found:
+            yield from (
+                f"label {label} is for ROS {version}, which this is not: ignored"
+                for label in mine
+                if label in labels
+            )
+    for name, values in ALONE.items() if "2" in found else ():
+        if variables.get(name, "").upper() in values:
+            text = f"its variable {name}={variables[name]} keeps its participants to themselves"
+            yield f"{text}: take it off"

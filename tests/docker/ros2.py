@@ -1,0 +1,172 @@
+"""Nodes of ROS 2: in labelled containers, and on a machine that shares a LAN with this host."""
+
+import itertools
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from rosproxy.admin.status_document import DomainStatus, parse_status
+from tests.docker.controller import Proxy, proxies
+from tests.docker.engine import docker, inspect, run, wait_until
+from tests.docker.inside import ENABLE, Container, Inside, unique
+from tests.docker.machines import Machine, addresses, machine
+from tests.docker.nodes import Log
+
+NUMBER = 91
+HERE, THERE = addresses(NUMBER)
+"""This host's address on the LAN, and the other machine's."""
+OPTIONS = ("--ports", "32", "--advertise-host", HERE)
+"""A controller's, so that outside is found on that LAN."""
+_PROGRAMS = {"jazzy": "node.py", "kilted": "node.py", "cyclone": "participant.py"}
+_numbers = itertools.count(1)
+
+
+def command(vendor: str, kind: str, topic: str, *options: str) -> tuple[str, ...]:
+    """The program that stands for a node, of an implementation of DDS."""
+    program = (f"/opt/{vendor}/bin/python", f"/nodes/{_PROGRAMS[vendor]}")
+    return (*program, kind, "--topic", topic, *options)
+
+
+@dataclass(frozen=True)
+class Outside:
+    """The machine on the LAN."""
+
+    machine: Machine
+
+    def node(self, vendor: str, kind: str, topic: str, *options: str) -> "OutsideNode":
+        """Start a node; what it prints goes to a file."""
+        name = f"outside_{kind}_{next(_numbers)}"
+        words = command(vendor, kind, topic, *options, "--name", name)
+        file = f"/tmp/{name}.log"
+        text = f"echo $$ >/tmp/{name}.pid; exec {' '.join(words)} >{file} 2>&1"
+        self.machine.start("sh", "-c", text)
+        path = self.machine.root / file.lstrip("/")
+        return OutsideNode(name, self, Log(lambda: path.read_text() if path.exists() else ""))
+
+    def end(self) -> None:
+        """End all nodes."""
+        self.machine.run("sh", "-c", "kill -KILL $(cat /tmp/*.pid); rm -f /tmp/*.pid", check=False)
+
+
+@dataclass(frozen=True)
+class OutsideNode:
+    name: str
+    outside: Outside
+    log: Log
+
+
+@contextmanager
+def machine_on_lan(
+    image: str, name: str = "lan", number: int = NUMBER, namespace: str = ""
+) -> Iterator[Outside]:
+    """A machine one cable away, which sends multicast into it."""
+    with machine(image, name, number, namespace=namespace) as found:
+        process = str(inspect(found.container)["State"]["Pid"])
+        run("nsenter", "--target", process, "--net",
+            "ip", "route", "add", "224.0.0.0/4", "dev", "eth0")  # fmt: skip
+        yield Outside(found)
+
+
+@dataclass(frozen=True)
+class Inside2:
+    """Makes networks, and containers with nodes of ROS 2."""
+
+    made: Inside
+
+    def node(
+        self, network: str, vendor: str, kind: str, topic: str, *options: str, **more: Any
+    ) -> Container:
+        """Start a labelled container, which says by its environment which ROS it is."""
+        name = unique(kind)
+        env = ("--env", f"ROS_DISTRO={vendor}", *more.pop("options", ()))
+        words = command(vendor, kind, topic, *options, "--name", Container(name).node)
+        more.setdefault("labels", (ENABLE,))
+        return self.made.run(network, *words, name=name, options=env, **more)
+
+
+def domain(proxy: Proxy) -> DomainStatus:
+    """What a proxy tells of its domain; nothing while it does not answer."""
+    text = docker("exec", proxy.name, "rosproxy", "status", "--json", check=False)
+    try:
+        (found,) = parse_status(text).domains
+    except ValueError:
+        return DomainStatus()
+    return found
+
+
+def ports(proxy: Proxy) -> dict[str, list[tuple[int, str]]]:
+    """The ports of the range with their locators, by participant inside."""
+    return {
+        one.guid_prefix: sorted((lease.port, lease.where) for lease in one.leases)
+        for one in domain(proxy).inside
+    }
+
+
+def wait_for_line(log: Log, pattern: str, count: int = 3, seconds: float = 60) -> None:
+    """Wait until that many lines match."""
+    wait_until(
+        lambda: len(re.findall(pattern, log.read(), re.MULTILINE)) >= count, seconds,
+        lambda: f"{count} of {pattern!r} in:\n{log.read()[-3000:]}",
+    )  # fmt: skip
+
+
+def ros2_proxies() -> list[Proxy]:
+    """The proxies for ROS 2 on this engine."""
+    return [proxy for proxy in proxies() if proxy.name.startswith("rosproxy-domain-")]
+
+
+def kept(proxy: Proxy) -> bool:
+    """Whether all participants inside keep their ports for the next process."""
+    found = domain(proxy).inside
+    return len(found) == 2 and all(one.kept for one in found)
+
+
+def all_run(proxy: Proxy) -> bool:
+    """Whether a proxy, its sandbox and its ear run."""
+    ear = inspect(proxy.ear, check=False)
+    return proxy.running and bool(ear) and bool(ear["State"]["Running"])
+
+
+def runs(proxy: Proxy) -> list[tuple[str, str]]:
+    """Which containers there are, and since when each runs."""
+    found = (inspect(name, check=False) for name in (proxy.name, proxy.sandbox, proxy.ear))
+    return [(one["Id"], one["State"]["StartedAt"]) for one in found if one]
+
+
+class Flow:
+    """A talker and a listener on either side; ``words`` are what each hears."""
+
+    def __init__(self, lan: Outside, inside2: Inside2, network: str = "", **more: Any) -> None:
+        network = network or inside2.made.network()
+        self.talker = inside2.node(network, "jazzy", "pub", "/out", "--word", "inside", **more)
+        self.listener = inside2.node(network, "kilted", "sub", "/back", **more)
+        lan.node("jazzy", "pub", "/back", "--word", "outside")
+        self.outward = lan.node("jazzy", "sub", "/out").log
+        self.inward = self.listener.log
+        self.wait(0)
+
+    @property
+    def heard(self) -> tuple[tuple[Log, str], tuple[Log, str]]:
+        return (self.outward, "inside"), (self.inward, "outside")
+
+    def wait(self, since: float, seconds: float = 60) -> None:
+        """Wait until messages flow in both directions; all parts run.
+
+        The kernel forgets first which way datagrams went while no port was published, as engines
+        since 23.0 have it do (github.com/moby/moby/pull/44742); Debian 12 has 20.10.
+        """
+        run("conntrack", "-D", "-p", "udp", "--orig-dst", HERE, check=False)  # there may be none
+        for log, word in self.heard:
+            log.wait_for(word, count=10, since=since, seconds=seconds)
+
+    def gaps(self, since: float) -> str:
+        """The longest times without messages since then, and how many were lost."""
+        now = time.time()
+        out, back = (log.longest_gap(word, since, now) for log, word in self.heard)
+        lost = sum(log.lost(word, since) for log, word in self.heard)
+        return (
+            f"seconds without messages outward {out:.1f}, inward {back:.1f}; messages lost {lost}"
+        )

@@ -1,0 +1,147 @@
+"""What is wrong on a host, told to whoever asks: the first cause, and what mends it."""
+
+import json
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.docker.controller import OPTIONS, Process, proxies, remove_proxies, the_proxy
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.robot import Robot, named_robot
+
+SCOUT = 94
+
+
+@pytest.fixture
+def process(tmp_path: Path, proxy_image: str, named: Robot, _no_other_controller: None) -> Process:
+    options = ("--proxy-image", proxy_image)
+    return Process(tmp_path, *options, names={named.name: named.address})
+
+
+def asked(process: Process, *words: str) -> tuple[int, dict[str, Any]]:
+    """The exit code of a command, and what it prints as JSON."""
+    text = process.once(*words, "--json", check=False)
+    assert process.process is not None
+    found: dict[str, Any] = json.loads(text[text.index("{") :])
+    return process.process.returncode, found
+
+
+def wrong(process: Process) -> tuple[int, list[dict[str, Any]]]:
+    """The exit code of ``doctor``, and all that it finds wrong."""
+    code, found = asked(process, "doctor")
+    severe = [one for one in found["findings"] if one["severity"] in ("error", "warning")]
+    return code, severe
+
+
+def page() -> dict[str, Any]:
+    """What the operator's live page shows of all proxies."""
+    with urllib.request.urlopen(f"http://{OPTIONS[-1]}/graph", timeout=30) as reply:
+        found: dict[str, Any] = json.loads(reply.read())
+    return found
+
+
+@pytest.fixture(scope="module")
+def named(ros_image: str) -> Iterator[Robot]:
+    """One with a master that knows nothing of nodes of other tests, long gone."""
+    with named_robot(ros_image, "scout", SCOUT) as robot:
+        robot.start_master()
+        yield robot
+
+
+def test_from_a_plan_to_a_host_that_is_well(process: Process, net: Inside, named: Robot) -> None:
+    network = net.network()
+    try:
+        code, planned = asked(process, "plan")
+        assert (code, planned) == (0, {"actions": [], "problems": []})
+        node = net.node(network, "rospy", "pub", "--topic", "/out")
+        code, planned = asked(process, "plan")
+        assert code == 3
+        assert any("create" in action for action in planned["actions"])
+        assert wrong(process)[1][0]["fix"].startswith("start the operator")
+        process.once("status", "--wait", "1", check=False)
+        assert process.process is not None
+        assert process.process.returncode == 1
+
+        process.start()
+        waiting = Process(process._directory, names={named.name: named.address})
+        waiting.options = process.options
+        status = json.loads(waiting.once("status", "--wait", "90", "--json"))
+        assert status["proxies"][0]["reachable"]
+        assert waiting.once("plan", "--wait", "60") == "Nothing to do."
+        wait_until(lambda: named.knows_proxied(node.node), 60, node.log.read)
+        wait_until(lambda: wrong(waiting) == (0, []), 60, lambda: str(wrong(waiting)))
+        text = " ".join(waiting.once("doctor", "/out", check=False).split())
+        assert f"proxy {the_proxy().name}: /out: published by /{node.node}" in text
+        shown = page()["nodes"]
+        assert shown[f"{the_proxy().name} /{node.node}"]["lane"] == "container"
+        assert shown[f"{named.master_uri} master"]["lane"] == "robot"
+        assert "nobody subscribes to it" in text
+
+        where = "http://127.0.0.1:11312/policy"
+        body = '{"layers": [{"name": "a", "mode": "enforce", "rules": "deny everything"}]}'
+        code_here = (
+            "import sys, urllib.request as u; r = u.Request(sys.argv[1], sys.argv[2].encode(), "
+            "method='POST')\ntry: u.urlopen(r)\nexcept u.HTTPError as e: print(e.code)"
+        )
+        assert docker("exec", the_proxy().name, "python3", "-c", code_here, where, body) == "400"
+        assert "the operator's policy: refused" in waiting.once("status", check=False)
+    finally:
+        process.stop()
+        remove_proxies()
+
+
+def test_a_misspelt_label(process: Process, net: Inside) -> None:
+    node = net.idle(net.network(), labels=("ros-proxy.enable=true",))
+    _, found = wrong(process)
+    (told,) = [one for one in found if one["subject"] == f"container {node.name}"]
+    assert "label ros-proxy.enable is unknown and ignored" in told["text"]
+    assert "did you mean rosproxy.enable?" in told["text"]
+    assert "did you mean rosproxy.enable?" in process.once("status", check=False)
+
+
+def test_a_masters_name_that_leads_nowhere_and_its_cure(
+    tmp_path: Path, process: Process, net: Inside, named: Robot
+) -> None:
+    """The cure names the name, and no label; done as it says, all is well."""
+    blind = Process(tmp_path, "--proxy-image", process.options[-1])
+    blind._names.clear()
+    blind._hosts.write_text("")
+    node = net.idle(net.network())
+    code, found = wrong(blind)
+    assert code == 1
+    assert found[0]["subject"] == f"master {named.name}"
+    (told,) = [one for one in found if one["subject"] == f"container {node.name}"]
+    for one in (found[0], told):
+        assert f"the name {named.name} can't be resolved where the operator runs" in one["text"]
+        assert f"--add-host {named.name}:ADDRESS" in one["text"]
+        assert "rosproxy.advertise-host" not in one["text"]
+    try:
+        blind.name(named.name, named.address)
+        blind.once("--once")
+        assert [proxy.running for proxy in proxies()] == [True]
+        assert not [one for one in wrong(blind)[1] if "container" in one["subject"]]
+        assert not [one for one in wrong(blind)[1] if "master" in one["check"]]
+    finally:
+        remove_proxies()
+
+
+def test_a_proxy_that_outside_does_not_reach(process: Process, net: Inside) -> None:
+    """192.0.2.1 is nobody's; the cure is said in the operator's words."""
+    net.idle(net.network(), labels=(ENABLE, "rosproxy.advertise-host=192.0.2.1"))
+    try:
+        process.once("--once")
+        code, found = wrong(process)
+        (told,) = [one for one in found if one["check"] == "published range"]
+        assert code == 1
+        assert "192.0.2.1" in told["text"]
+        assert "label rosproxy.advertise-host=ADDRESS" in told["fix"]
+        wait_until(
+            lambda: "published range: 192.0.2.1" in process.once("status", check=False), 60,
+            lambda: process.once("status", check=False),
+        )  # fmt: skip
+    finally:
+        remove_proxies()

@@ -1,0 +1,163 @@
+"""A master given by address: nothing but the label, and the proxy is in the way of nodes."""
+
+import time
+
+import pytest
+
+from tests.docker.controller import Controller, managed, proxies, the_proxy
+from tests.docker.engine import docker, inspect, wait_until
+from tests.docker.inside import ENABLE, Inside
+from tests.docker.redirects import addressed_talker, redirected, rules
+from tests.docker.robot import Robot
+
+
+@pytest.mark.parametrize("library", [pytest.param("rospy", marks=pytest.mark.smoke), "roscpp"])
+@pytest.mark.parametrize("known_by", ["", "ROS_IP", "ROS_HOSTNAME"])
+def test_the_label_alone_is_enough(
+    library: str, known_by: str, controller: Controller, near: Inside, robot: Robot
+) -> None:
+    """Topics and services both ways; also where a variable says what nodes call their host.
+
+    Nobody but the network knows that name, and that address is nobody's.
+    """
+    network = near.network()
+    variables = {"ROS_IP": "192.0.2.99", "ROS_HOSTNAME": "talker"}
+    options = ["--network-alias", "talker"]
+    if known_by:
+        options += ["--env", f"{known_by}={variables[known_by]}"]
+    ear = robot.node("ear", library, "sub", "--topic", "/out")
+    robot.node("mouth", library, "pub", "--topic", "/in", "--word", "robot")
+    robot.node("server", library, "serve", "--service", "/there")
+    began = time.time()
+    try:
+        node = near.node(
+            network, library, "pub", "--topic", "/out", "--word", "inside", options=tuple(options)
+        )
+        ear.wait_for("inside")
+        print(f"{library}: heard {ear.got('inside')[0].at - began:.1f} s after docker run")
+        server = near.node(network, library, "serve", "--service", "/ask")
+        listener = near.node(network, library, "sub", "--topic", "/in")
+        listener.log.wait_for("robot")
+        wait_until(lambda: robot.knows_proxied(server.node), 60, server.log.read)
+        robot.node("caller", library, "call", "--service", "/ask", "--count", "3").wait_for(
+            "ask", verb="reply"
+        )
+        caller = near.node(network, library, "call", "--service", "/there", "--count", "3")
+        caller.log.wait_for("ask", verb="reply")
+
+        for one in (node, listener):
+            assert robot.knows_proxied(one.node)
+            assert inspect(one.name)["RestartCount"] == 0
+            redirected(one, network)
+    finally:
+        for name in ("ear", "mouth", "server", "caller"):
+            robot.end(name)
+
+
+def test_it_is_told_and_leaves_no_more_than_a_record(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    network = near.network()
+    node = addressed_talker(near, network, robot)
+    redirected(node, network)
+
+    (row,) = (one for one in controller.status()["containers"] if one["name"] == node.name)
+    assert row["redirect"] == {"master": f"{robot.address}:11311", "in_place": True}
+    assert f"{robot.address}:11311 leads to its proxy there" in controller.command("status")
+    assert "goes around" not in controller.problems()
+    (record,) = managed("redirect")
+    made = inspect(record)
+    assert (made["State"]["Status"], made["State"]["ExitCode"]) == ("exited", 0)
+    assert made["HostConfig"]["NetworkMode"] == f"container:{inspect(node.name)['Id']}"
+    assert made["HostConfig"]["CapAdd"] == ["NET_ADMIN"]
+    assert made["HostConfig"]["CapDrop"] == ["ALL"]
+    assert made["HostConfig"]["SecurityOpt"] == ["no-new-privileges:true"]
+    assert made["HostConfig"]["ReadonlyRootfs"]
+    assert not made["Mounts"]
+
+    docker("rm", "--force", node.name)
+
+    wait_until(lambda: not managed("redirect"), 30, "the record is removed")
+
+
+def test_a_network_in_common_that_is_not_the_way_outwards(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    """Nodes' connections are to come from the address by which the proxy knows them."""
+    one, other = sorted((near.network(), near.network()))
+    node = near.node(
+        one, "roscpp", "pub", "--topic", "/out", "--word", "inside", verb="create",
+        labels=(ENABLE, f"rosproxy.network={other}"),
+    )  # fmt: skip
+    docker("network", "connect", other, node.name)
+    docker("start", node.name)
+
+    wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)
+
+    assert the_proxy().networks == {other}
+    redirected(node, other)
+
+
+def test_networks_joined_later_and_left(controller: Controller, near: Inside, robot: Robot) -> None:
+    one, other = near.network(), near.network()
+    node = addressed_talker(near, one, robot)
+    ear = robot.node("ear", "roscpp", "sub", "--topic", "/out")
+    try:
+        ear.wait_for("inside")
+        docker("network", "connect", other, node.name)
+        wait_until(lambda: the_proxy().networks == {one, other}, 60, "both are joined")
+        docker("network", "disconnect", one, node.name)
+
+        redirected(node, other)
+        ear.wait_for("inside", since=time.time())
+    finally:
+        robot.end("ear")
+
+
+def test_containers_that_share_a_network(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    """The label may be on either; there are rules once in the network of both."""
+    network = near.network()
+    owner = near.idle(network, labels=(), uri="")
+    mode = f"container:{owner.name}"
+    nodes = [
+        near.node(mode, "roscpp", "pub", "--topic", topic, "--word", "inside")
+        for topic in ("/out", "/more")
+    ]
+    for node in nodes:
+        wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)  # noqa: B023
+    redirected(owner, network)
+    assert len(managed("redirect")) == 1
+
+    for name in (owner, *nodes):
+        docker("restart", "--time", "0", name.name)
+
+    redirected(owner, network)
+    for node in nodes:
+        wait_until(lambda: robot.knows_proxied(node.node), 60, node.log.read)  # noqa: B023
+    assert rules(owner).count("dnat to") == 1
+    assert rules(owner) == rules(nodes[0])
+
+
+def test_the_last_container_goes_and_nothing_is_left(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    node = addressed_talker(near, near.network(), robot)
+
+    docker("kill", node.name)
+
+    wait_until(lambda: not proxies() and not managed("redirect"), 60, "all are removed")
+    assert f"/{node.node}" not in robot.nodes()
+
+
+def test_what_can_not_be_redirected_is_told(
+    controller: Controller, near: Inside, robot: Robot
+) -> None:
+    """Without a way outwards nothing gets as far as a rule."""
+    node = near.idle(near.network("--internal"))
+
+    wait_until(lambda: f"container {node.name}" in controller.problems(), 30, controller.problems)
+
+    assert "its networks have no way outwards" in controller.problems()
+    assert not managed("redirect")

@@ -1,0 +1,122 @@
+"""A real Prometheus with the guide's configuration: the dashboard shows, and alerts fire."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosproxy_operator.common.metrics import ClusterMetrics, CommonMetrics, DockerMetrics
+from tests.chart.monitoring import expressions, metrics
+from tests.docker.controller import Controller, Proxy, proxies
+from tests.docker.engine import docker, wait_until
+from tests.docker.inside import ENABLE, Container, Inside, inside
+from tests.docker.nodes import node_command
+from tests.docker.prometheus import Prometheus, guides_configuration, running_prometheus
+from tests.docker.robot import Robot, named_robot
+from tests.docker.ros2 import HERE, Inside2, Outside, ros2_proxies
+from tests.docker.traffic import traffic
+
+PATROL = 86
+OPERATOR = "127.0.0.1:21313"
+NODES = 5
+"""Three that talk, one that has a secret, and one that is killed."""
+LABELS = (ENABLE, "rosproxy.data-plane=kernel", f"rosproxy.ports={2 * NODES}")
+"""The kernel's share of the range is there for each node."""
+
+
+@pytest.fixture
+def patrol(ros_image: str) -> Iterator[Robot]:
+    """A robot with a master of its own, which the test ends."""
+    with named_robot(ros_image, "patrol", PATROL) as robot:
+        robot.start_master()
+        yield robot
+
+
+@pytest.fixture
+def cell(ros_image: str, patrol: Robot) -> Iterator[Inside]:
+    """Where the nodes of that master's inside live."""
+    with inside(ros_image, patrol.master_uri) as made:
+        yield made
+
+
+@pytest.fixture
+def prometheus(tmp_path: Path) -> Iterator[Prometheus]:
+    with running_prometheus(tmp_path, guides_configuration(tmp_path, OPERATOR)) as found:
+        yield found
+
+
+@pytest.fixture
+def operator(start_controller: Callable[..., Controller], patrol: Robot) -> Controller:
+    names = {patrol.name: patrol.address}
+    return start_controller("--allow-data-plane", "kernel", names=names)
+
+
+def ros1_proxy() -> Proxy:
+    (found,) = {one.name for one in proxies()} - {one.name for one in ros2_proxies()}
+    return Proxy(found)
+
+
+def of_kubernetes(query: str) -> bool:
+    """Whether a query is for what the operator on Kubernetes alone counts."""
+    return bool(metrics(query) & (families(ClusterMetrics()) - families(DockerMetrics())))
+
+
+def families(found: CommonMetrics) -> set[str]:
+    """The names of its metrics in queries."""
+    described = found.registry.collect()
+    return {f"{one.name}_total" if one.type == "counter" else one.name for one in described}
+
+
+def test_dashboard_and_alerts(
+    operator: Controller, prometheus: Prometheus, cell: Inside, patrol: Robot,
+    lan: Outside, inside2: Inside2,
+) -> None:  # fmt: skip
+    """One run: all is well; then one thing after the other breaks; each panel has had data."""
+    network = cell.network()
+    ear = lan.node("jazzy", "sub", "/out")
+    labels = (ENABLE, f"rosproxy.advertise-host={HERE}", "rosproxy.ports=16")
+    inside2.node(inside2.made.network(), "jazzy", "pub", "/out", "--word", "inside", labels=labels)
+    with traffic(cell, patrol, network, "rospy", labels=LABELS):
+        hidden = (*LABELS, "rosproxy.policy=deny publish /secret")
+        cell.node(network, "roscpp", "pub", "--topic", "/secret", labels=hidden)
+        box = cell.idle(network, labels=LABELS)
+        start_node(box, "victim")
+        ear.log.wait_for("inside")
+        proxy = ros1_proxy()
+        everybody = {("rosproxy", one.name) for one in (proxy, *ros2_proxies())}
+        everybody |= {("rosproxy-operator", "rosproxy-operator")}
+        wait_until(lambda: prometheus.answering() == everybody, 30, str(everybody))
+        wait_until(
+            lambda: bool(prometheus.series("rosproxy_kernel_connections > 0")),
+            30, lambda: docker("exec", proxy.name, "rosproxy", "status"),
+        )  # fmt: skip
+        wait_until(lambda: patrol.knows_proxied("victim"), 30, operator.logs)
+        wait_until(lambda: prometheus.firing() == [], 30, lambda: str(prometheus.firing()))
+
+        box.run("sh", "-c", "kill -KILL $(cat /tmp/victim.pid)")
+        found = prometheus.wait_for_alert("RosproxyNodeDown", instance=proxy.name, node="/victim")
+        assert f"The ROS node /victim behind {proxy.name}" in found["annotations"]["summary"]
+
+        # The port of the dead one goes to one of them, and the last gets none.
+        for number in range(NODES + 2):
+            start_node(box, f"filler_{number}")
+        prometheus.wait_for_alert("RosproxyRangeFull", instance=proxy.name)
+        prometheus.wait_for_alert("RosproxyNodesRefused", instance=proxy.name)
+
+        docker("kill", patrol.container)
+        found = prometheus.wait_for_alert("RosproxyMasterDown", instance=proxy.name)
+        assert f"docker exec {proxy.name} rosproxy doctor" in found["annotations"]["description"]
+
+        operator.kill()
+        docker("kill", proxy.name)
+        prometheus.wait_for_alert("RosproxyOperatorDown", instance="rosproxy-operator")
+        prometheus.wait_for_alert("RosproxyDown", instance=proxy.name)
+
+    asked = [(title, query) for title, query in expressions() if not of_kubernetes(query)]
+    assert not [each for each in asked if not prometheus.series(each[1])]
+
+
+def start_node(box: Container, name: str) -> None:
+    """One more node in a container, which may be killed while that runs."""
+    words = " ".join(node_command("roscpp", "pub", "--topic", f"/{name}", f"__name:={name}"))
+    box.start("sh", "-c", f"echo $$ >/tmp/{name}.pid; exec {words}")

@@ -1,0 +1,233 @@
+"""What must always hold on a simulated host, and once nothing happens any more."""
+
+from msgspec import structs
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common.allocation import overlap
+from rosproxy_operator.docker.planner.actions import Create, CreateEar, CreateSandbox
+from rosproxy_operator.docker.planner.desired import chosen_direction, chosen_plane, chosen_udp
+from rosproxy_operator.docker.planner.model import STARTED, Key, Member, PlanSettings
+from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.specs import (
+    ROLE_EAR,
+    ROLE_PROXY,
+    ROLE_REDIRECT,
+    ROLE_SANDBOX,
+    OwnLabels,
+    ear_fingerprint,
+    ear_name,
+    proxy_fingerprint,
+    proxy_name,
+    reserved_ports,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from tests.unit.operator.docker.builders import read_members
+from tests.unit.operator.docker.simulation import GATEWAY, SERVING, Box, Controller, Engine
+
+HERE = "192.0.2.10"
+ROBOT = Key("http://robot:11311", HERE)
+SETTINGS = PlanSettings(
+    advertise_host=HERE,
+    ports=2,
+    port_window=PortRange(11400, 11415),
+    grace=10.0,
+    max_ports=3,
+    allow_data_plane=("auto", "kernel", "splice"),
+)
+EPHEMERAL = PortRange(11414, 11500)
+INNER = "inner"
+"""Part of the names of internal networks."""
+
+
+class Invariants:
+    """A host with the operator, and what must hold there."""
+
+    def __init__(self) -> None:
+        self.engine = Engine(SETTINGS, EPHEMERAL)
+        self.controller = Controller(self.engine, SETTINGS)
+        for name in ("app", "lab", INNER):
+            self.engine.add_network(name, internal=INNER in name)
+        self.served: dict[Key, PortRange] = {}
+        self.may_move: set[Key] = set()
+        self.forgotten: set[tuple[int, Key]] = set()
+
+    def own(self, *states: str, role: str = "") -> list[tuple[Box, OwnLabels]]:
+        """The operator's containers."""
+        return [
+            (box, box.own)
+            for box in self.engine.boxes
+            if box.own and (not states or box.state in states) and role in ("", box.role)
+        ]
+
+    def boxes(self, *states: str, role: str = "") -> list[Box]:
+        return [box for box, _ in self.own(*states, role=role)]
+
+    def strangers(self) -> list[Box]:
+        return [box for box in self.engine.boxes if not box.own]
+
+    # what must hold
+
+    def check(self) -> None:
+        """What holds at any moment."""
+        running = [(own.key, own.role) for _, own in self.own(*SERVING)]
+        assert len(running) == len(set(running)), "one of each runs for each key"
+        for _, own in self.own(*SERVING, role=ROLE_SANDBOX):
+            served = self.served.get(own.key)
+            if served is not None and own.key not in self.may_move:
+                assert own.range.first == served.first, "who serves keeps its ports"
+                assert len(own.range) >= len(served)
+            self.served[own.key] = own.range
+            self.may_move.discard(own.key)
+        # One that was never started has no ports yet: it gives way to who has served on them.
+        boxes = self.own(role=ROLE_SANDBOX)
+        held = [(own.key, own.range) for box, own in boxes if box.state != "created"]
+        for key, ports in held:
+            others = [other for one, other in held if one != key]
+            assert not any(overlap(ports, other) for other in others), "ports are one's own"
+
+    def check_new_ranges(self, found: DockerPlan) -> None:
+        """Ports of new sandboxes are nobody else's; who has ports keeps them."""
+        seen = self.engine.observe()
+        for action in found.actions:
+            if not isinstance(action, CreateSandbox):
+                continue
+            key, ports = action.key, action.range
+            had = [own.range for _, own in self.own() if own.key == key]
+            had += [self.served[key]] if key in self.served else []
+            new = {port for port in ports.ports() if not any(port in one for one in had)}
+            held = seen.listening_udp if key.is_ros2 else seen.listening
+            strangers = {
+                port
+                for one in seen.containers
+                for port in (one.udp_ports if key.is_ros2 else one.host_ports)
+            }
+            assert not new & (strangers | held)
+            assert not any(port in EPHEMERAL or port in reserved_ports(key) for port in new)
+            for one in seen.sandboxes:
+                others = one.key != key and one.container.state != "created"
+                assert not (others and overlap(one.range, ports))
+
+    def check_all_is_as_wished(self, found: DockerPlan) -> None:
+        members, _ = read_members(self.engine.observe(), SETTINGS)
+        fine = frozenset(
+            name
+            for name, network in self.engine.networks.items()
+            if network.internal or name >= SETTINGS.uplink
+        )
+        live = [member for member in members if member.container.alive and member.networks & fine]
+        # Without an image nothing can take a redirect away.
+        stays = "" if self.engine.image else ROLE_REDIRECT
+        keys = {own.key for _, own in self.own() if own.role != stays}
+        assert keys <= {member.key for member in live}
+        fatal = {problem.subject for problem in found.problems if problem.fatal}
+        told = {problem.subject for problem in found.problems}
+        for key in sorted({member.key for member in live}):
+            if not fatal & {f"proxy image {SETTINGS.proxy_image}", f"proxy {proxy_name(key)}"}:
+                mine = [member for member in live if member.key == key]
+                wanted = {n for member in mine for n in member.networks & fine}
+                self.check_key(key, wanted, self.made(key, mine))
+                for member in mine:
+                    if f"container {member.container.name}" not in told:
+                        self.check_names(member, member.networks & fine)
+
+        self.check_redirects(live)
+
+    def check_redirects(self, live: list[Member]) -> None:
+        """Who gives the address of his master is led to his proxy, and nobody else is."""
+        boxes = {box.id: box for box in self.engine.boxes}
+        wanted = {}
+        for member in live:
+            home = boxes.get(member.container.shares or "", boxes[member.container.id])
+            given = member.container.master_uri.removeprefix("http://") if self.engine.image else ""
+            joined = [self.engine.networks[name] for name in home.networks]
+            if (
+                given.startswith("192.")
+                and f"http://{given}" == member.key.master_uri
+                and {home.state, member.container.state} <= STARTED
+                and member.container.labels.get("rosproxy.redirect") != "false"
+                and self.controller.settings.redirect
+                and not all(network.internal for network in joined)
+            ):
+                wanted[home.namespace, member.key] = given
+        runs = {
+            own.key: box
+            for proxy, own in self.own("running", role=ROLE_PROXY)
+            if (box := self.engine.home(proxy)) and box.state == "running"
+        }
+        there = {home.namespace: home.id for home in boxes.values() if home.state in STARTED}
+        if self.engine.image:
+            for (namespace, key), rule in self.engine.rules.items():
+                known = (namespace, key) in wanted or (namespace, key) in self.forgotten
+                assert namespace not in there or known, rule
+        for (namespace, key), given in wanted.items():
+            if sandbox := runs.get(key):  # else it stays as it is, or comes later
+                master, proxy = self.engine.rules[namespace, key]
+                assert str(master) == given
+                assert proxy == HostPort(sandbox.address, 11402)
+        records = [box.mode for box in self.boxes(role=ROLE_REDIRECT)]
+        assert len(records) <= len(wanted) or not self.engine.image
+
+    def made(self, key: Key, members: list[Member]) -> Create:
+        """The proxy that these containers are to have, but for its range."""
+        plane = chosen_plane(members, SETTINGS.data_plane)
+        direction = chosen_direction(members, SETTINGS.direction)
+        told = {peer for member in members for peer in member.peers}
+        peers = tuple(sorted(told)) if key.is_ros2 else ()
+        udp = not key.is_ros2 and chosen_udp(members, SETTINGS)
+        made = Create("", key, PortRange(0, 0), "", plane, direction=direction, peers=peers)
+        return structs.replace(made, udp=udp)
+
+    def check_key(self, key: Key, wanted: set[str], made: Create) -> None:
+        every = [(box, own) for box, own in self.own() if own.key == key]
+        own = [(box, own) for box, own in every if own.role != ROLE_REDIRECT]
+        if any(box.state == "restarting" and box.role == ROLE_SANDBOX for box, _ in own):
+            return
+        roles = [own.role for _, own in own]
+        has_ear = key.is_ros2 and (bool(self.engine.image) or ROLE_EAR in roles)
+        assert sorted(roles) == [ROLE_EAR] * has_ear + [ROLE_SANDBOX, ROLE_PROXY]
+        *ears, (sandbox, is_), (proxy, runs) = sorted(own, key=lambda one: one[0].role)
+        assert sandbox.state == "running"
+        assert proxy.state in ("running", "restarting")
+        assert set(sandbox.networks) == {SETTINGS.uplink, *wanted}
+        assert self.is_named(sandbox, sandbox_name(key))
+        assert self.is_named(proxy, proxy_name(key))
+        assert self.engine.home(proxy) is sandbox
+        assert proxy.namespace == sandbox.namespace or proxy.state == "restarting"
+        assert runs.range == is_.range
+        near = HostPort(GATEWAY, is_.range.last)
+        for ear, hears in ears:
+            self.check_ear(ear, hears, sandbox, near)
+        if self.engine.image:
+            forwards = made.data_plane == "kernel"
+            box = CreateSandbox("", key, is_.range, forwards=forwards, udp=made.udp)
+            assert is_.fingerprint == sandbox_fingerprint(box, SETTINGS)
+            made = structs.replace(made, range=is_.range, ear=near if key.is_ros2 else None)
+            assert runs.fingerprint == proxy_fingerprint(made, SETTINGS, self.engine.image, "")
+
+    def check_ear(self, ear: Box, hears: OwnLabels, sandbox: Box, near: HostPort) -> None:
+        """It runs, and knows where its proxy is."""
+        assert ear.state in ("running", "restarting")
+        assert self.is_named(ear, ear_name(hears.key))
+        if self.engine.image:
+            proxy = HostPort(sandbox.address, hears.range.first)
+            made = CreateEar("", hears.key, hears.range, HERE, near, proxy)
+            assert hears.fingerprint == ear_fingerprint(made, SETTINGS, self.engine.image)
+
+    def is_named(self, box: Box, name: str) -> bool:
+        """Whether it has its name, if no stranger has."""
+        return (box.name == name) != any(one.name == name for one in self.strangers())
+
+    def check_names(self, member: Member, networks: frozenset[str]) -> None:
+        """By the name that a container uses it finds its own proxy and nobody else."""
+        for network in networks if member.needs else ():
+            found = [
+                box.own.key if box.own else box.name
+                for box in self.engine.boxes
+                if network in box.networks
+                and member.needs in box.networks[network][1] | {box.name}
+                and box.state not in ("dead", "removing")
+            ]
+            restarting = [own.key for _, own in self.own("restarting", role=ROLE_SANDBOX)]
+            assert found == [member.key] or member.key in restarting

@@ -1,0 +1,281 @@
+"""Proxies for ROS 2, and their ears: how they are made, and when anew."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from msgspec import structs
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.docker.engine_json import read_making
+from rosproxy_operator.docker.planner.actions import (
+    Action,
+    Create,
+    CreateEar,
+    CreateNetwork,
+    CreateSandbox,
+    Remove,
+    Start,
+)
+from rosproxy_operator.docker.planner.model import (
+    Attachment,
+    Container,
+    EarContainer,
+    HostState,
+    Key,
+    PlanSettings,
+    Proxy,
+    Sandbox,
+)
+from rosproxy_operator.docker.planner.own import gives_away
+from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.specs import (
+    OwnLabels,
+    container_config,
+    ear_config,
+    ear_fingerprint,
+    ear_name,
+    own_labels,
+    proxy_fingerprint,
+    proxy_name,
+    read_own,
+    sandbox_config,
+    sandbox_fingerprint,
+    sandbox_name,
+)
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    APP,
+    HERE,
+    IMAGE,
+    RANGE,
+    SECRET,
+    SETTINGS,
+    UPLINK,
+    container,
+    inspection,
+    observed,
+    planned,
+)
+
+TWO = {"rosproxy.enable": "true", "rosproxy.ros": "2"}
+KEY = Key("", HERE, 0)
+NEAR, EAR = "172.30.0.2", HostPort(UPLINK.gateway, RANGE.last)
+MADE = CreateEar(ear_name(KEY), KEY, RANGE, HERE, EAR, HostPort(NEAR, RANGE.first))
+BOX = CreateSandbox(sandbox_name(KEY), KEY, RANGE)
+PROXY = Create(proxy_name(KEY), KEY, RANGE, BOX.name, ear=EAR)
+
+
+def own(made: Any, places: tuple[Attachment, ...] = (), mode: str = "host") -> Container:
+    return Container(
+        f"id-{made.name}", made.name, "running", own_labels(made), mode, places,
+        started_at="2026-01-01T10:00:00Z",
+    )  # fmt: skip
+
+
+def there(near: str = NEAR, ear: CreateEar | None = MADE) -> dict[str, Any]:
+    """A proxy for ROS 2 that runs, with its ear."""
+    box = structs.replace(BOX, fingerprint=sandbox_fingerprint(BOX, SETTINGS))
+    made = proxy_fingerprint(PROXY, SETTINGS, IMAGE, SECRET)
+    places = (Attachment(SETTINGS.uplink, near), Attachment("app", "172.18.0.9"))
+    ears = []
+    if ear is not None:
+        ear = structs.replace(ear, fingerprint=ear_fingerprint(ear, SETTINGS, IMAGE))
+        ears = [EarContainer(KEY, own(ear), RANGE, ear.fingerprint)]
+    return {
+        "sandboxes": [Sandbox(KEY, own(box, places, "app"), RANGE, box.fingerprint)],
+        "proxies": [Proxy(KEY, own(PROXY, mode=f"container:id-{BOX.name}"), RANGE, made)],
+        "ears": tuple(ears),
+    }
+
+
+def look(state: HostState, settings: PlanSettings = SETTINGS) -> DockerPlan:
+    return planned(state, settings, DockerMemory(), 100.0)
+
+
+def actions(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
+    return list(look(state, settings).actions)
+
+
+TALKER = container(labels=TWO)
+
+
+def test_a_proxy_waits_for_the_uplink_where_its_ear_is_to_listen() -> None:
+    found = look(observed(TALKER, networks=[APP]))
+    assert list(found.actions) == [CreateNetwork(SETTINGS.uplink)]
+    assert isinstance(found.deferred[0].actions[0], CreateSandbox)
+
+
+def test_the_ear_is_made_once_its_proxy_has_an_address() -> None:
+    made = actions(observed(TALKER))
+    assert [type(one) for one in made] == [CreateSandbox, Start, *map(type, made[2:])]
+    assert not any(isinstance(one, CreateEar) for one in made)
+    assert next(one for one in made if isinstance(one, Create)).ear == EAR
+
+    create, start = actions(observed(TALKER, **there(ear=None)))
+
+    fingerprint = ear_fingerprint(MADE, SETTINGS, IMAGE)
+    assert create == structs.replace(MADE, fingerprint=fingerprint)
+    assert start == Start(MADE.name)
+    assert actions(observed(TALKER, **there())) == []
+
+
+def test_the_ear_is_made_anew_when_its_proxy_has_another_address() -> None:
+    old = f"{MADE.name}-old"
+    rename, create, remove, start = actions(observed(TALKER, **there("172.30.0.7")))
+    assert (rename.name, remove, start) == (
+        MADE.name, Remove(old, "made anew"), Start(MADE.name),
+    )  # fmt: skip
+    assert isinstance(create, CreateEar)
+    assert create.proxy == HostPort("172.30.0.7", RANGE.first)
+
+
+def test_the_ear_goes_before_its_sandbox_is_made_anew() -> None:
+    more = container(labels={**TWO, "rosproxy.ports": "40"})
+    found = actions(observed(more, **there()))
+    assert found[0] == Remove(MADE.name, "its proxy gets another address")
+    assert any(isinstance(one, CreateSandbox) and len(one.range) == 40 for one in found)
+    assert not any(isinstance(one, CreateEar) for one in found)
+
+
+def test_all_three_go_when_nobody_wants_them() -> None:
+    found = look(observed(**there()), replace(SETTINGS, grace=0.0))
+    assert [one.name for one in found.actions] == [MADE.name, PROXY.name, BOX.name]
+
+
+def test_no_lan_no_ear() -> None:
+    deaf = replace(SETTINGS, ros2_lan="none")
+    found = look(observed(TALKER, **there()), deaf)
+    assert Remove(MADE.name, "the LAN is not to be heard") in found.actions
+    assert not found.problems
+    (create,) = (one for one in actions(observed(TALKER), deaf) if isinstance(one, Create))
+    assert create.ear is None
+
+
+def test_the_lan_is_where_the_option_says_or_the_advertised_host_or_far_hosts_are() -> None:
+    def lan(host: str, option: str, far: str = "") -> list[str]:
+        settings = replace(SETTINGS, advertise_host=host, ros2_lan=option)
+        key = Key("", host, 0)
+        box = CreateSandbox(sandbox_name(key), key, RANGE)
+        box = structs.replace(box, fingerprint=sandbox_fingerprint(box, settings))
+        place = (Attachment(settings.uplink, NEAR), Attachment("app", "172.18.0.9"))
+        state = observed(
+            TALKER, far=far,
+            sandboxes=[Sandbox(key, own(box, place, "app"), RANGE, box.fingerprint)],
+        )  # fmt: skip
+        found = look(state, settings)
+        told = [p.text for p in found.problems if "does not hear the LAN" in p.text]
+        return [one.lan for one in found.actions if isinstance(one, CreateEar)] or told
+
+    assert lan(HERE, "192.0.2.77") == ["192.0.2.77"]
+    assert lan(HERE, "", "192.0.2.99") == [HERE]
+    assert lan("lab-pc", "", "192.0.2.99") == ["192.0.2.99"]
+    assert lan("lab-pc", "")[0].endswith("or with --ros2-lan none if peers are enough")
+
+
+def test_udp_ports_alone_are_in_its_way() -> None:
+    state = observed(
+        TALKER,
+        replace(container("web", labels={}, ports=[11400]), udp_ports=frozenset({11410})),
+        listening=[11411, 11412],
+        listening_udp=frozenset({11420}),
+    )
+    (box,) = (one for one in actions(state) if isinstance(one, CreateSandbox))
+    assert box.range == PortRange(11421, 11452)
+
+
+def test_its_own_well_known_ports_are_not_in_its_range() -> None:
+    labels = {**TWO, "rosproxy.domain": "16"}  # 7400 + 250 * 16 = 11400
+    (box,) = (one for one in actions(observed(container(labels=labels)))
+              if isinstance(one, CreateSandbox))  # fmt: skip
+    assert box.range.first == 11411
+
+
+def test_both_versions_have_ports_of_their_own() -> None:
+    labels = {**TWO, "rosproxy.ros": "1,2", "rosproxy.master-uri": "http://192.0.2.7:11311"}
+    boxes = [one for one in actions(observed(container(labels=labels)))
+             if isinstance(one, CreateSandbox)]  # fmt: skip
+    assert {(box.key.domain, str(box.range)) for box in boxes} == {
+        (0, "11400-11431"), (None, "11432-11463"),
+    }  # fmt: skip
+
+
+def test_peers_of_all_containers_are_told() -> None:
+    one = container("one", {**TWO, "rosproxy.peers": "robot"})
+    other = container("other", {**TWO, "rosproxy.peers": "arm:11400"})
+    settings = replace(SETTINGS, ros2_peer=("laptop",))
+    (made,) = (each for each in actions(observed(one, other), settings)
+               if isinstance(each, Create))  # fmt: skip
+    assert made.peers == ("arm:11400", "laptop", "robot")
+
+
+def test_what_a_proxy_for_ros_2_is_made_of() -> None:
+    made = structs.replace(PROXY, peers=("arm:11400", "robot"))
+    env = dict(text.split("=", 1) for text in container_config(made, SETTINGS, SECRET, "")["Env"])
+    env.pop("ROSPROXY_ADMIN_TOKEN_HASH")
+    assert env == {
+        "ROSPROXY_ROS": "2",
+        "ROSPROXY_ADVERTISE_HOST": HERE,
+        "ROSPROXY_PORT_RANGE": "11400-11430",
+        "ROSPROXY_ADMIN_BIND": "0.0.0.0:11312",
+        "ROSPROXY_ROS2_DOMAINS": "0",
+        "ROSPROXY_ROS2_PEERS": "arm:11400 robot",
+        "ROSPROXY_ROS2_EAR": "172.30.0.1:11431",
+        "ROSPROXY_AWAIT_POLICY": "3",
+    }
+    ports = sandbox_config(BOX, SETTINGS)["HostConfig"]["PortBindings"]
+    assert [*ports] == [f"{port}/udp" for port in range(11400, 11431)]
+    assert (proxy_name(KEY), read_own(own_labels(BOX))) == (
+        "rosproxy-domain-0-7ec54e", OwnLabels("ports", KEY, RANGE, ""),
+    )  # fmt: skip
+
+
+def test_an_ear_has_the_hosts_network_and_no_other_right() -> None:
+    config = ear_config(MADE, SETTINGS)
+    assert config["User"] == "10001:10001"
+    assert config["HostConfig"] == {
+        "ReadonlyRootfs": True,
+        "CapDrop": ["ALL"],
+        "SecurityOpt": ["no-new-privileges:true"],
+        "RestartPolicy": {"Name": "always"},
+        "Init": False,
+        "Memory": 128 * 1024**2,
+        "PidsLimit": 64,
+        "NetworkMode": "host",
+    }
+    own = read_own(config["Labels"])
+    assert own == OwnLabels("ear", KEY, RANGE, "")
+    assert not gives_away(own, MADE.name, read_making(inspection(config)), IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("NetworkMode", "app"),
+        ("CapAdd", ["NET_ADMIN"]),
+        ("SecurityOpt", None),
+        ("PidMode", "host"),
+        ("PortBindings", {"80/tcp": [{"HostPort": "80"}]}),
+    ],
+)
+def test_what_gives_a_forged_ear_away(field: str, value: object) -> None:
+    making = inspection(ear_config(MADE, SETTINGS))
+    making["HostConfig"][field] = value
+    own = OwnLabels("ear", KEY, RANGE, "")
+    found = gives_away(own, MADE.name, read_making(making), IMAGE)
+    assert found == f"its HostConfig.{field} is none that it gives"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"io.rosproxy.domain": "233"},
+        {"io.rosproxy.domain": "x"},
+        {"io.rosproxy.domain": ""},
+        {"io.rosproxy.master-uri": "http://robot:11311"},
+        {"io.rosproxy.domain": "", "io.rosproxy.master-uri": "http://robot:11311"},
+    ],
+)
+def test_labels_of_an_ear_that_are_not_whole(wrong: dict[str, str]) -> None:
+    assert read_own({**own_labels(MADE), **wrong}) is None

@@ -1,0 +1,382 @@
+"""A master given by address is led to the proxy, in the network of who gives it."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from msgspec import structs
+
+from rosproxy_operator.docker.engine_json import read_making, signature
+from rosproxy_operator.docker.planner.actions import Action, CreateRedirect, Remove, Run
+from rosproxy_operator.docker.planner.model import (
+    Attachment,
+    Container,
+    HostState,
+    Key,
+    PlanSettings,
+    Proxy,
+    RedirectContainer,
+    Sandbox,
+)
+from rosproxy_operator.docker.planner.own import gives_away
+from rosproxy_operator.docker.planner.plan import DockerPlan
+from rosproxy_operator.docker.planner.proxy_news import facts
+from rosproxy_operator.docker.planner.redirect import redirect_config
+from rosproxy_operator.docker.planner.specs import own_labels, read_own
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    APP,
+    HERE,
+    IMAGE,
+    RANGE,
+    SETTINGS,
+    UPLINK,
+    both,
+    container,
+    inspection,
+    observed,
+    planned,
+    read_members,
+)
+from tests.unit.operator.docker.hosts import Hosts, pick
+from tests.unit.operator.docker.invariants import SETTINGS as FEW
+
+ADDRESS = "192.0.2.7"
+MASTER = f"http://{ADDRESS}:11311"
+KEY = Key(MASTER, HERE)
+LABELS = {"rosproxy.enable": "true"}
+NEAR = "172.18.0.9"
+OFF = replace(SETTINGS, redirect=False)
+
+
+def node(name: str = "talker", env: str = MASTER, mode: str = "", **labels: str) -> Container:
+    more = {f"rosproxy.{label.replace('_', '-')}": text for label, text in labels.items()}
+    made = container(name, {**LABELS, **more}, env=env, mode=mode, networks=() if mode else ["app"])
+    places = (Attachment("app", "172.18.0.3", frozenset({name})),)
+    return replace(made, attachments=() if mode else places, started_at="2026-01-01T09:00:00Z")
+
+
+def there(near: str = NEAR, proxy: str = "running", key: Key = KEY) -> dict[str, Any]:
+    """The proxy of these nodes, with an address on their network."""
+    found = both(key=key)
+    (box,), (process,) = found["sandboxes"], found["proxies"]
+    places = [replace(p, address=near if p.network == "app" else "") for p in
+              box.container.attachments]  # fmt: skip
+    box = Sandbox(key, replace(box.container, attachments=tuple(places)), box.range,
+                  box.fingerprint)  # fmt: skip
+    process = Proxy(key, replace(process.container, state=proxy), process.range,
+                    process.fingerprint)  # fmt: skip
+    return {"sandboxes": [box], "proxies": [process]}
+
+
+def look(state: HostState, settings: PlanSettings = SETTINGS) -> DockerPlan:
+    return planned(state, settings, DockerMemory(), 100.0)
+
+
+def steps(state: HostState, settings: PlanSettings = SETTINGS) -> list[Action]:
+    """What is to be done for redirects alone."""
+    groups = look(state, settings).groups
+    return [action for group in groups if group.about for action in group.actions]
+
+
+def wanted(state: HostState) -> CreateRedirect:
+    create, run = steps(state)
+    assert isinstance(create, CreateRedirect)
+    assert run == Run(create.name)
+    return create
+
+
+def record(made: CreateRedirect, state: str = "exited", code: int = 0) -> RedirectContainer:
+    own = Container(
+        f"id-{made.name}", made.name, state, own_labels(made), f"container:{made.target}",
+        exit_code=code,
+    )  # fmt: skip
+    return RedirectContainer(made.key, own, made.range, made.fingerprint)
+
+
+def test_it_is_set_once_where_the_proxy_is_met() -> None:
+    made = wanted(observed(node(), **there()))
+    assert (str(made.master), str(made.proxy)) == (f"{ADDRESS}:11311", f"{NEAR}:11311")
+    assert (made.target, made.started) == ("id-talker", "2026-01-01T09:00:00Z")
+
+    found = look(observed(node(), **there(), redirects=(record(made),)))
+    assert (found.actions, found.problems) == ((), ())
+
+
+@pytest.mark.parametrize("state", ["exited", "created", "running"])
+def test_one_that_has_failed_or_not_run_is_run(state: str) -> None:
+    made = wanted(observed(node(), **there()))
+    one = record(made, state, int(state == "exited"))
+    assert steps(observed(node(), **there(), redirects=(one,))) == [Run(made.name)]
+
+
+def test_it_is_set_anew_for_another_start_and_another_address() -> None:
+    old = wanted(observed(node(), **there()))
+    later = replace(node(), started_at="2026-01-01T10:00:00Z")
+    for state in (observed(later, **there()), observed(node(), **there("172.18.0.77"))):
+        new = wanted(state)
+        assert new.name != old.name
+        assert steps(replace(state, redirects=(record(old),))) == [
+            new, Run(new.name), Remove(old.name, "outdated"),
+        ]  # fmt: skip
+
+
+def test_it_is_not_set_without_a_proxy_and_stays_while_that_is_away() -> None:
+    assert steps(observed(node())) == []
+    assert steps(observed(node(), **there(proxy="exited"))) == []
+    made = wanted(observed(node(), **there()))
+    for state in (observed(node()), observed(node(), **there(proxy="exited"))):
+        assert steps(replace(state, redirects=(record(made),))) == []
+
+
+def test_it_is_taken_away_where_nobody_wants_it_any_more() -> None:
+    made = wanted(observed(node(), **there()))
+    state = observed(node(), **there(), redirects=(record(made),))
+    by_label = replace(state, containers=(node(redirect="false"),))
+    undo, *then = steps(state, OFF)
+    assert steps(by_label) == [undo, *then]
+    assert isinstance(undo, CreateRedirect)
+    assert undo.master is None
+    assert then == [Run(undo.name), Remove(made.name, "outdated"), Remove(undo.name, "done")]
+    assert steps(replace(state, redirects=(record(undo),)), OFF) == [Remove(undo.name, "done")]
+    both_left = replace(state, redirects=(record(made), record(undo, "created")))
+    assert steps(both_left, OFF) == then
+
+
+def test_what_is_left_of_a_network_that_is_gone_is_removed() -> None:
+    made = wanted(observed(node(), **there()))
+    gone = [Remove(made.name, "its network is gone")]
+    assert steps(observed(**there(), redirects=(record(made),))) == gone
+    ended = replace(node(), state="exited")
+    assert steps(observed(ended, **there(), redirects=(record(made),))) == gone
+
+
+def test_nothing_is_done_to_what_the_engine_is_at() -> None:
+    made = wanted(observed(node(), **there()))
+    assert steps(observed(**there(), redirects=(record(made, "removing"),))) == []
+    busy = frozenset({made.name})
+    assert steps(observed(**there(), redirects=(record(made),), busy=busy)) == []
+
+
+def test_one_that_is_dead_is_made_anew() -> None:
+    made = wanted(observed(node(), **there()))
+    state = observed(node(), **there(), redirects=(record(made, "dead"),))
+    assert steps(state) == [Remove(made.name, "dead"), made, Run(made.name)]
+
+
+def test_without_an_image_all_stays() -> None:
+    made = wanted(observed(node(), **there()))
+    state = observed(node(), **there(), redirects=(record(made),), image="")
+    assert (steps(state), steps(state, OFF)) == ([], [])
+
+
+def test_containers_that_share_a_network_have_it_once() -> None:
+    owner = replace(node("box"), labels={}, master_uri="")
+    guests = [node(name, mode="container:id-box") for name in ("one", "other")]
+    made = wanted(observed(owner, *guests, **there()))
+    assert made.target == "id-box"
+
+
+def test_a_masters_name_may_be_known_by_the_address() -> None:
+    by_name = Key("http://robot:11311", HERE)
+    one = node(master_uri="http://robot:11311")
+    masters = {"robot": ADDRESS}
+    assert str(wanted(observed(one, **there(key=by_name), masters=masters)).master) == (
+        f"{ADDRESS}:11311"
+    )
+    assert steps(observed(one, **there(key=by_name), masters={"robot": "192.0.2.8"})) == []
+
+
+@pytest.mark.parametrize(
+    ("one", "settings", "text"),
+    [
+        (node(env="http://192.0.2.8:11311", master_uri=MASTER), SETTINGS, "name of the master"),
+        (node(env="http://192.0.2.7:11399", master_uri=MASTER), SETTINGS, "name of the master"),
+        (node(env="http://[2001:db8::7]:11311"), SETTINGS, "name of the master's host"),
+        (node(redirect="false"), SETTINGS, "without label rosproxy.redirect='false' it is led"),
+        (node(redirect="true"), OFF, "the operator's --no-redirect keeps it"),
+        (node(redirect="perhaps"), SETTINGS, "neither true nor false: write rosproxy.redirect="),
+    ],
+)
+def test_who_is_not_redirected_is_told(one: Container, settings: PlanSettings, text: str) -> None:
+    members, problems = read_members(observed(one), settings)
+    assert text in " ".join(problem.text for problem in problems)
+    assert not any(member.by_address for member in members)
+
+
+def test_a_label_can_not_widen() -> None:
+    _, problems = read_members(observed(node(redirect="true")), OFF)
+    assert any("rosproxy.redirect=true is ignored" in problem.text for problem in problems)
+
+
+def test_without_a_way_outwards_nothing_is_redirected() -> None:
+    cell = replace(APP, internal=True)
+    (member,), (problem,) = read_members(observed(node(), networks=[UPLINK, cell]))
+    assert member.by_address is None
+    assert "its networks have no way outwards" in problem.text
+
+
+def test_a_master_that_is_not_allowed_is_not_redirected() -> None:
+    members, (problem,) = read_members(observed(node()), replace(SETTINGS, allow_master=("a:1",)))
+    assert not members
+    assert "--allow-master" in problem.text
+
+
+def test_its_nodes_arrive_once_more_when_it_is_there() -> None:
+    made = wanted(observed(node(), **there()))
+    members, _ = read_members(observed(node(), **there()))
+
+    def arrivals(*records: RedirectContainer) -> Any:
+        state = observed(node(), **there(), redirects=records)
+        return facts(state, state.proxies[0], members).arrivals
+
+    assert len(arrivals() | arrivals(record(made))) == 2
+    assert arrivals() == arrivals(record(made, code=1))
+
+
+MADE = structs.replace(wanted(observed(node(), **there())), range=RANGE)
+
+
+def test_it_has_one_capability_and_bounds() -> None:
+    config = redirect_config(MADE, SETTINGS)
+    assert config["User"] == "0:0"
+    assert config["Entrypoint"] == ["/usr/sbin/nft"]
+    assert config["HostConfig"] == {
+        "ReadonlyRootfs": True,
+        "CapDrop": ["ALL"],
+        "CapAdd": ["NET_ADMIN"],
+        "SecurityOpt": ["no-new-privileges:true"],
+        "RestartPolicy": {"Name": "no"},
+        "Init": False,
+        "Memory": 64 * 1024**2,
+        "PidsLimit": 16,
+        "NetworkMode": "container:id-talker",
+    }
+    own = read_own(config["Labels"])
+    assert own is not None
+    assert not gives_away(own, MADE.name, read_making(inspection(config)), IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("NetworkMode", "host"),
+        ("CapAdd", ["NET_ADMIN", "SYS_ADMIN"]),
+        ("CapAdd", None),
+        ("SecurityOpt", None),
+        ("PidMode", "host"),
+        ("Binds", ["/:/host"]),
+        ("ReadonlyRootfs", False),
+        ("PortBindings", {"80/tcp": [{"HostPort": "80"}]}),
+    ],
+)
+def test_what_gives_a_forged_one_away(field: str, value: object) -> None:
+    making = inspection(redirect_config(MADE, SETTINGS))
+    making["HostConfig"][field] = value
+    own = read_own(own_labels(MADE))
+    assert own is not None
+    found = gives_away(own, MADE.name, read_making(making), IMAGE)
+    assert found == f"its HostConfig.{field} is none that it gives"
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"Entrypoint": ["/bin/sh"]}, "its command is not /usr/sbin/nft"),
+        ({"User": "10001:10001"}, "its user is not 0:0"),
+    ],
+)
+def test_what_an_image_says_gives_it_away_as_well(change: dict[str, Any], text: str) -> None:
+    making = inspection({**redirect_config(MADE, SETTINGS), **change})
+    own = read_own(own_labels(MADE))
+    assert own is not None
+    assert gives_away(own, MADE.name, read_making(making), IMAGE) == text
+    assert gives_away(own, "talker", read_making(making), IMAGE).startswith("its name is not")
+
+
+def test_the_end_of_a_container_without_a_network_shows_in_the_list() -> None:
+    assert signature({"State": "running"}) != signature({"State": "exited"})
+
+
+# whatever happens
+
+
+class Addressed(Hosts):
+    """A host where all masters are given by address, and the option may be another one."""
+
+    def come(self, n: int, m: int) -> None:
+        if len(self.strangers()) > 4:
+            return
+        label = {"rosproxy.redirect": "false"} if n % 5 == 1 else {}
+        box = self.engine.add(
+            f"node{next(self.engine.ids)}",
+            env="http://192.0.2.9:11402",
+            labels={"rosproxy.enable": "true", **label},
+        )
+        self.engine.join(box, pick(("app", "lab"), n))
+        self.engine.begin(box, pick(("running", "running", "exited"), m))
+
+    def switch(self, n: int, _: int) -> None:
+        self.controller.settings = replace(FEW, redirect=bool(n & 1))
+
+
+EVENTS = st.tuples(
+    st.sampled_from(
+        [
+            *(Addressed.come, Addressed.switch, Addressed.share, Addressed.change),
+            *(Addressed.fail_redirects, Addressed.attach, Addressed.detach, Addressed.remove),
+            *(Addressed.meddle, Addressed.break_one, Addressed.remove_own, Addressed.look),
+            *(Addressed.look_and_be_killed, Addressed.look_and_stall, Addressed.come_to_rest),
+            *(Addressed.change_image, Addressed.engine_restarts, Addressed.start_by_hand),
+        ]
+    ),
+    st.integers(0, 59),
+    st.integers(0, 59),
+)
+
+
+STARTED_ANEW = [
+    (Addressed.come, 0, 0),
+    (Addressed.switch, 0, 0),
+    (Addressed.change, 0, 1),
+    (Addressed.change, 0, 0),
+    (Addressed.start_by_hand, 0, 0),
+]
+"""A record of the container's former start is started by hand, and sets its rules in this one."""
+OUTDATED_STARTED = [
+    (Addressed.come, 0, 2),
+    (Addressed.meddle, 0, 0),
+    (Addressed.look, 0, 0),
+    (Addressed.look_and_be_killed, 2, 0),
+    (Addressed.start_by_hand, 0, 0),
+]
+"""So does one whose proxy has another address by now, and which was not removed any more."""
+
+
+@given(st.lists(EVENTS, min_size=5, max_size=25))
+@example(STARTED_ANEW)
+@example(OUTDATED_STARTED)
+def test_redirects_come_to_rest_as_wished(events: list) -> None:
+    host = Addressed()
+    host.come(0, 0)
+    host.come_to_rest()
+    assert host.engine.rules
+    for happen, n, m in events:
+        happen(host, n, m)
+        host.check()
+    host.come_to_rest()
+    host.engine.image = "image-1"
+    host.come_to_rest()
+
+
+def test_the_rules_name_one_address_and_port() -> None:
+    rules, none = (
+        redirect_config(made, SETTINGS)["Cmd"][0]
+        for made in (MADE, structs.replace(MADE, master=None, proxy=None))
+    )
+    assert rules.startswith(none)
+    assert none.count("\n") == 2
+    assert rules.count("dnat to") == 1
+    assert f"ip daddr {ADDRESS} tcp dport 11311 dnat to {NEAR}:11311" in rules

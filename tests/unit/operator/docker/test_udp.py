@@ -1,0 +1,100 @@
+"""Whose proxies publish their ports for UDP as well, for UDPROS: label and option."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+from msgspec import structs
+
+from rosproxy.leases.ports import PortRange
+from rosproxy_operator.docker.planner.actions import Create, CreateSandbox
+from rosproxy_operator.docker.planner.model import Container
+from rosproxy_operator.docker.planner.specs import (
+    container_config,
+    published_ports,
+    sandbox_config,
+    sandbox_fingerprint,
+)
+from rosproxy_operator.docker.planner.state import DockerMemory
+from tests.unit.operator.docker.builders import (
+    ENABLED,
+    KEY,
+    RANGE,
+    SETTINGS,
+    container,
+    observed,
+    planned,
+    read_members,
+)
+
+BOTH = {"rosproxy.direction": "both"}
+ASKED = {"rosproxy.udp": "true"}
+BOX = CreateSandbox("s", KEY, PortRange(11400, 11401))
+
+
+def labelled(name: str, *labels: Mapping[str, str]) -> Container:
+    found = dict(ENABLED)
+    for each in labels:
+        found |= each
+    return container(name, found)
+
+
+@pytest.mark.parametrize(
+    ("containers", "option", "gets"),
+    [
+        ([labelled("a", BOTH)], False, False),
+        ([labelled("a", BOTH, ASKED)], False, True),
+        ([labelled("a", BOTH), labelled("b", ASKED)], False, True),
+        ([labelled("a", BOTH)], True, True),
+        ([labelled("a", BOTH, {"rosproxy.udp": "False"})], True, False),
+        ([labelled("a", ASKED)], True, False),
+    ],
+)
+def test_who_asks(containers: list[Container], option: bool, gets: bool) -> None:
+    found = planned(observed(*containers), replace(SETTINGS, udp=option), DockerMemory(), 0.0)
+    made = [one.udp for one in found.actions if isinstance(one, Create | CreateSandbox)]
+    assert made == [gets, gets]
+
+
+def test_who_asks_for_it_alone_is_told() -> None:
+    found = planned(observed(labelled("a", ASKED)), SETTINGS, DockerMemory(), 0.0)
+    (problem,) = found.problems
+    assert problem.subject == "container a"
+    assert "rosproxy.direction=both" in problem.text
+    assert not problem.fatal
+
+
+def test_a_word_that_is_none() -> None:
+    members, (problem,) = read_members(observed(labelled("a", {"rosproxy.udp": "yes"})))
+    assert members == ()
+    assert problem.text.startswith("label rosproxy.udp='yes' is neither true nor false")
+
+
+@pytest.mark.parametrize("udp", [False, True])
+def test_what_is_published_and_told(udp: bool) -> None:
+    made = structs.replace(BOX, udp=udp)
+    bindings = sandbox_config(made, SETTINGS)["HostConfig"]["PortBindings"]
+    assert sorted(bindings) == sorted(
+        f"{port}/{protocol}"
+        for port in (11400, 11401)
+        for protocol in (["tcp", "udp"] if udp else ["tcp"])
+    )
+    told = container_config(Create("p", KEY, RANGE, "s", udp=udp), SETTINGS, "t", "")["Env"]
+    assert ("ROSPROXY_UDP=1" in told) == udp
+
+
+def test_the_sandbox_is_made_anew_for_it() -> None:
+    either = (structs.replace(BOX, udp=udp) for udp in (False, True))
+    assert len({sandbox_fingerprint(one, SETTINGS) for one in either}) == 2
+
+
+@pytest.mark.parametrize(("udp", "first"), [({}, 11400), (ASKED, 11406)])
+def test_udp_ports_that_others_have_are_in_the_way_of_those_that_ask(
+    udp: Mapping[str, str], first: int
+) -> None:
+    taken = replace(container("dns", {}), udp_ports=frozenset({11402}))
+    seen = replace(observed(labelled("a", BOTH, udp), taken), listening_udp=frozenset({11405}))
+    found = planned(seen, SETTINGS, DockerMemory(), 0.0)
+    (box,) = [one for one in found.actions if isinstance(one, CreateSandbox)]
+    assert box.range.first == first
+    assert len(published_ports(KEY, box.range, box.udp)) == len(box.range) * (1 + box.udp)

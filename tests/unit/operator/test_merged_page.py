@@ -1,0 +1,82 @@
+"""The live pages of several proxies as one."""
+
+import json
+from typing import Any
+
+import pytest
+
+from rosproxy.page.document import BROKEN, MOST_LINKS, Document, PageLink, PageNode, Told
+from rosproxy_operator.common.merged_page import merged, read_document
+
+MASTER = "http://robot:11311"
+
+
+def shown(name: str, links: int = 1, **changes: Any) -> Document:
+    """A proxy with a talker inside and a listener outside."""
+    document = {
+        "proxy": {"master": MASTER, "host": "here", "ports": "11000-11099"},
+        "nodes": {
+            "rosproxy": {"lane": "host", "kind": "proxy", "label": "rosproxy"},
+            "master": {"lane": "robot", "kind": "master"},
+            "/talker": {"lane": "container"},
+            "/listener": {"lane": "robot"},
+        },
+        "links": {
+            f"{number}": {
+                "kind": "topic",
+                "name": f"/{name}{number}",
+                "source": "/talker",
+                "target": "/listener",
+                "state": "ok",
+            }
+            for number in range(links)
+        },
+        "findings": [{"severity": "error", "subject": "ports", "text": "none is free", "fix": "x"}],
+        "left_out": 0,
+        **changes,
+    }
+    return read_document(json.dumps(document))
+
+
+def test_inside_is_apart_and_outside_the_same() -> None:
+    document = merged({"one": shown("a"), "two": shown("b")}, "1.0")
+    nodes = document["nodes"]
+    assert {key for key, node in nodes.items() if node["lane"] == "container"} == {
+        "one /talker",
+        "two /talker",
+    }
+    assert nodes["one /talker"]["label"] == "/talker"
+    assert nodes["one /talker"]["proxy"] == "one"
+    assert [key for key, node in nodes.items() if node["lane"] == "robot"] == [
+        f"{MASTER} master",
+        f"{MASTER} /listener",
+    ]
+    assert {nodes["one rosproxy"]["label"], nodes["two rosproxy"]["label"]} == {"one", "two"}
+    ends = {(link["source"], link["target"]) for link in document["links"].values()}
+    assert ends == {(f"{name} /talker", f"{MASTER} /listener") for name in ("one", "two")}
+    assert document["findings"][0]["subject"] == "one: ports"
+
+
+def test_a_proxy_that_cannot_be_asked_says_why() -> None:
+    document = merged({"one": "10.0.0.1:11312 refuses connections"}, "1.0")
+    node = document["nodes"]["one"]
+    assert (node["state"], node["text"]) == (
+        BROKEN,
+        "it can't be asked: 10.0.0.1:11312 refuses connections",
+    )
+
+
+def test_what_is_broken_stays_where_not_all_fits() -> None:
+    node = PageNode("container")
+    link = PageLink("topic", "/last", "/talker", state=BROKEN, text="why", fix="what to do")
+    wrong = Document({"/talker": node}, {"x": link}, (Told("error", "s", "t", "f"),))
+    document = merged({"many": shown("a", MOST_LINKS), "wrong": wrong}, "1.0")
+    assert len(document["links"]) == MOST_LINKS
+    assert document["left_out"] == 1
+    assert next(iter(document["links"].values()))["fix"] == "what to do"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"nodes": {"a": 1}, "links": {}}', "[" * 10_000])
+def test_what_is_no_document_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        read_document(text)

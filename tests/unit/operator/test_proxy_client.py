@@ -1,0 +1,73 @@
+"""What operators take from proxies, which somebody may have taken over."""
+
+import gzip
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+from aiohttp import web
+
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.common import proxy_client
+from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
+
+
+class Evil:
+    """Somebody at a proxy's address, who gives one ``answer`` to all."""
+
+    def __init__(self) -> None:
+        self.answer: Callable[[], web.Response] = web.Response
+        self.asked: list[str] = []
+        self.where = HostPort("", 0)
+
+    async def serve(self, request: web.Request) -> web.StreamResponse:
+        self.asked.append(request.path)
+        return self.answer()
+
+
+@pytest.fixture
+async def evil() -> AsyncIterator[Evil]:
+    one, application = Evil(), web.Application()
+    application.router.add_route("*", "/{path:.*}", one.serve)
+    runner = web.AppRunner(application)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", 0).start()
+    one.where = HostPort(*runner.addresses[0])
+    yield one
+    await runner.cleanup()
+
+
+@pytest.fixture
+async def client() -> AsyncIterator[ProxyClient]:
+    one = ProxyClient()
+    yield one
+    await one.close()
+
+
+async def test_a_redirect_is_not_followed(evil: Evil, client: ProxyClient) -> None:
+    evil.answer = lambda: web.Response(status=307, headers={"Location": "/secrets"})
+    with pytest.raises(ProxyError, match="HTTP 307"):
+        await client.status(evil.where)
+    assert evil.asked == ["/status"]
+
+
+async def test_nothing_is_inflated(evil: Evil, client: ProxyClient) -> None:
+    body = gzip.compress(b'{"nodes": []}')
+    evil.answer = lambda: web.Response(body=body, headers={"Content-Encoding": "gzip"})
+    with pytest.raises(ProxyError, match="as a rosproxy does"):
+        await client.status(evil.where)
+
+
+@pytest.mark.parametrize("status", [200, 500])
+async def test_a_long_answer_is_not_read(
+    evil: Evil, client: ProxyClient, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(proxy_client, "LONGEST", 1000)
+    evil.answer = lambda: web.Response(status=status, body=b"[" * 1001)
+    with pytest.raises(ProxyError, match="as a rosproxy does"):
+        await client.status(evil.where)
+
+
+async def test_what_is_no_text_is_no_answer(evil: Evil, client: ProxyClient) -> None:
+    evil.answer = lambda: web.Response(body=b"\xff\xfe", content_type="application/json")
+    with pytest.raises(ProxyError, match="as a rosproxy does"):
+        await client.status(evil.where)

@@ -1,0 +1,103 @@
+"""What a proxy's own doctor has printed, read by the operator's."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy.admin.findings import DoctorFinding, Severity, error, ok
+from rosproxy.doctor.findings import as_json
+from rosproxy_operator.common.proxy_doctor import read_findings
+from rosproxy_operator.docker.doctor import CURES, host_findings
+from rosproxy_operator.kubernetes.status.conditions import cluster_findings
+
+
+def test_findings_carry_the_proxys_name_and_the_operators_cure() -> None:
+    said = [
+        ok("admin", "proxy", "rosproxy 1"),
+        error("advertised host", "advertised host", "leads nowhere", "--advertise-host ADDRESS"),
+        error("node", "/talker", "is gone", "restart it"),
+    ]
+    found = read_findings("proxy a", json.dumps(as_json(said)).encode(), CURES)
+    assert [one.subject for one in found] == [
+        "proxy a: proxy",
+        "proxy a: advertised host",
+        "proxy a: /talker",
+    ]
+    assert "label rosproxy.advertise-host=ADDRESS" in found[1].fix
+    assert (found[2].severity, found[2].fix) == (Severity.ERROR, "restart it")
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        *(b"", b"rosproxy: usage", b"[]", b"{}", b"[" * 99999, b"\xff"),
+        *(b'{"findings": 5}', b'{"findings": [1]}', b'{"findings": [{"severity": "loud"}]}'),
+    ],
+)
+def test_what_is_no_findings_is_told(said: bytes) -> None:
+    (found,) = read_findings("proxy a", said, {})
+    assert found.severity is Severity.WARNING
+    assert "nothing that can be read" in found.text
+
+
+@given(st.binary() | st.recursive(st.none() | st.text(), st.lists).map(json.dumps).map(str.encode))
+def test_nothing_that_a_proxy_prints_makes_it_fail(said: bytes) -> None:
+    assert all(isinstance(one, DoctorFinding) for one in read_findings("a", said, {}))
+
+
+def test_causes_of_a_host_come_before_what_follows_from_them() -> None:
+    def problem(subject: str, fatal: bool = True) -> dict[str, object]:
+        return {"subject": subject, "text": "is wrong", "fatal": fatal}
+
+    subjects = ["proxy b", "container a", "network n", "master robot", "proxy image i"]
+    status = {
+        "problems": [problem("container odd", fatal=False), *map(problem, subjects)],
+        "proxies": [{"name": "p", "state": "exited"}],
+        "containers": [{"name": "a", "proxy": "p"}],
+        "actions": ["create p"],
+    }
+    found = list(host_findings(status))
+    assert [one.subject for one in found] == [
+        "proxy image i",
+        "network n",
+        "master robot",
+        "container a",
+        "proxy b",
+        "container odd",
+        "proxy p",
+        "operator",
+        "host",
+    ]
+
+
+def rosproxy(**status: object) -> dict[str, object]:
+    metadata = {"namespace": "lab", "name": "robot", "generation": 2}
+    return {"metadata": metadata, "status": {"observedGeneration": 2, "nodes": 1, **status}}
+
+
+def condition(kind: str, status: str, message: str) -> dict[str, str]:
+    return {"type": kind, "status": status, "message": message}
+
+
+def test_a_cluster_tells_the_cause_and_no_text_twice() -> None:
+    conditions = [
+        condition("Ready", "False", "no proxy is ready"),
+        condition("Degraded", "True", "no master"),
+        condition("MasterReachable", "False", "no master"),
+    ]
+    found = cluster_findings([rosproxy(conditions=conditions)])
+    assert [one.text for one in found] == [
+        "MasterReachable is False: no master",
+        "Ready is False: no proxy is ready",
+    ]
+    assert found[0].fix == "kubectl -n lab describe rosproxy robot"
+
+
+def test_a_cluster_that_is_well_or_empty_or_without_an_operator() -> None:
+    (sound,) = cluster_findings([rosproxy(proxies="1/1")])
+    assert sound.severity is Severity.OK
+    assert "there is no RosProxy" in cluster_findings([])[0].text
+    assert "selects no pod" in cluster_findings([rosproxy(nodes=0)])[0].text
+    assert "does the operator run?" in cluster_findings([rosproxy(observedGeneration=1)])[0].fix
