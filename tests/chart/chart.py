@@ -52,7 +52,10 @@ OPTIONS: dict[str, dict[str, Values]] = {
         "none": {},
         "all": {
             "serviceMonitor": {"enabled": True, "labels": {"release": "p"}, "interval": "15s"},
-            "podDisruptionBudget": {"enabled": True},
+            "podMonitor": {"enabled": True, "labels": {"release": "p"}, "interval": "1m30s"},
+            "prometheusRule": {"enabled": True, "runbook": "https://docs.example/alerts"},
+            "dashboard": {"enabled": True, "annotations": {"grafana_folder": "Robots"}},
+            "podDisruptionBudget": {"enabled": False},
             "networkPolicy": {
                 "enabled": True,
                 "metricsFrom": [{"podSelector": {"matchLabels": {"app": "prometheus"}}}],
@@ -86,11 +89,21 @@ OPTIONS: dict[str, dict[str, Values]] = {
             "nodeSelector": {"e": "f"},
             "tolerations": [{"operator": "Exists"}],
             "affinity": {"nodeAffinity": {}},
+            "replicas": 3,
+            "topologySpreadConstraints": [
+                {
+                    "maxSkew": 1,
+                    "topologyKey": "topology.kubernetes.io/zone",
+                    "whenUnsatisfiable": "DoNotSchedule",
+                    "labelSelector": {"matchLabels": {"c": "d"}},
+                }
+            ],
             "priorityClassName": "high",
             "extraEnv": [{"name": "HTTPS_PROXY", "value": "http://proxy:3128"}],
             "extraArgs": ["--resync=10"],
             "log": {"level": "debug", "format": "json"},
             "tests": {
+                "ros": 2,
                 "namespace": "arms",
                 "imagePullPolicy": "Never",
                 "imagePullSecrets": [{"name": "registry"}],

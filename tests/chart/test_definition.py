@@ -10,14 +10,13 @@ from rosproxy.access.rules import LONGEST_GLOB
 from rosproxy.leases.ports import PortRange
 from rosproxy_operator.common.policy import MOST_AUTHORS_RULES
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.model import (
-    Name,
+from rosproxy_operator.kubernetes.resources.cluster import (
     NodeState,
     Obstacle,
-    Pod,
     ProxyPod,
     ProxyReport,
 )
+from rosproxy_operator.kubernetes.resources.model import Name, Pod
 from rosproxy_operator.kubernetes.resources.spec import MOST_NAME, MOST_PORTS, RULE_KINDS, rosproxy
 from rosproxy_operator.kubernetes.status.status import status_of
 from tests.chart.chart import Json
@@ -26,7 +25,7 @@ DEFINITION = custom_resource()
 VERSION = DEFINITION["spec"]["versions"][0]
 SCHEMA = VERSION["schema"]["openAPIV3Schema"]
 BOUNDS = {"string": ("maxLength", "enum"), "array": ("maxItems",), "object": ("properties",
-          "maxProperties"), "integer": ("format", "maximum")}  # fmt: skip
+          "maxProperties"), "integer": ("format", "maximum"), "boolean": ("type",)}  # fmt: skip
 
 
 def fields(schema: Json, path: str = "") -> Iterator[tuple[str, Json]]:
@@ -75,7 +74,7 @@ def test_columns_show_fields() -> None:
         path = column["jsonPath"].partition("[")[0]
         assert path.startswith(".metadata.") or path[1:] in STATUS, path
     always = [one["name"] for one in VERSION["additionalPrinterColumns"] if not one.get("priority")]
-    assert always == ["Master", "Nodes", "Proxies", "Ready", "Age"]
+    assert always == ["Master", "Domain", "Nodes", "Proxies", "Ready", "Age"]
 
 
 def with_defaults(value: Any, schema: Json) -> Any:
@@ -136,13 +135,17 @@ def test_rules_have_messages() -> None:
 def test_status_is_in_the_definition() -> None:
     """The API server drops fields that the definition does not have, without a word."""
     body = {"metadata": {"name": "a", "namespace": "b", "uid": "c", "generation": 1},
-            "spec": {"master": {"uri": "http://robot:11311"}}}  # fmt: skip
+            "spec": {"ros": "1,2", "master": {"uri": "http://robot:11311"}}}  # fmt: skip
     own, id = rosproxy(body), Name("b", "rosproxy-a-n-012345")
     ports = PortRange(11400, 11431)
     proxy = ProxyPod(Pod(id, "u"), own.id, "c", "n", ports, "f", "rosproxy:1", ready=True)
     pod = Pod(Name("b", "talker"), "v", node="n", ip="192.0.2.3")
     answer = ProxyReport(
-        True, True, nodes={"192.0.2.3": ("/talker",)}, topics=frozenset({"/chatter"})
+        True,
+        True,
+        nodes={"192.0.2.3": ("/talker",)},
+        topics=frozenset({"/chatter"}),
+        participants={"192.0.2.3": ("01.0f.00.00.00.00.00.00.00.00.00.01",)},
     )
     states = (
         NodeState("n", "192.0.2.1", ports, proxy, (pod,), answer),

@@ -170,7 +170,9 @@ def test_pods_are_restricted(combination: str) -> None:
     found = list(rendered(combination))
     pods = [one["spec"]["template"]["spec"] for one in of_kind(found, "Deployment")]
     pods += [one["spec"] for one in of_kind(found, "Pod")]
-    assert len(pods) == 4
+    names = {one["metadata"]["name"] for one in of_kind(found, "Deployment")}
+    has_master = "rosproxy-operator-test-master" in names  # the test of ROS 2 has none
+    assert len(pods) == 3 + has_master
     for pod in pods:
         assert pod["securityContext"]["runAsNonRoot"] is True
         assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
@@ -187,16 +189,40 @@ def test_pods_are_restricted(combination: str) -> None:
             assert not [port for port in container.get("ports", []) if "hostPort" in port]
 
 
-def test_one_operator() -> None:
+def test_two_operators() -> None:
     (deployment,) = [one for one in of_kind(objects(), "Deployment")
                      if one["metadata"]["name"] == "rosproxy-operator"]  # fmt: skip
-    assert deployment["spec"]["replicas"] == 1
-    assert deployment["spec"]["strategy"] == {"type": "Recreate"}
+    assert deployment["spec"]["replicas"] == 2
+    assert deployment["spec"]["strategy"]["rollingUpdate"] == {"maxUnavailable": 0, "maxSurge": 1}
     container = deployment["spec"]["template"]["spec"]["containers"][0]
     assert container["livenessProbe"]["httpGet"] == {"path": "/healthz", "port": "liveness"}
     assert container["readinessProbe"]["httpGet"] == {"path": "/readyz", "port": "metrics"}
     assert container["image"] == f"rosproxy-operator:{__version__}"
     assert f"--proxy-image=rosproxy:{__version__}" in container["args"]
+
+
+def test_operators_are_apart_and_go_one_by_one() -> None:
+    found = objects()
+    (pod,), (budget,) = operator(found), of_kind(found, "PodDisruptionBudget")
+    assert budget["spec"]["maxUnavailable"] == 1
+    (apart,) = pod["topologySpreadConstraints"]
+    assert apart["topologyKey"] == "kubernetes.io/hostname"
+    assert apart["whenUnsatisfiable"] == "ScheduleAnyway"
+    assert apart["labelSelector"] == budget["spec"]["selector"]
+
+
+def test_operators_have_a_right_to_their_lease_alone() -> None:
+    found = objects()
+    (lease,), (pod,) = of_kind(found, "Lease"), operator(found)
+    assert "spec" not in lease  # so that upgrades leave alone who holds it
+    name = lease["metadata"]["name"]
+    assert f"--lease={NAMESPACE}/{name}" in pod["containers"][0]["args"]
+    rules = [rule for role in (*of_kind(found, "Role"), *of_kind(found, "ClusterRole"))
+             for rule in role["rules"] if "leases" in rule["resources"]]  # fmt: skip
+    assert [(rule.get("resourceNames"), rule["verbs"]) for rule in rules] == [
+        ([name], ["get", "patch"]),
+        (None, ["create"]),
+    ]
 
 
 def test_webhook() -> None:

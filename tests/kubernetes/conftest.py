@@ -19,8 +19,8 @@ from tests.kubernetes.pods import Namespace, namespace
 from tests.kubernetes.robot import Robot, robot_with_master
 
 _LOCK = Path("/run/lock/rosproxy-cluster")
-LAST = ("test_chart", "test_operator_killed", "test_api_server", "test_node_lost", "test_upgrade",
-        "test_uninstall")  # fmt: skip
+LAST = ("test_chart", "test_operator_killed", "test_leader", "test_api_server",
+        "test_node_lost", "test_upgrade", "test_uninstall")  # fmt: skip
 """The modules whose tests disturb the whole cluster, in their order."""
 
 
@@ -36,7 +36,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Show with a failure what the operator has logged and what there is in the cluster."""
+    """Show with a failure what operator and proxies have logged, and what the cluster has."""
     report = yield
     if report.failed and report.when in ("setup", "call") and KUBECONFIG.exists():
         try:
@@ -47,9 +47,9 @@ def pytest_runtest_makereport(
 
 
 def _sections() -> Iterator[tuple[str, str]]:
-    for body in api.objects("pods", release.NAMESPACE, release.OPERATORS):
-        name = body["metadata"]["name"]
-        yield name, api.logs(release.NAMESPACE, name)[-8000:]
+    own = (api.objects("pods", "", label) for label in (release.OPERATORS, release.PROXIES))
+    for told in (body["metadata"] for found in own for body in found):
+        yield told["name"], api.logs(told["namespace"], told["name"])[-4000:]
     yield "the cluster", kubectl("get", "rosproxies,pods", "-A", "-o", "wide", check=False)
 
 

@@ -111,12 +111,14 @@ class Namespace:
 
     def pod_body(
         self, name: str, *command: str, on: str = "", labels: Mapping[str, str] | None = None,
-        env: Mapping[str, str] | None = None, ports: tuple[int, ...] = (), **spec: Any,
+        env: Mapping[str, str] | None = None, ports: tuple[int, ...] = (),
+        protocol: str = "TCP", image: str = ROS, **spec: Any,
     ) -> Json:  # fmt: skip
         container: Json = {
-            "name": "ros", "image": ROS, "imagePullPolicy": "Never", "command": list(command),
+            "name": "ros", "image": image, "imagePullPolicy": "Never", "command": list(command),
             "env": [{"name": key, "value": value} for key, value in (env or {}).items()],
-            "ports": [{"containerPort": port, "hostPort": port} for port in ports],
+            "ports": [{"containerPort": port, "hostPort": port, "protocol": protocol}
+                      for port in ports],
         }  # fmt: skip
         where = {"nodeSelector": {"kubernetes.io/hostname": on}} if on else {}
         return {

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.docker.engine import ROOT, run, wait_until
+from tests.docker.images import PROXY
 from tests.kubernetes import api
 from tests.kubernetes.api import Json
+from tests.kubernetes.cluster.images import load_images
 from tests.kubernetes.cluster.layout import BIN, KUBECONFIG
 from tests.kubernetes.pods import Namespace, Pod
 
@@ -16,12 +18,15 @@ NAME = "rosproxy"
 FULL_NAME = "rosproxy-operator"
 """What the chart calls the objects of the release."""
 OPERATORS = "app.kubernetes.io/component=operator"
+PROXIES = "app.kubernetes.io/component=proxy"
+_OTHER = "rosproxy:other"
 _IMAGES: Json = {
     "image": {"repository": "rosproxy-operator", "tag": "test", "pullPolicy": "Never"},
     "proxy": {"image": {"repository": "rosproxy", "tag": "test", "pullPolicy": "Never"}},
     "allow": {"dataPlanes": ["Auto", "Kernel", "Splice", "Copy"], "images": ["rosproxy:*"]},
     "tests": {
         "image": "rosproxy-test-ros:latest",
+        "ros2Image": "rosproxy-test-ros2:latest",
         "imagePullPolicy": "Never",
         "namespace": "default",
     },
@@ -46,6 +51,13 @@ def upgrade(**values: Any) -> None:
     _apply("upgrade", **values)
 
 
+def other_image() -> str:
+    """The tag of another image of the proxy, which all nodes have: the same but for a label."""
+    run("docker", "build", "--tag", _OTHER, "--label", "other=1", "-", input=f"FROM {PROXY}")
+    load_images(_OTHER)
+    return _OTHER.partition(":")[2]
+
+
 def uninstall() -> None:
     helm("uninstall", NAME, "--namespace", NAMESPACE, "--wait")
 
@@ -57,17 +69,32 @@ def remove() -> None:
     wait_until(lambda: not api.get("namespaces", "", NAMESPACE), 60, f"{NAMESPACE} is gone")
 
 
-def operator() -> Pod:
-    """The operator's pod, the newest if there are two."""
+def operators() -> list[Pod]:
+    """The operators' pods, those left out that are about to go."""
     found = api.objects("pods", NAMESPACE, OPERATORS)
-    alive = [body for body in found if "deletionTimestamp" not in body["metadata"]]
-    assert alive, "no operator"
-    newest = max(alive, key=lambda body: str(body["metadata"]["creationTimestamp"]))
-    return Pod(NAMESPACE, newest["metadata"]["name"])
+    alive = [body["metadata"] for body in found if "deletionTimestamp" not in body["metadata"]]
+    return [Pod(NAMESPACE, metadata["name"]) for metadata in alive]
+
+
+def holder() -> str:
+    """Who holds the Lease: the name of an operator's pod and something of its process."""
+    return str(api.get("leases", NAMESPACE, FULL_NAME).get("spec", {}).get("holderIdentity", ""))
+
+
+def operator() -> Pod:
+    """The pod of the operator that leads."""
+    leading: list[Pod] = []
+
+    def there() -> bool:
+        leading[:] = [pod for pod in operators() if holder().startswith(f"{pod.name}_")]
+        return bool(leading)
+
+    wait_until(there, 30, lambda: f"one leads: {holder()!r} of {operators()}")
+    return leading[0]
 
 
 def kill_operator() -> None:
-    """Kill the operator's process and delete its pod.
+    """Kill the process of the operator that leads, and delete its pod.
 
     Without the latter the kubelet waits 10 seconds, 20, 40, … before it starts the next.
     """
@@ -77,14 +104,17 @@ def kill_operator() -> None:
 
 
 def wait_operator(seconds: float = 60) -> None:
-    """Wait until an operator is ready, no other is there, and its webhook is reached.
+    """Wait until all operators are ready, one leads, and the webhook is reached.
 
-    For a second after that it is ready, kube-proxy still leads to the one before.
+    For a second after that one is ready, kube-proxy still leads to the one before.
     """
+    wanted = api.get("deployments", NAMESPACE, FULL_NAME)["spec"]["replicas"]
 
     def there() -> bool:
         found = api.objects("pods", NAMESPACE, OPERATORS)
-        return len(found) == 1 and operator().ready and _webhook_answers()
+        alive = operators()
+        ready = len(found) == len(alive) == wanted and all(pod.ready for pod in alive)
+        return ready and operator() in alive and _webhook_answers()
 
     wait_until(there, seconds, lambda: str(api.objects("pods", NAMESPACE, OPERATORS)))
 

@@ -61,7 +61,8 @@ class RosProxy:
     @property
     def proxies(self) -> list[Proxy]:
         """The proxies' pods, those being deleted left out."""
-        found = api.objects("pods", self.namespace, f"{PROXY_OF}={self.name}")
+        selector = f"{PROXY_OF}={self.name},app.kubernetes.io/component=proxy"
+        found = api.objects("pods", self.namespace, selector)
         return [proxy(body) for body in found if "deletionTimestamp" not in body["metadata"]]
 
     def proxy_on(self, node: str) -> Proxy | None:

@@ -5,10 +5,12 @@ from tests.kubernetes import api
 from tests.kubernetes.pods import INJECT, Namespace, unique
 from tests.kubernetes.robot import Robot, robot_with_master
 from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 
 def talker(net: Namespace, topic: str, library: str = "rospy", **more: str) -> str:
-    """Start a node that publishes; its ROS name."""
+    """Start a node that publishes, once its proxy can be found; its ROS name."""
+    wait_for_service(net)
     pod = net.node(library, "pub", "--topic", topic, "--word", "inside", on="node1", **more)
     return pod.node
 
@@ -18,7 +20,7 @@ def test_another_master(net: Namespace, robot: Robot) -> None:
     topic = f"/{unique('moved').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     old = talker(net, topic)
-    robot.node("ear_before", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=60)
+    robot.node("ear_before", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=START)
     before = made.the_proxy()
     with robot_with_master() as other:
         made.change(master={"uri": other.master_uri})
@@ -71,7 +73,7 @@ def test_deleted_rosproxy_leaves_only_the_users_pods(net: Namespace, robot: Robo
     topic = f"/{unique('left').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     name = talker(net, topic)
-    robot.node("ear_left", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=60)
+    robot.node("ear_left", "rospy", "sub", "--topic", topic).wait_for("inside", seconds=START)
     pods = {body["metadata"]["uid"] for body in net.pods(INJECT)}
 
     made.remove()

@@ -12,6 +12,7 @@ from tests.kubernetes import api
 from tests.kubernetes.pods import Namespace, namespace, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import RosProxy, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 PUBLISHED = 11302
 
@@ -39,6 +40,7 @@ def inside(_release: None, robot: Robot) -> Iterator[Inside]:
         wait_until(
             lambda: "/rosout" in nodes_at(uri), 60, lambda: f"a master at {uri}: {made.tell()}"
         )
+        wait_for_service(net)
         yield Inside(net, made, uri)
 
 
@@ -65,12 +67,12 @@ def test_topics_and_services_with_the_robot(
     here = {"master_uri": inside.master_uri}
     heard = robot.node(f"ear_{mark}", library, "sub", "--topic", f"/out_{mark}", **here)
     robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/in_{mark}", "--word", "out", **here)
-    called = ("call", "--service", f"/serve_{mark}", "--count", "3", "--patience", "60")
+    called = ("call", "--service", f"/serve_{mark}", "--count", "3", "--patience", str(START))
     replies = robot.node(f"caller_{mark}", library, *called, **here)
 
-    heard.wait_for("inside", seconds=60)
-    ear.log.wait_for("out", seconds=60)
-    replies.wait_for("ask", 3, seconds=60, verb="reply")
+    heard.wait_for("inside", seconds=START)
+    ear.log.wait_for("out", seconds=START)
+    replies.wait_for("ask", 3, seconds=START, verb="reply")
     address = {"node1": "10.88.0.11", "node2": "10.88.0.12"}[on]
     assert nodes_at(inside.master_uri)[f"/{talker.node}"].startswith(f"http://{address}:")
 

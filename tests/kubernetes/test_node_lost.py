@@ -2,8 +2,10 @@
 
 import time
 
+from tests.docker.engine import wait_until
 from tests.kubernetes import release
-from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.cluster.layout import node_named
+from tests.kubernetes.cluster.network import inside
 from tests.kubernetes.conftest import cluster
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
@@ -13,11 +15,15 @@ from tests.kubernetes.traffic import flow
 
 
 def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
-    """The other node's traffic does not notice; this one's is there again when it is back."""
+    """The other node's traffic does not notice; this one's is there again when it is back.
+
+    The operator that leads is lost with it, and the other one tells.
+    """
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     # The API server reaches Services by way of node1: that is so in this cluster only.
     other, lost_node = "node1", "node2"
-    _operator_on(other, not_on=lost_node)
+    _leader_on(lost_node)
+    webhook = release.operator().ip
     with (
         flow(net, robot, "rospy", on=other) as unharmed,
         flow(net, robot, "roscpp", on=lost_node) as hit,
@@ -31,6 +37,12 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
             assert lost_node in condition["message"], condition
             noticed = time.time() - lost
             assert made.proxies, "nothing is deleted on a node that may come back"
+            # What is made while kube-proxy still leads to the lost operator comes by unwired.
+            wait_until(
+                lambda: webhook not in inside(node_named(other), "iptables-save"),
+                60,
+                f"kube-proxy leads to {webhook} no more",
+            )
             net.idle(on=other).wait_ready()
         finally:
             cluster("start-node", lost_node)
@@ -44,12 +56,12 @@ def test_node_is_stopped_and_comes_back(net: Namespace, robot: Robot) -> None:
         gaps = unharmed.gaps(lost)
         assert gaps.unnoticed, gaps
         made.wait_for("Degraded", "False", seconds=60)
+    release.wait_operator()
 
 
-def _operator_on(node: str, not_on: str) -> None:
-    """Have the operator run on a node."""
+def _leader_on(node: str) -> None:
+    """Have the operator lead that runs on a node: each has one."""
     if release.operator().body["spec"]["nodeName"] != node:
-        kubectl("cordon", not_on)
         release.kill_operator()
         release.wait_operator()
-        kubectl("uncordon", not_on)
+    assert release.operator().body["spec"]["nodeName"] == node

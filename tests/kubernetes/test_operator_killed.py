@@ -1,4 +1,4 @@
-"""The operator is killed, in the middle of anything, and while pods come and go."""
+"""The operator that leads is killed in the middle of anything; and while none is there."""
 
 import time
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ def no_operator() -> Iterator[None]:
     try:
         yield
     finally:
-        _scale(1)
+        _scale(2)
         release.wait_operator()
 
 

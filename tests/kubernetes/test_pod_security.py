@@ -21,7 +21,7 @@ def baseline(_release: None) -> Iterator[Namespace]:
 def test_operator_runs_where_restricted_is_enforced() -> None:
     labels = api.get("namespaces", "", release.NAMESPACE)["metadata"]["labels"]
     assert labels[ENFORCE] == "restricted"
-    assert release.operator().ready
+    assert all(pod.ready for pod in release.operators())
 
 
 def test_baseline_forbids_host_ports_and_it_is_said_what_to_do(baseline: Namespace) -> None:

@@ -12,6 +12,7 @@ from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace, Pod, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import RosProxy, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 
 def new_topic() -> str:
@@ -24,7 +25,9 @@ def talker(net: Namespace, library: str, topic: str, on: str = "node1", **more: 
 
 @pytest.fixture
 def made(net: Namespace, robot: Robot) -> RosProxy:
-    return rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    found = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    wait_for_service(net)
+    return found
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["proxy there", "proxy not there"])
@@ -41,7 +44,7 @@ def test_how_long_the_first_message_takes(
     pod = talker(net, library, name)
     pod.wait_ready()
     ready = time.time()
-    heard = ear.wait_for("inside", seconds=60)
+    heard = ear.wait_for("inside", seconds=START)
     proxy = "there" if there else "not there"
     note(f"first message, {library}, proxy {proxy}: {heard - ready:.1f} s after the pod is Ready, "
          f"{heard - created:.1f} s after it is created")  # fmt: skip
@@ -55,7 +58,7 @@ def test_deleted_pod_is_unregistered_at_once_and_comes_back(
     name = new_topic()
     ear = robot.node(f"ear{name[1:]}", library, "sub", "--topic", name)
     pod = talker(net, library, name)
-    ear.wait_for("inside", seconds=60)
+    ear.wait_for("inside", seconds=START)
     uri = robot.uri(pod.node)
 
     pod.remove(grace=0)
@@ -85,7 +88,7 @@ def test_container_that_restarts_in_its_pod(made: RosProxy, net: Namespace, robo
     name = new_topic()
     ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
     pod = talker(net, "roscpp", name)
-    ear.wait_for("inside", seconds=60)
+    ear.wait_for("inside", seconds=START)
     killed = time.time()
     pod.crash()
     ear.wait_for("inside", since=killed + 0.5, seconds=60)
@@ -98,7 +101,7 @@ def test_cordoned_and_drained_node(made: RosProxy, net: Namespace, robot: Robot)
     made.change(graceSeconds=2)
     ear = robot.node(f"ear{name[1:]}", "rospy", "sub", "--topic", name)
     pod = talker(net, "rospy", name, on="node2")
-    ear.wait_for("inside", seconds=60)
+    ear.wait_for("inside", seconds=START)
     try:
         kubectl("cordon", "node2")
         assert made.the_proxy("node2").ready

@@ -4,7 +4,7 @@ from tests.docker.engine import wait_until
 from tests.kubernetes.pods import Namespace, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import rosproxy
-from tests.kubernetes.traffic import wait_for_service
+from tests.kubernetes.traffic import START, wait_for_service
 
 
 def test_a_policy_hides_a_topic_and_changes_without_a_new_pod(net: Namespace, robot: Robot) -> None:
@@ -15,7 +15,7 @@ def test_a_policy_hides_a_topic_and_changes_without_a_new_pod(net: Namespace, ro
     wait_for_service(net)
     talker = net.node("rospy", "pub", "--topic", topic, "--word", "inside", on="node1")
     listener = net.node("roscpp", "sub", "--topic", topic, on="node1")
-    listener.log.wait_for("inside")
+    listener.log.wait_for("inside", seconds=START)
     wait_until(lambda: robot.knows_proxied(talker.node), 20, made.tell)
     assert robot.publishers(topic) == set()
     proxy = made.the_proxy()

@@ -6,17 +6,19 @@ from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.pods import Namespace, unique
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import NOWHERE, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 
 def test_status_and_columns(net: Namespace, robot: Robot) -> None:
     topic = f"/{unique('told').replace('-', '_')}"
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    wait_for_service(net)
     pod = net.node("roscpp", "pub", "--topic", topic, "--word", "inside", on="node1")
     net.idle(on="node2")
 
     made.wait_status(lambda s: s.get("proxies") == "2/2", "both proxies are ready")
     made.wait_for("Ready")
-    made.wait_status(lambda s: s.get("topics", 0) >= 1, "the topic is counted")
+    made.wait_status(lambda s: s.get("topics", 0) >= 1, "the topic is counted", START)
     status = made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted")
 
     assert status["observedGeneration"] == made.body["metadata"]["generation"]
@@ -36,10 +38,11 @@ def test_status_and_columns(net: Namespace, robot: Robot) -> None:
         "Degraded": "False",
     }
     narrow = kubectl("get", "rosproxy", "-n", net.name).splitlines()
-    assert narrow[0].split() == ["NAME", "MASTER", "NODES", "PROXIES", "READY", "AGE"]
+    assert narrow[0].split() == ["NAME", "MASTER", "DOMAIN", "NODES", "PROXIES", "READY", "AGE"]
     assert narrow[1].split()[:5] == ["robot", robot.master_uri, "2", "2/2", "True"]
     wide = kubectl("get", "rp", "-n", net.name, "-o", "wide").splitlines()
-    assert wide[0].split()[6:] == ["PORTS", "ROS-NODES", "TOPICS", "MASTER-URI", "MESSAGE"]
+    more = ["PORTS", "ROS-NODES", "PARTICIPANTS", "TOPICS", "MASTER-URI", "MESSAGE"]
+    assert wide[0].split()[7:] == more
     assert here["ports"] in wide[1]
     assert status["masterURI"] in wide[1]
     created = made.wait_event("ProxyCreated")

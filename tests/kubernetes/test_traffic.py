@@ -55,7 +55,7 @@ def _start(made: World, net: Namespace, robot: Robot, library: str, on: str) -> 
     robot.node(f"mouth_{mark}", library, "pub", "--topic", f"/for_{mark}", "--word", "robot")
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "far", on=other)
     net.node(library, "pub", "--topic", f"/for_{mark}", "--word", "near", on=on)
-    patience = ("--count", "5", "--patience", str(START))
+    patience = ("--count", "200", "--rate", "5", "--patience", str(START))
     made.replies[place] = robot.node(
         f"caller_{mark}", library, "call", "--service", f"/serve_{mark}", *patience
     )

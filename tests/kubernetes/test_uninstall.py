@@ -6,13 +6,14 @@ from tests.kubernetes.cluster.control_plane import kubectl
 from tests.kubernetes.pods import INJECT, Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import all_proxies, rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
 
 NAMES = ("rosproxy", "rosproxy-operator")
 """Of what the chart makes and of what the operator makes."""
 CLUSTER_WIDE = ("customresourcedefinitions", "clusterroles", "clusterrolebindings",
                 "mutatingwebhookconfigurations")  # fmt: skip
 NAMESPACED = ("pods", "services", "secrets", "serviceaccounts", "roles", "rolebindings",
-              "deployments", "poddisruptionbudgets", "networkpolicies")  # fmt: skip
+              "deployments", "poddisruptionbudgets", "networkpolicies", "leases")  # fmt: skip
 
 
 def left() -> list[str]:
@@ -29,8 +30,9 @@ def left() -> list[str]:
 
 def test_nothing_is_left(net: Namespace, robot: Robot) -> None:
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=4)
+    wait_for_service(net)
     pod = net.node("rospy", "pub", "--topic", "/last", "--word", "inside", on="node1")
-    robot.node("ear_last", "rospy", "sub", "--topic", "/last").wait_for("inside", seconds=60)
+    robot.node("ear_last", "rospy", "sub", "--topic", "/last").wait_for("inside", seconds=START)
     assert made.proxies
 
     release.uninstall()

@@ -2,17 +2,13 @@
 
 import time
 
-from tests.docker.engine import run, wait_until
-from tests.docker.images import PROXY
+from tests.docker.engine import wait_until
 from tests.kubernetes import api, release
-from tests.kubernetes.cluster.images import load_images
 from tests.kubernetes.measured import note
 from tests.kubernetes.pods import Namespace
 from tests.kubernetes.robot import Robot
 from tests.kubernetes.rosproxies import Proxy, rosproxy
-from tests.kubernetes.traffic import flow
-
-OTHER = "rosproxy:other"
+from tests.kubernetes.traffic import START, flow, wait_for_service
 
 
 def test_helm_test() -> None:
@@ -35,18 +31,17 @@ def test_upgrade_of_the_operator_only(net: Namespace, robot: Robot) -> None:
 
 def test_upgrade_of_the_proxies(net: Namespace, robot: Robot) -> None:
     """Their image is changed in place: the same pod, the same ports."""
-    run("docker", "build", "--tag", OTHER, "--label", "other=1", "-", input=f"FROM {PROXY}")
-    load_images(OTHER)
+    other = release.other_image()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
     with flow(net, robot, "rospy") as traffic:
         before, started = made.the_proxy(), time.time()
-        release.upgrade(proxy={"image": {"tag": "other"}})
+        release.upgrade(proxy={"image": {"tag": other}})
         wait_until(lambda: made.the_proxy().restarts == 1, 60, made.tell)
         traffic.wait(since=time.time(), seconds=60)
         after = made.the_proxy()
         note(f"helm upgrade, other image of the proxy: {traffic.gaps(started)}")
         assert (after.uid_then, after.ports) == (before.uid_then, before.ports)
-        assert after.body["spec"]["containers"][0]["image"] == OTHER
+        assert after.body["spec"]["containers"][0]["image"] == f"rosproxy:{other}"
     release.upgrade()
 
 
@@ -88,13 +83,14 @@ def test_webhook_turned_off(net: Namespace, robot: Robot) -> None:
     release.upgrade(webhook={"enabled": False})
     release.wait_operator()
     made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
-    wait_until(lambda: bool(made.service), 60, made.tell)
+    wait_for_service(net)
     pod = net.idle(on="node1")
     assert pod.environment == {}
     uri = f"http://{made.service['spec']['clusterIP']}:11311"
     talker = net.node("rospy", "pub", "--topic", "/by_hand", "--word", "inside", on="node1",
                       env={"ROS_MASTER_URI": uri})  # fmt: skip
-    robot.node("ear_by_hand", "rospy", "sub", "--topic", "/by_hand").wait_for("inside", seconds=60)
+    ear = robot.node("ear_by_hand", "rospy", "sub", "--topic", "/by_hand")
+    ear.wait_for("inside", seconds=START)
     assert robot.knows_proxied(talker.node, "node1")
     release.upgrade()
     release.wait_operator()

@@ -53,6 +53,13 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "mode": ({"master": GOOD, "policy": {"mode": "Tell"}}, "mode"),
     "publish": ({"master": {**GOOD, "publish": 11302}}, "publish"),
+    "ROS 3": ({"ros": 3}, 'ros is 1, 2 or "1,2"'),
+    "ROS 2 with a master": ({"ros": 2, "master": GOOD}, "ROS 2 has none"),
+    "both versions without a master": ({"ros": "1,2"}, "ROS 1 needs a master"),
+    "ROS 1 with a domain": ({"master": GOOD, "domain": 3}, "are for ROS 2"),
+    "no domain": ({"ros": 2, "domain": 233}, "domain"),
+    "no peer": ({"ros": 2, "peers": ["a b"]}, "peers[0]"),
+    "few ports for ROS 2": ({"ros": 2, "ports": 4, "multicast": True}, "too few for ROS 2"),
 }
 
 
@@ -80,6 +87,16 @@ def test_rules_of_a_policy_are_taken(net: Namespace) -> None:
     ]
     policy = rosproxy(net.name, master=GOOD, policy={"rules": rules}).body["spec"]["policy"]
     assert policy == {"slaveControl": "Any", "mode": "Enforce", "rules": rules}
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [{"ros": 2}, {"ros": "2", "domain": 0, "peers": ["robot", "192.0.2.9:11400"]},
+     {"ros": "1,2", "master": GOOD, "multicast": True}, {"ros": 1, "master": GOOD}],
+)  # fmt: skip
+def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None:
+    found = rosproxy(net.name, **spec).body["spec"]
+    assert spec.items() <= found.items()
 
 
 def test_defaults_are_filled_in(net: Namespace) -> None:

@@ -18,7 +18,8 @@ from tests.kubernetes.rosproxies import PROXY_OF
 START = 180
 """Seconds that pods and the robot's nodes get to start and to find each other, all at once.
 
-A SYN that passes while kube-proxy changes from refusing to translating is sent again for 127 s.
+A SYN that passes while kube-proxy changes from refusing to translating is sent again for 127 s
+(kubernetes/kubernetes#48719).
 """
 
 

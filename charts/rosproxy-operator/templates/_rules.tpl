@@ -5,6 +5,10 @@
 - apiGroups: [""]
   resources: [pods]
   verbs: [create, delete, patch]
+# A pod that was not wired is evicted, where its RosProxy asks for that.
+- apiGroups: [""]
+  resources: [pods/eviction]
+  verbs: [create]
 # One Service for each RosProxy, under which pods find the proxy on their own node.
 - apiGroups: [""]
   resources: [services]
@@ -12,7 +16,7 @@
 # One NetworkPolicy for each RosProxy: who may connect to its proxies.
 - apiGroups: [networking.k8s.io]
   resources: [networkpolicies]
-  verbs: [list, create, patch, delete]
+  verbs: [get, list, watch, create, patch, delete]
 # Events on RosProxies and on pods; one that comes again is read and counted. And the kubelet's events
 # on a proxy that does not start: they alone say that a port is taken.
 - apiGroups: [""]

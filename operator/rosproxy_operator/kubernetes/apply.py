@@ -1,43 +1,50 @@
 """Carrying out what was planned.
 
 Every action may be carried out twice, or after somebody else did it, or on something that has
-vanished meanwhile: that is no error, the next look sees what is left to do.
+vanished meanwhile: that is no error, the next look sees what is left to do. Before anything is
+deleted it is read again whether that is still right (`confirm`).
 """
 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.problem import Problem
 from rosproxy_operator.common.proxy_client import ProxyClient, ProxyError
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import (
+from rosproxy_operator.kubernetes.api.client import (
     POLICIES,
     Api,
     ApiConflict,
     ApiError,
     ApiGone,
     ApiInvalid,
+    NotLeading,
 )
+from rosproxy_operator.kubernetes.confirm import Deletion, Stale, confirm
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreateEar,
     CreatePolicy,
     CreateProxy,
     CreateService,
+    DeleteEar,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
     Emit,
+    EvictPod,
     ObjectAction,
     PatchStatus,
     SetImage,
     SetPolicy,
 )
 from rosproxy_operator.kubernetes.planner.manifests import without_cluster_ip
-from rosproxy_operator.kubernetes.proxy_sync import address_of, token_for
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Json, Name
+from rosproxy_operator.kubernetes.proxies.proxy_sync import address_of, token_for
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.names import CONTAINER, KIND, PLURAL, is_own
 from rosproxy_operator.kubernetes.resources.objects import name_of
 from rosproxy_operator.kubernetes.resources.values import part, parts, word, words
@@ -49,6 +56,11 @@ AT_ONCE = 8
 """Calls to the API server at the same time."""
 RETIRING = 10.0
 """Seconds that a proxy has to unregister its nodes at the master before it is deleted."""
+RELEASED = (0.2, 0.5, 1.0)
+"""Seconds between tries to have a Service's former address, by which alone pods know it.
+
+The API server tells that a Service is gone before it gives the address back.
+"""
 
 _KINDS: Mapping[type, tuple[str, str]] = {
     CreateService: ("Service", "services"),
@@ -57,6 +69,8 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     DeletePolicy: ("NetworkPolicy", POLICIES),
     CreateProxy: ("Pod", "pods"),
     DeleteProxy: ("Pod", "pods"),
+    CreateEar: ("Pod", "pods"),
+    DeleteEar: ("Pod", "pods"),
 }
 """What is created and deleted: its kind, and the same as the API's paths have it."""
 Count = Callable[[Action, str], None]
@@ -65,16 +79,39 @@ Count = Callable[[Action, str], None]
 class ClusterApplier:
     """Carries out actions, those of one RosProxy one after the other.
 
-    ``counted`` is called with each action and its outcome (ok, failed).
+    ``counted`` is called with each action and its outcome (ok, failed); ``doubted`` where what is
+    known stays another than what is read: a watch has lost something. ``busy`` are those that are
+    under way or wait for room.
     """
 
-    def __init__(self, api: Api, proxies: ProxyClient, tasks: Tasks, counted: Count) -> None:
+    def __init__(
+        self,
+        api: Api,
+        proxies: ProxyClient,
+        tasks: Tasks,
+        counted: Count,
+        doubted: Callable[[], None] = lambda: None,
+    ) -> None:
         self._api, self._proxies, self._tasks, self._counted = api, proxies, tasks, counted
+        self._doubted, self._stale = doubted, set[Name]()
         self._room = asyncio.Semaphore(AT_ONCE)
         self._retiring: set[str] = set()
         self._retired: set[str] = set()
         self.failures: Mapping[Name, Mapping[Name, str]] = {}
         self.problems: dict[Name, Problem] = {}
+        self.busy = 0
+
+    @property
+    def failed(self) -> int:
+        """How much has failed and is to be tried again."""
+        return sum(map(len, self.failures.values())) + len(self.problems)
+
+    def forget(self) -> None:
+        """Begin anew: another operator has acted meanwhile."""
+        self.failures, self.problems = {}, {}
+        self._stale.clear()
+        self._retiring.clear()
+        self._retired.clear()
 
     async def carry_out(self, actions: Iterable[Action], observed: ClusterSnapshot) -> None:
         """Carry out what was planned from what was observed. What fails is noted, not raised."""
@@ -106,15 +143,20 @@ class ClusterApplier:
 
     async def _one(self, action: Action, observed: ClusterSnapshot) -> str | None:
         """Carry out one action; what went wrong."""
-        if isinstance(action, DeleteProxy) and action.retire and action.uid not in self._retired:
-            if action.uid not in self._retiring:
-                self._retiring.add(action.uid)
-                self._tasks.spawn(self._retire(action, observed), f"retiring {action.id}")
-            return None
         quiet = isinstance(action, PatchStatus | Emit)
+        self.busy += 1
         try:
+            waits = isinstance(action, DeleteProxy) and action.retire
+            if waits and not await self._is_retired(action, observed):
+                return None
             async with self._room:
-                await in_thread(self._do, action)
+                await in_thread(self._do, action, observed)
+        except Stale as error:
+            log.debug("%s: not now: %s has changed meanwhile", line(action), error)
+            self._doubt(_subject(action))
+            return None
+        except NotLeading:
+            return None  # another one does it, or this one in another term
         except _nothing_left(action) as error:
             log.debug("%s: nothing to do: %s", line(action), error)
             return None
@@ -124,10 +166,13 @@ class ClusterApplier:
             log.exception("%s failed", line(action))
             text = f"the operator failed: {error!r}"
         else:
+            self._stale.discard(_subject(action))
             level = logging.DEBUG if quiet else logging.INFO
             log.log(level, "%s", line(action), extra=_log_fields(action))
             self._counted(action, "ok")
             return None
+        finally:
+            self.busy -= 1
         before = self.failures.get(action.of, {}).get(_subject(action))
         told = text == before or isinstance(action, PatchStatus)
         level = logging.DEBUG if told else logging.WARNING
@@ -135,13 +180,42 @@ class ClusterApplier:
         self._counted(action, "failed")
         return text
 
-    def _do(self, action: Action) -> None:
+    def _doubt(self, id: Name) -> None:
+        """What is known was not so. Once that is a watch that lags, a second time it is not."""
+        if id in self._stale:
+            self._stale.clear()
+            self._doubted()
+        else:
+            self._stale.add(id)
+
+    async def _is_retired(self, action: Action, observed: ClusterSnapshot) -> bool:
+        """Whether a proxy has unregistered its nodes; else it begins to, if that is right."""
+        assert isinstance(action, DeleteProxy)  # noqa: S101 - no other is to be retired
+        if action.uid in self._retired:
+            return True
+        if not self._api.gate.open():
+            return False
+        if action.uid not in self._retiring:
+            self._retiring.add(action.uid)
+            try:
+                async with self._room:
+                    await in_thread(confirm, self._api, action, observed)
+            except BaseException:
+                self._retiring.discard(action.uid)
+                raise
+            self._tasks.spawn(self._retire(action, observed), f"retiring {action.id}")
+        return False
+
+    def _do(self, action: Action, observed: ClusterSnapshot) -> None:
         api = self._api
         match action:
-            case CreateService() | CreatePolicy() | CreateProxy():
+            case CreateService() | CreatePolicy() | CreateProxy() | CreateEar():
                 _create(api, _KINDS[type(action)][1], action.body)
-            case DeleteService() | DeletePolicy() | DeleteProxy():
-                api.delete(_KINDS[type(action)][1], action.id, action.uid)
+            case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteEar():
+                self._delete(action, observed)
+            case EvictPod():
+                confirm(api, action, observed)
+                api.evict(action.id, action.uid)
             case SetImage():
                 container = "/spec/containers/0"
                 named = {"op": "test", "path": f"{container}/name", "value": CONTAINER}
@@ -155,6 +229,10 @@ class ClusterApplier:
                 api.patch(f"{PLURAL}/status", action.of, [_still(action.uid), status])
             case Emit():
                 _emit(api, action)
+
+    def _delete(self, action: Deletion, observed: ClusterSnapshot) -> None:
+        version = confirm(self._api, action, observed)
+        self._api.delete(_KINDS[type(action)][1], action.id, action.uid, version)
 
     async def _retire(self, action: DeleteProxy, observed: ClusterSnapshot) -> None:
         """Let a proxy unregister its nodes, then delete it, beside everything else."""
@@ -184,24 +262,30 @@ def _still(uid: str) -> Json:
 def line(action: Action) -> str:
     """An action in one line."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy():
+        case CreateService() | CreatePolicy() | CreateProxy() | CreateEar():
             return f"create {_KINDS[type(action)][0]} {_subject(action)}"
-        case DeleteService() | DeletePolicy() | DeleteProxy():
+        case DeleteService() | DeletePolicy() | DeleteProxy() | DeleteEar():
             return f"delete {_KINDS[type(action)][0]} {action.id}: {action.why}"
-        case SetImage():
-            return f"set image of Pod {action.id} to {action.image}"
-        case SetPolicy():
-            return f"mend NetworkPolicy {action.id}"
+        case SetImage() | SetPolicy() | EvictPod():
+            return _change_line(action)
         case PatchStatus():
             return f"write status of RosProxy {action.of}"
         case Emit():
             return f"event for {action.of}: {action.reason}: {action.message}"
 
 
+def _change_line(action: SetImage | SetPolicy | EvictPod) -> str:
+    if isinstance(action, SetPolicy):
+        return f"mend NetworkPolicy {action.id}"
+    if isinstance(action, EvictPod):
+        return f"evict Pod {action.id}: {action.why}"
+    return f"set image of Pod {action.id} to {action.image}"
+
+
 def _subject(action: Action) -> Name:
     """The object that an action is about."""
     match action:
-        case CreateService() | CreatePolicy() | CreateProxy():
+        case CreateService() | CreatePolicy() | CreateProxy() | CreateEar():
             return name_of(action.body["metadata"])
         case ObjectAction():
             return action.id
@@ -225,7 +309,7 @@ def _nothing_left(action: Action) -> tuple[type[ApiError], ...]:
     return (ApiGone,)
 
 
-def _create(api: Api, kind: str, body: Json) -> None:
+def _create(api: Api, kind: str, body: Json, pauses: Sequence[float] = RELEASED) -> None:
     """Create an object if it is not there; a Service if need be under another address than before.
 
     Raises ApiError.
@@ -237,6 +321,9 @@ def _create(api: Api, kind: str, body: Json) -> None:
     except ApiInvalid as error:
         if "clusterIP" not in body["spec"]:
             raise
+        if pauses:
+            time.sleep(pauses[0])
+            return _create(api, kind, body, pauses[1:])
         log.info("%s: %s; taking another address", name_of(body["metadata"]), error)
         _create(api, kind, without_cluster_ip(body))
 

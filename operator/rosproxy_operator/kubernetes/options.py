@@ -59,6 +59,25 @@ def administrators_options(command: Command) -> Command:
     return with_options(command, options)
 
 
+def ros2_options(command: Command) -> Command:
+    """What a RosProxy may ask for of ROS 2."""
+    options = (
+        click.option(
+            "--allow-peer",
+            type=GLOB,
+            multiple=True,
+            help="Hosts that a RosProxy may name as peers of ROS 2, as 192.0.2.* (repeatable). "
+            "Default: any.",
+        ),
+        click.option(
+            "--allow-multicast/--no-allow-multicast",
+            default=True,
+            help="Whether a RosProxy may hear the nodes' LAN, by pods in the nodes' own network.",
+        ),
+    )
+    return with_options(command, options)
+
+
 def own_options(command: Command) -> Command:
     """Who may reach the proxies, and how the operator proves to them who it is."""
     options = (
@@ -78,6 +97,12 @@ def own_options(command: Command) -> Command:
             type=Parsed("namespace/name", read_name),
             help="An existing Secret in which the key of the proxies' tokens is kept over "
             "restarts.",
+        ),
+        click.option(
+            "--lease",
+            type=Parsed("namespace/name", read_name),
+            help="The Lease by which several operators choose the one that acts. Default: there is "
+            "no other.",
         ),
     )
     return with_options(command, options)

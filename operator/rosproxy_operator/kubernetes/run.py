@@ -1,23 +1,37 @@
-"""Running the Kubernetes operator."""
+"""Running the Kubernetes operator.
+
+When it is told to end, it first stops to act and gives the lead away, then serves the webhook until
+nobody is led here any more.
+"""
 
 import asyncio
+import contextlib
 import logging
+import resource
 import signal
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from rosproxy import __version__
 from rosproxy_operator.common.health import HealthServer
 from rosproxy_operator.common.metrics import ClusterMetrics
-from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.common.operator_page import operator_page
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api.client import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
+from rosproxy_operator.kubernetes.leader import LeaderElection
+from rosproxy_operator.kubernetes.serving import ClusterServing
 from rosproxy_operator.kubernetes.settings import KubernetesSettings
-from rosproxy_operator.kubernetes.watch import ClusterWatch
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from rosproxy_operator.kubernetes.webhook.rotation import CertificateRotation, source
 from rosproxy_operator.kubernetes.webhook.server import WebhookServer
 
 log = logging.getLogger(__name__)
+
+UNDER_WAY = 5.0
+"""Seconds that requests have to end before the lead is given away; else its Lease runs out."""
+DRAINING = 6.0
+"""Seconds for which the webhook is served after that: kube-proxy on each node is to hear of it."""
 
 
 def run(settings: KubernetesSettings) -> None:
@@ -25,7 +39,14 @@ def run(settings: KubernetesSettings) -> None:
 
     Raises SettingError if it can't listen where it is told to, ApiError if no cluster is known.
     """
+    _raise_limit()
     asyncio.run(_run(settings, Api(settings.namespaces)))
+
+
+def _raise_limit() -> None:
+    """Let it have as many open files as it may: it waits at each proxy, which is a connection."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 async def _run(settings: KubernetesSettings, api: Api) -> None:
@@ -33,8 +54,17 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     metrics = ClusterMetrics()
-    controller = KubernetesController(settings, api, metrics)
-    health = HealthServer(metrics.registry, controller.dead, controller.unready)
+    election = LeaderElection(api, settings.lease, metrics)
+    api.gate.open = election.leads
+    controller = KubernetesController(settings, api, metrics, election.term)
+    webhook = rotation = None
+    if settings.webhook:
+        rotation = CertificateRotation(source(api, settings.webhook, election.leads), metrics)
+        server = WebhookServer(settings.webhook.bind, rotation)
+        webhook = Injector(api, settings.plan, metrics, controller.wake), server
+    page = operator_page(controller.documents)
+    unready = _first(controller.unready, *([webhook[1].unready] if webhook else []))
+    health = HealthServer(metrics.registry, controller.dead, unready, page)
     await health.start(settings.admin)
     log.info(
         "rosproxy-operator %s: looking after %s at %s; health and metrics at http://%s",
@@ -43,21 +73,42 @@ async def _run(settings: KubernetesSettings, api: Api) -> None:
         api.server,
         settings.admin,
     )
-    running: list[Coroutine[Any, Any, object]] = [controller.run(), stopped.wait()]
-    webhook = None
-    if settings.webhook:
-        rotation = CertificateRotation(source(api, settings.webhook), metrics)
-        running.append(rotation.run())
-        server = WebhookServer(settings.webhook.bind, rotation)
-        webhook = Injector(api, settings.plan, metrics, controller.wake), server
-    watch = ClusterWatch(settings, controller, webhook, metrics)
-    controller.appeared = watch.restart
+    serving = ClusterServing(settings, controller, webhook)
+    running: list[Coroutine[Any, Any, object]] = [
+        stopped.wait(), controller.run(), election.run(controller.retry),
+        *([rotation.run()] if rotation else []),
+    ]  # fmt: skip
     tasks = [asyncio.ensure_future(work) for work in running]
-    watch.start()
+    serving.start()
     done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    if settings.lease and stopped.is_set():
+        await hand_over(api, controller, election)
+        if webhook:
+            await _drain(webhook[1], stopped)
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, health.stop(), return_exceptions=True)
-    watch.stop()
+    serving.stop()
     for task in done:
         task.result()  # raises what it died of
+
+
+async def hand_over(api: Api, controller: KubernetesController, election: LeaderElection) -> None:
+    """Stop to act, and let another operator lead only when nothing is under way any more."""
+    election.resign()
+    await controller.stop_acting()
+    if await in_thread(api.gate.close, UNDER_WAY):
+        await election.release()
+
+
+async def _drain(server: WebhookServer, stopped: asyncio.Event) -> None:
+    """Serve those who are yet led here. Who asks a second time does not want to wait."""
+    stopped.clear()
+    server.drain()
+    with contextlib.suppress(TimeoutError):
+        await asyncio.wait_for(stopped.wait(), DRAINING)
+
+
+def _first(*checks: Callable[[], str | None]) -> Callable[[], str | None]:
+    """The first reason that one of these gives."""
+    return lambda: next(filter(None, (check() for check in checks)), None)

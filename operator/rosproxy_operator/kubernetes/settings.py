@@ -35,7 +35,9 @@ class Bounds(msgspec.Struct, frozen=True):
     ``masters`` are globs of the masters' URIs, any if there are none; ``window`` is where hostPorts
     may lie, all of ``spec.portWindow`` and ``spec.master.publish``; ``images`` are globs of the
     images that ``spec.image`` may name besides the operator's own. ``slave_control`` is what holds
-    for all: a RosProxy may only narrow it.
+    for all: a RosProxy may only narrow it. Of ROS 2: ``peers`` are globs of the hosts that it may
+    tell of participants, any if there are none; ``multicast``: whether it may hear the nodes' LAN,
+    by pods in the nodes' own network.
     """
 
     masters: tuple[str, ...] = ()
@@ -44,6 +46,8 @@ class Bounds(msgspec.Struct, frozen=True):
     data_planes: tuple[DataPlane, ...] = ("auto", "splice", "copy")
     images: tuple[str, ...] = ()
     slave_control: str = "any"
+    peers: tuple[str, ...] = ()
+    multicast: bool = True
 
 
 class ClusterSettings(msgspec.Struct, frozen=True):
@@ -91,7 +95,8 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     how long it waits at most between two looks. ``admin`` is where it serves its own health and
     metrics, ``liveness`` where it tells that it is alive. Without ``webhook`` pods are not wired.
     ``key_secret`` is the Secret that holds the key of the proxies' tokens; None: it is made anew
-    with each start.
+    with each start. ``lease``: of all operators with the same one acts, and all share certificate
+    and key; None: it is the only one.
     """
 
     plan: ClusterSettings = ClusterSettings()
@@ -101,6 +106,7 @@ class KubernetesSettings(msgspec.Struct, frozen=True):
     liveness: HostPort = DEFAULT_LIVENESS
     webhook: WebhookSettings | None = None
     key_secret: Name | None = None
+    lease: Name | None = None
 
 
 def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
@@ -108,6 +114,7 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
 
     Raises SettingError if they don't go together.
     """
+    _check_shared(options)
     return KubernetesSettings(
         plan=ClusterSettings(
             image=options["proxy_image"],
@@ -121,6 +128,8 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
                 data_planes=options["allow_data_plane"],
                 images=options["allow_image"],
                 slave_control=options["slave_control"],
+                peers=options["allow_peer"],
+                multicast=options["allow_multicast"],
             ),
             network_policy=options["network_policy"],
             admin_from=options["admin_from"],
@@ -133,7 +142,20 @@ def make_kubernetes_settings(options: Mapping[str, Any]) -> KubernetesSettings:
         liveness=options["liveness_bind"],
         webhook=_make_webhook(options) if options["webhook_bind"] else None,
         key_secret=options["key_secret"],
+        lease=options["lease"],
     )
+
+
+def _check_shared(options: Mapping[str, Any]) -> None:
+    """Raise SettingError if several operators could not share what they have to."""
+    if options["lease"] is None:
+        return
+    if options["key_secret"] is None:
+        raise SettingError("--key-secret", "is needed with --lease: all operators share the key")
+    own = options["webhook_bind"] and not options["webhook_cert_dir"]
+    if own and options["webhook_secret"] is None:
+        text = "is needed with --lease: all operators serve the same certificate"
+        raise SettingError("--webhook-secret", text)
 
 
 def read_namespace(text: str) -> str:

@@ -12,7 +12,7 @@ from tests.kubernetes.cluster.control_plane import (
     stop_control_plane,
 )
 from tests.kubernetes.cluster.images import IMAGES, load_images
-from tests.kubernetes.cluster.layout import NODES, STATE, Node
+from tests.kubernetes.cluster.layout import KUBECONFIG, NODES, PKI, STATE, Node
 from tests.kubernetes.cluster.network import make_bridge, remove_bridge
 from tests.kubernetes.cluster.node import (
     PAUSE_IMAGE,
@@ -27,6 +27,8 @@ from tests.kubernetes.cluster.robot import start_robot, stop_robot
 def up() -> None:
     """Bring up whatever of the cluster is not: control plane, nodes, images, robot."""
     assert answers(), "Docker does not answer: it builds the images and runs the robot"
+    if STATE.exists() and not (KUBECONFIG.exists() and PKI.exists()):
+        down()  # whoever made it, or took it away, was killed half-way
     STATE.mkdir(parents=True, exist_ok=True)
     make_certificates()
     make_bridge()
@@ -46,6 +48,7 @@ def up() -> None:
 
 def down() -> None:
     """Stop all of it and leave nothing behind."""
+    KUBECONFIG.unlink(missing_ok=True)  # first: `up` knows by it that the rest is not whole
     for node in NODES:
         remove_node(node)
     stop_control_plane()

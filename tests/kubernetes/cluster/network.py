@@ -90,19 +90,20 @@ def route_services() -> None:
         run("ip", "route", "delete", SERVICE_NETWORK, check=False)
 
 
-def plug_in_robot(process: str) -> None:
+def plug_in_robot(process: str, address: str = ROBOT_ADDRESS, cable: str = _ROBOT_CABLE) -> None:
     """Lay the cable to a container that has no network: it reaches the bridge, nothing behind."""
-    run("ip", "link", "delete", _ROBOT_CABLE, check=False)
-    run("ip", "link", "add", _ROBOT_CABLE, "type", "veth", "peer", "name", "eth0",
+    run("ip", "link", "delete", cable, check=False)
+    run("ip", "link", "add", cable, "type", "veth", "peer", "name", "eth0",
         "netns", process)  # fmt: skip
-    run("ip", "link", "set", _ROBOT_CABLE, "master", BRIDGE, "up")
+    run("ip", "link", "set", cable, "master", BRIDGE, "up")
     far = ("nsenter", "--target", process, "--net")
-    run(*far, "ip", "address", "add", f"{ROBOT_ADDRESS}/24", "dev", "eth0")
+    run(*far, "ip", "address", "add", f"{address}/24", "dev", "eth0")
     run(*far, "ip", "link", "set", "eth0", "up")
+    run(*far, "ip", "route", "add", "224.0.0.0/4", "dev", "eth0")
 
 
-def unplug_robot() -> None:
-    run("ip", "link", "delete", _ROBOT_CABLE, check=False)
+def unplug_robot(cable: str = _ROBOT_CABLE) -> None:
+    run("ip", "link", "delete", cable, check=False)
 
 
 def inside(node: Node, *command: str) -> str:

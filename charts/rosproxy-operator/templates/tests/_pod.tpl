@@ -13,6 +13,14 @@ helm.sh/hook: test
 helm.sh/hook-delete-policy: before-hook-creation,hook-succeeded,hook-failed
 {{- end -}}
 
+{{/* The range of ports of the test's RosProxy is within what the operator allows. */}}
+{{- define "rosproxy.test.window" -}}
+{{- if ne .Values.allow.portWindow "1024-65535" }}
+{{- $window := splitList "-" .Values.allow.portWindow -}}
+portWindow: {first: {{ first $window }}, last: {{ last $window }}}
+{{- end }}
+{{- end -}}
+
 {{/* The labels of the test's objects, from a dict: root, component. */}}
 {{- define "rosproxy.test.labels" -}}
 app.kubernetes.io/name: {{ default .root.Chart.Name .root.Values.nameOverride | trunc 63 | trimSuffix "-" }}-test
@@ -20,7 +28,10 @@ app.kubernetes.io/instance: {{ .root.Release.Name }}
 app.kubernetes.io/component: {{ .component }}
 {{- end -}}
 
-{{/* A pod's spec, from a dict: root, args, env, restart. It meets the standard "restricted". */}}
+{{/*
+A pod's spec, from a dict: root, args, env, restart, and whom to keep away from (apart, labels).
+It meets the standard "restricted".
+*/}}
 {{- define "rosproxy.test.pod" -}}
 automountServiceAccountToken: false
 restartPolicy: {{ .restart }}
@@ -38,7 +49,9 @@ securityContext:
     type: RuntimeDefault
 containers:
   - name: ros
-    image: {{ .root.Values.tests.image | quote }}
+    {{- with .root.Values.tests }}
+    image: {{ ternary .ros2Image .image (eq (int .ros) 2) | quote }}
+    {{- end }}
     {{- with .root.Values.tests.imagePullPolicy }}
     imagePullPolicy: {{ . }}
     {{- end }}
@@ -85,6 +98,17 @@ volumes:
       name: {{ include "rosproxy.test.name" .root }}
   - name: tmp
     emptyDir: {}
+{{- with .apart }}
+affinity:
+  podAntiAffinity:
+    preferredDuringSchedulingIgnoredDuringExecution:
+      - weight: 100
+        podAffinityTerm:
+          topologyKey: kubernetes.io/hostname
+          labelSelector:
+            matchLabels:
+              {{- . | nindent 14 }}
+{{- end }}
 {{- with .root.Values.tests.nodeSelector }}
 nodeSelector:
   {{- toYaml . | nindent 2 }}

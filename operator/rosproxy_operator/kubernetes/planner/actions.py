@@ -64,6 +64,24 @@ class DeleteProxy(ObjectAction, frozen=True):
     retire: bool = False
 
 
+class CreateEar(ClusterAction, frozen=True):
+    """Create the pod of a proxy's ear. ``body`` is the whole object."""
+
+    body: Json
+
+
+class DeleteEar(ObjectAction, frozen=True):
+    """Delete the pod of an ear."""
+
+    why: str
+
+
+class EvictPod(ObjectAction, frozen=True):
+    """Evict a user's pod that whoever made it makes anew."""
+
+    why: str
+
+
 class SetImage(ObjectAction, frozen=True):
     """Give a proxy's pod another image: its ports and its address stay."""
 
@@ -97,6 +115,9 @@ Action = (
     | DeletePolicy
     | CreateProxy
     | DeleteProxy
+    | CreateEar
+    | DeleteEar
+    | EvictPod
     | SetImage
     | PatchStatus
     | Emit

@@ -20,8 +20,16 @@ from rosproxy_operator.common.allocation import (
     overlap,
     within,
 )
+from rosproxy_operator.common.ros2 import well_known_ports
 from rosproxy_operator.kubernetes.planner.state import ClusterState, ports_held
-from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves, short
+from rosproxy_operator.kubernetes.planner.view import (
+    View,
+    grouped,
+    has_ports,
+    place_of,
+    serves,
+    short,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Pod,
@@ -52,8 +60,10 @@ def allocate(view: View, settings: ClusterSettings, state: ClusterState) -> Clus
     A proxy that has its ports keeps them, unless its RosProxy or the settings now forbid them.
     """
     ranges = ClusterRanges()
-    for node in sorted({place.node for place in view.wanted}):
-        _Allocation(view, settings, state, node, ranges).run()
+    places = grouped((place.node, place) for place in view.wanted)
+    refused = grouped(state.taken)
+    for node, wanted in sorted(places.items()):
+        _Allocation(view, settings, state, wanted, {*refused.get(node, ())}, ranges).run()
     return ranges
 
 
@@ -65,14 +75,16 @@ class _Allocation:
         view: View,
         settings: ClusterSettings,
         state: ClusterState,
-        node: str,
+        wanted: tuple[ProxyPlace, ...],
+        refused: set[int],
         ranges: ClusterRanges,
     ) -> None:
-        self.view, self.state, self.node, self.ranges = view, state, node, ranges
-        self.of = {one: view.rosproxies[one.of] for one in view.wanted if one.node == node}
+        self.view, self.state, self.ranges = view, state, ranges
+        self.node = node = wanted[0].node
+        self.of = {one: view.rosproxies[one.of] for one in wanted}
         self.proxies = view.on.get(node, ())
         self.strangers = view.strangers.get(node, ())
-        self.refused = {port for where, port in state.taken if where == node}
+        self.refused = refused
         self.kernel = {
             "NodePorts are": settings.node_ports,
             "the nodes' ephemeral ports are": settings.ephemeral,
@@ -131,12 +143,13 @@ class _Allocation:
         """
         served = place in self.state.served
         waits = served or self.view.current.get(place) is not None
-        pods = [pod for pod in self.strangers if not (served and pod.deleting)]
+        pods = [pod for pod in self._strangers(place) if not (served and pod.deleting)]
         for one in self.proxies:
             heeded = has_ports(one) or place_of(one) not in self.view.wanted
             if heeded and place_of(one) != place and not (waits and one.pod.deleting):
                 pods.append(one.pod)
-        return is_free(ports, ports_held(pods) | self.refused, self._promised_to_others(place))
+        held = ports_held(pods, self.of[place].spec)
+        return is_free(ports, held | self.refused, self._promised_to_others(place))
 
     def _publish(self, place: ProxyPlace) -> None:
         """Give a proxy its port for a master in the cluster, if it is to have one and can."""
@@ -160,7 +173,8 @@ class _Allocation:
     def _fill(self, place: ProxyPlace) -> None:
         """Give a proxy more ports if it has too few, or a range if it has none."""
         spec, given = self.of[place].spec, self.ranges.given
-        blocked = ports_held(self._pods_of_others(place)) | self.refused | self._reserved(place)
+        others = ports_held(self._pods_of_others(place), spec)
+        blocked = others | self.refused | self._reserved(place)
         held = [*self.kernel.values(), *self._promised_to_others(place)]
         if kept := given.get(place):
             given[place] = extended(kept, spec.ports, spec.window, blocked, held) or kept
@@ -195,7 +209,10 @@ class _Allocation:
             f"{what} {ports}" for what, ports in self.kernel.items() if overlap(ports, error.window)
         ]
         pods = self._pods_of_others(place)
-        holders = [str(pod.id) for pod in pods if any(p in error.window for p in pod.host_ports)]
+        spec = self.of[place].spec
+        holders = [
+            str(pod.id) for pod in pods if any(p in error.window for p in pod.ports_of(spec))
+        ]
         why += [f"others are held by {short(holders)}"] if holders else []
         by = ", ".join(why) or "the others were refused just now"
         return (
@@ -205,7 +222,13 @@ class _Allocation:
 
     def _pods_of_others(self, place: ProxyPlace) -> list[Pod]:
         """All other pods that hold ports on the node."""
-        return [*self.strangers, *(one.pod for one in self.proxies if place_of(one) != place)]
+        own = (one.pod for one in self.proxies if place_of(one) != place)
+        return [*self._strangers(place), *own]
+
+    def _strangers(self, place: ProxyPlace) -> list[Pod]:
+        """Pods that are no proxies; the ears of others are among them."""
+        ears = (one for one in self.view.observed.ears if one.on == self.node)
+        return [*self.strangers, *(one.pod for one in ears if one.of != place.of)]
 
     def _promised_to_others(self, place: ProxyPlace) -> Iterator[PortRange]:
         """What other proxies on the node have been given by now."""
@@ -217,4 +240,6 @@ class _Allocation:
                 yield PortRange(port, port)
 
     def _reserved(self, place: ProxyPlace) -> set[int]:
-        return {MASTER_PORT, ADMIN_PORT, self.of[place].spec.master.publish}
+        spec = self.of[place].spec
+        known = well_known_ports(spec.ros2.number) if spec.ros2 else frozenset[int]()
+        return {MASTER_PORT, ADMIN_PORT, spec.master.publish, *known}

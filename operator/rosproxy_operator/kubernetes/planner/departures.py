@@ -5,7 +5,7 @@ API server that a pod is gone. It compares the addresses at which a proxy has RO
 of the pods that are there, and is careful: what is unregistered by mistake is not found again.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from ipaddress import ip_address, ip_network
 
 import msgspec
@@ -13,7 +13,8 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.planner.view import grouped
-from rosproxy_operator.kubernetes.resources.model import ClusterNode, ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, ProxyReport
+from rosproxy_operator.kubernetes.resources.model import ClusterNode
 
 UNSEEN = 15.0
 """Seconds after which an address in a node's pod network is nobody's that no pod was seen with.
@@ -57,7 +58,7 @@ def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departur
         if answer is None or not answer.answered or node is None or not node.ready:
             continue
         living = [pod for pod in pods.get(node.name, ()) if not pod.ended]
-        missing = answer.nodes.keys() - {pod.ip for pod in living}
+        missing = answer.addresses - {pod.ip for pod in living}
         unseen = {ip for ip in missing - known[node.name].keys() if _is_pods(ip, proxy, node)}
         since = {ip: state.strange.get((node.name, ip), now) for ip in unseen}
         strange |= {(node.name, ip): at for ip, at in since.items()}
@@ -65,7 +66,8 @@ def gone(observed: ClusterSnapshot, state: ClusterState, now: float) -> Departur
         late = {ip for ip, at in since.items() if now - at >= UNSEEN and not unnamed}
         if addresses := (missing & known[node.name].keys()) | late:
             found[proxy.pod.uid] = tuple(sorted(addresses))
-    kept = {on: _kept(observed, on, some, now) for on, some in known.items()}
+    proxies = grouped((one.on, observed.reports.get(one.pod.uid)) for one in observed.proxies)
+    kept = {on: _kept(proxies[on], some, now) for on, some in known.items()}
     return Departures(found, replace(state, addresses=kept, strange=strange))
 
 
@@ -83,12 +85,11 @@ def _is_pods(address: str, proxy: ProxyPod, node: ClusterNode) -> bool:
 
 
 def _kept(
-    observed: ClusterSnapshot, on: str, known: Mapping[str, float], now: float
+    asked: Collection[ProxyReport | None], known: Mapping[str, float], now: float
 ) -> dict[str, float]:
     """Which addresses are worth remembering: those that a proxy names, or may name yet."""
-    asked = [observed.reports.get(one.pod.uid) for one in observed.proxies if one.on == on]
     answers = [answer for answer in asked if answer is not None and answer.answered]
-    named = {address for answer in answers for address in answer.nodes}
+    named = {address for answer in answers for address in answer.addresses}
     longest = REMEMBERED if len(answers) == len(asked) else LONGEST
     return {ip: at for ip, at in known.items() if ip in named or now - at < longest}
 

@@ -2,22 +2,25 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
 
 from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort, is_address
 from rosproxy_operator.common.allocation import overlap
 from rosproxy_operator.common.policy import POLICY_VARIABLES, policy_variables
 from rosproxy_operator.common.proxy_bounds import bound_variables
-from rosproxy_operator.kubernetes.planner.policies import policy_of
+from rosproxy_operator.common.ros2 import discovery_port, well_known_ports
+from rosproxy_operator.kubernetes.planner.access.policies import policy_of
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
     Json,
     MasterSpec,
     Name,
     RosProxy,
+    RosProxySpec,
 )
 from rosproxy_operator.kubernetes.resources.names import (
     ADMIN_PORT,
@@ -30,6 +33,7 @@ from rosproxy_operator.kubernetes.resources.names import (
     MASTER_PORT,
     NODE,
     PORT_RANGE,
+    PROXY,
     own_labels,
     proxy_id,
     service_id,
@@ -38,6 +42,14 @@ from rosproxy_operator.kubernetes.settings import ClusterSettings
 
 USER = 10001
 """The image's own user."""
+NOBODY: Json = {
+    "runAsNonRoot": True,
+    "runAsUser": USER,
+    "runAsGroup": USER,
+    "seccompProfile": {"type": "RuntimeDefault"},
+}
+"""The ``securityContext`` of pods of that image."""
+PEERS_VARIABLE = "ROSPROXY_ROS2_PEERS"
 STOPS_WITHIN = 5
 """Seconds that a proxy has to end before it is killed, `_LINGERS` included."""
 _LINGERS = 2
@@ -59,11 +71,17 @@ _LOCAL_PORTS = (PortRange(1024, 11000), PortRange(32768, 60999), PortRange(12000
 """Where a proxy's outgoing connections may start: never on a port that it is to listen on."""
 
 
+_FINGERPRINTS: dict[Name, tuple[object, str]] = {}
+"""What proxies' pods were made of when their fingerprints were worked out last, and those."""
+_MOST = 8192
+
+
 class Site(msgspec.Struct, frozen=True):
     """A proxy on a node.
 
     ``master`` is the real master as a proxy is told it: ``uri`` also of a Service, ``address``
-    empty if its name is to be resolved, ``publish`` 0 where that port can't be had.
+    empty if its name is to be resolved, ``publish`` 0 where that port can't be had. ``peers`` are
+    all of ROS 2: those of the RosProxy, and its proxies on other nodes.
     """
 
     rosproxy: RosProxy
@@ -72,6 +90,30 @@ class Site(msgspec.Struct, frozen=True):
     ports: PortRange
     master: MasterSpec
     token_hash: str = ""
+    peers: tuple[str, ...] = ()
+
+    @property
+    def own_ports(self) -> PortRange:
+        """The proxy's own ports of the range: with an ear the last one is the ear's."""
+        ports = self.ports
+        return PortRange(ports.first, ports.last - 1) if self.rosproxy.spec.multicast else ports
+
+    @property
+    def ear(self) -> HostPort | None:
+        """Where the proxy's ear is told of participants, on the node; None if there is none."""
+        lan = lan_address(self.node, self.advertise_host)
+        multicast = self.rosproxy.spec.multicast and lan
+        return HostPort(lan, self.ports.last) if multicast else None
+
+
+def lan_address(node: ClusterNode, advertise_host: str) -> str:
+    """A node's own IPv4 address on the LAN; empty if it has none.
+
+    It is the one that is advertised, if that is the node's own, else its InternalIP.
+    """
+    own = [one for one in node.addresses.values() if is_address(one) and ":" not in one]
+    internal = node.addresses.get("InternalIP", "")
+    return next((one for one in (advertise_host, internal) if one in own), "")
 
 
 def image_of(rosproxy: RosProxy, settings: ClusterSettings) -> str:
@@ -100,12 +142,31 @@ def proxy_pod(site: Site, settings: ClusterSettings) -> Json:
     meta = metadata(of, proxy_id(of.id, site.node.name), notes)
     # A running proxy is told its policy: another one makes no pod anew. A proxy that is started
     # again while the operator is away begins with the policy of its pod's creation.
-    env = [one for one in container["env"] if one["name"] not in POLICY_VARIABLES]
+    # So it is with peers, which come and go with the nodes.
+    told = {*POLICY_VARIABLES, PEERS_VARIABLE}
+    env = [one for one in container["env"] if one["name"] not in told]
     spec = {**_spec(site), "containers": [{**container, "image": "", "env": env}]}
     body = {"apiVersion": "v1", "kind": "Pod", "metadata": meta, "spec": spec}
-    known_as = _digest(f"{site.master.uri} {site.advertise_host}")[:8]
+    known_as = _digest(f"{site.master.uri}{_domain(of)} {site.advertise_host}")[:8]
     notes[FINGERPRINT] = f"{_fingerprint(body)}-{known_as}"
     return {**body, "spec": {**spec, "containers": [container]}}
+
+
+def proxy_fingerprint(site: Site, settings: ClusterSettings) -> str:
+    """The fingerprint of a proxy's pod, worked out anew only if what it is made of is another.
+
+    With a thousand proxies that would be half of what a look takes. Peers are no part of it.
+    """
+    of = site.rosproxy
+    made_of = (of.uid, of.spec, site.node, site.advertise_host, site.ports, site.master)
+    about = (*made_of, site.token_hash, settings)
+    name = proxy_id(of.id, site.node.name)
+    known = _FINGERPRINTS.get(name)
+    if known is None or known[0] != about:
+        if len(_FINGERPRINTS) >= _MOST:
+            _FINGERPRINTS.clear()
+        known = _FINGERPRINTS[name] = about, fingerprint_of(proxy_pod(site, settings))
+    return known[1]
 
 
 def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
@@ -118,9 +179,7 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
         "internalTrafficPolicy": "Local",
         # A proxy that does not reach its master must still be there to say so.
         "publishNotReadyAddresses": True,
-        "ports": [
-            {"name": "master", "port": MASTER_PORT, "targetPort": MASTER_PORT, "protocol": "TCP"}
-        ],
+        "ports": [*_service_ports(rosproxy)],
     }
     body = {"apiVersion": "v1", "kind": "Service", "metadata": meta, "spec": spec}
     notes[FINGERPRINT] = _fingerprint(body)
@@ -129,12 +188,34 @@ def service(rosproxy: RosProxy, cluster_ip: str = "") -> Json:
     return body
 
 
+def _service_ports(of: RosProxy) -> Iterator[Json]:
+    listening = []
+    if of.spec.ros1:
+        listening.append(("master", MASTER_PORT, "TCP"))
+    if of.spec.ros2:
+        listening.append(("discovery", discovery_port(of.spec.ros2.number), "UDP"))
+    for name, port, protocol in listening:
+        yield {"name": name, "port": port, "targetPort": port, "protocol": protocol}
+
+
+def _domain(of: RosProxy) -> str:
+    """The domain as part of what a proxy's nodes know it by; empty without ROS 2."""
+    return f" domain {of.spec.ros2.number}" if of.spec.ros2 else ""
+
+
 def finds_again(old: str, new: str) -> bool:
     """Whether a proxy finds at its master the nodes of another one, by their fingerprints.
 
-    It does if both have the same master and the same advertised host.
+    It does if both have the same master, or domain, and the same advertised host.
     """
     return old.partition("-")[2] in ("", new.partition("-")[2])
+
+
+def fingerprinted(body: Json) -> Json:
+    """An object with its fingerprint written on it."""
+    meta = body["metadata"]
+    notes = {**meta["annotations"], FINGERPRINT: _fingerprint(body)}
+    return {**body, "metadata": {**meta, "annotations": notes}}
 
 
 def fingerprint_of(body: Json) -> str:
@@ -156,7 +237,9 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def metadata(of: RosProxy, id: Name, annotations: dict[str, str]) -> dict[str, Any]:
+def metadata(
+    of: RosProxy, id: Name, annotations: dict[str, str], component: str = PROXY
+) -> dict[str, Any]:
     """The metadata of an object that belongs to a RosProxy and goes with it."""
     owner = {
         "apiVersion": API_VERSION,
@@ -168,7 +251,7 @@ def metadata(of: RosProxy, id: Name, annotations: dict[str, str]) -> dict[str, A
     return {
         "name": id.name,
         "namespace": id.namespace,
-        "labels": own_labels(of.id.name),
+        "labels": own_labels(of.id.name, component),
         "annotations": annotations,
         "ownerReferences": [owner],
     }
@@ -180,35 +263,41 @@ def _spec(site: Site) -> dict[str, Any]:
     The pod is bound to its node through the scheduler, as a DaemonSet's: it checks the ports.
     """
     spec = site.rosproxy.spec
-    field = {"key": "metadata.name", "operator": "In", "values": [site.node.name]}
+    aliases = [dict(one) for one in spec.host_aliases]
+    sysctls = [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}]
+    return {
+        **bound_to(site.node.name, spec),
+        "terminationGracePeriodSeconds": STOPS_WITHIN,
+        "securityContext": {**NOBODY, "sysctls": sysctls},
+        **({"hostAliases": aliases} if aliases else {}),
+    }
+
+
+def bound_to(node: str, spec: RosProxySpec) -> dict[str, Any]:
+    """What the specs of all pods have in common that the operator makes for a node."""
+    field = {"key": "metadata.name", "operator": "In", "values": [node]}
     terms = {"nodeSelectorTerms": [{"matchFields": [field]}]}
     tolerations = [
         {"key": f"node.kubernetes.io/{taint}", "operator": "Exists", "effect": effect}
         for taint, effect in _TAINTS
     ]
-    more = {"imagePullSecrets": spec.image_pull_secrets, "hostAliases": spec.host_aliases}
+    secrets = [dict(one) for one in spec.image_pull_secrets]
     return {
         "affinity": {"nodeAffinity": {"requiredDuringSchedulingIgnoredDuringExecution": terms}},
         "tolerations": [*tolerations, *map(dict, spec.tolerations)],
         "restartPolicy": "Always",
-        "terminationGracePeriodSeconds": STOPS_WITHIN,
         "automountServiceAccountToken": False,
         # Services called rosproxy-… would otherwise set variables that are the proxy's options.
         "enableServiceLinks": False,
-        "securityContext": {
-            "runAsNonRoot": True,
-            "runAsUser": USER,
-            "runAsGroup": USER,
-            "seccompProfile": {"type": "RuntimeDefault"},
-            "sysctls": [{"name": "net.ipv4.ip_local_port_range", "value": _local_ports(site)}],
-        },
-        **{key: [dict(one) for one in value] for key, value in more.items() if value},
+        **({"imagePullSecrets": secrets} if secrets else {}),
     }
 
 
 def _local_ports(site: Site) -> str:
     fixed = (MASTER_PORT, ADMIN_PORT, site.master.publish)
-    listening = [site.ports, *(PortRange(port, port) for port in fixed if port)]
+    ros2 = site.rosproxy.spec.ros2
+    known = sorted(well_known_ports(ros2.number)) if ros2 else ()
+    listening = [site.ports, *(PortRange(port, port) for port in (*fixed, *known) if port)]
     free = (one for one in _LOCAL_PORTS if not any(overlap(one, other) for other in listening))
     ports = next(free, _LOCAL_PORTS[0])
     return f"{ports.first} {ports.last}"
@@ -223,6 +312,8 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
     spec = site.rosproxy.spec
     policy = spec.image_pull_policy or settings.image_pull_policy
     publish = [site.master.publish] if site.master.publish else []
+    taken = [("TCP", [*site.ports.ports(), *publish])] if spec.ros1 else []
+    taken += [("UDP", [*site.own_ports.ports()])] if spec.takes_udp else []
     variables = _environment(site, settings)
     forwards = spec.data_plane == "kernel"
     return {
@@ -231,8 +322,9 @@ def _container(site: Site, settings: ClusterSettings) -> dict[str, Any]:
         **({"imagePullPolicy": policy} if policy else {}),
         "env": [{"name": name, "value": value} for name, value in variables.items()],
         "ports": [
-            {"containerPort": port, "hostPort": port, "protocol": "TCP"}
-            for port in [*site.ports.ports(), *publish]
+            {"containerPort": port, "hostPort": port, "protocol": protocol}
+            for protocol, ports in taken
+            for port in ports
         ],
         "resources": dict(spec.resources),
         "livenessProbe": _probe("/healthz", 10),
@@ -253,21 +345,35 @@ def _environment(site: Site, settings: ClusterSettings) -> Mapping[str, str]:
         "ROS_MASTER_URI": site.master.uri,
         "ROSPROXY_MASTER_ADDRESS": site.master.address,
         "ROSPROXY_ADVERTISE_HOST": site.advertise_host,
-        "ROSPROXY_PORT_RANGE": str(site.ports),
-        "ROSPROXY_MASTER_PORT": str(MASTER_PORT),
+        "ROSPROXY_PORT_RANGE": str(site.own_ports),
+        "ROSPROXY_MASTER_PORT": str(MASTER_PORT) if spec.ros1 else "",
         "ROSPROXY_PUBLISH_MASTER": str(site.master.publish or ""),
         "ROSPROXY_ADMIN_BIND": f"0.0.0.0:{ADMIN_PORT}",
         "ROSPROXY_INSIDE_NETWORKS": " ".join(site.node.pod_networks),
         "ROSPROXY_CLEANUP_AFTER": f"{spec.cleanup_after:g}",
         "ROSPROXY_SLAVE_CONTROL": slave_control_of(site.rosproxy, settings),
         "ROSPROXY_DIRECTION": "" if spec.direction == "out" else spec.direction,
+        "ROSPROXY_UDP": "1" if spec.udp else "",
         "ROSPROXY_DATA_PLANE": "" if spec.data_plane == "auto" else spec.data_plane,
         HASH_VARIABLE: site.token_hash,
+        **_ros2_variables(site),
         **bound_variables(settings.proxy_bounds),
         # Without a policy there is nothing to wait for, which takes a second after each restart.
         **(policy_variables(policy) if policy else {}),
     }
     return {name: value for name, value in variables.items() if value}
+
+
+def _ros2_variables(site: Site) -> Mapping[str, str]:
+    spec = site.rosproxy.spec
+    if spec.ros2 is None:
+        return {}
+    return {
+        "ROSPROXY_ROS": "1 2" if spec.ros1 else "2",
+        "ROSPROXY_ROS2_DOMAINS": str(spec.ros2.number),
+        PEERS_VARIABLE: " ".join(site.peers),
+        "ROSPROXY_ROS2_EAR": str(site.ear or ""),
+    }
 
 
 def _probe(path: str, period: int) -> dict[str, Any]:

@@ -14,37 +14,41 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.access.layers import PolicyLayer
+from rosproxy_operator.common.proxy_status import Leases
 from rosproxy_operator.kubernetes.planner import departures
+from rosproxy_operator.kubernetes.planner.access.bounds import within_bounds
+from rosproxy_operator.kubernetes.planner.access.callers import callers
+from rosproxy_operator.kubernetes.planner.access.policies import policies
 from rosproxy_operator.kubernetes.planner.actions import Action, PatchStatus
 from rosproxy_operator.kubernetes.planner.allocation import allocate
-from rosproxy_operator.kubernetes.planner.bounds import within_bounds
-from rosproxy_operator.kubernetes.planner.callers import callers
-from rosproxy_operator.kubernetes.planner.injection import unwired
-from rosproxy_operator.kubernetes.planner.network_policy import (
+from rosproxy_operator.kubernetes.planner.former_ports import former_ports, remember
+from rosproxy_operator.kubernetes.planner.pods.injection import unwired
+from rosproxy_operator.kubernetes.planner.pods.ros2_pods import unmet
+from rosproxy_operator.kubernetes.planner.retries import Retries, Task
+from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
+from rosproxy_operator.kubernetes.planner.steps.ear import ear_findings, reconcile_ears
+from rosproxy_operator.kubernetes.planner.steps.network_policy import (
     reconcile_orphaned_policies,
     reconcile_policies,
 )
-from rosproxy_operator.kubernetes.planner.policies import policies
-from rosproxy_operator.kubernetes.planner.reconcile import (
+from rosproxy_operator.kubernetes.planner.steps.reconcile import (
     ClusterContext,
     advertise_host,
     ends,
     master_of,
+    peers,
     reconcile_orphans,
     reconcile_proxies,
     reconcile_service,
     site_of,
 )
-from rosproxy_operator.kubernetes.planner.retries import Retries, Task
-from rosproxy_operator.kubernetes.planner.state import ClusterState, decide, learn, moves
+from rosproxy_operator.kubernetes.planner.steps.remake import remake_unwired
 from rosproxy_operator.kubernetes.planner.view import view
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, NodeState, Obstacle
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
-    ClusterSnapshot,
     InvalidRosProxy,
     Json,
-    NodeState,
-    Obstacle,
     ProxyPlace,
     RosProxy,
 )
@@ -53,14 +57,24 @@ from rosproxy_operator.kubernetes.status import events
 from rosproxy_operator.kubernetes.status.findings import finding, findings
 from rosproxy_operator.kubernetes.status.status import status_of, status_of_invalid
 
+_STEPS = (
+    reconcile_service,
+    reconcile_policies,
+    reconcile_proxies,
+    reconcile_ears,
+    remake_unwired,
+)
+"""What is done for each RosProxy, in this order."""
+
 
 class ClusterPlan(msgspec.Struct, frozen=True):
     """What to do, in this order, and what to remember.
 
     One action that fails keeps none of the others from being done. ``gone`` are, by the uid of a
     proxy's pod, the addresses of pods that are no more, ``callers`` those of pods that may use the
-    proxy, ``policies`` the layers of its policy: it is to be told. ``again_in`` is in how many
-    seconds to look again even if nothing happens; None: no need.
+    proxy, ``policies`` the layers of its policy, ``peers`` its peers of ROS 2, ``former`` the
+    ports of participants at the proxy before it: it is to be told.
+    ``again_in`` is in how many seconds to look again even if nothing happens; None: no need.
     """
 
     actions: tuple[Action, ...] = ()
@@ -69,6 +83,8 @@ class ClusterPlan(msgspec.Struct, frozen=True):
     gone: Mapping[str, tuple[str, ...]] = {}
     callers: Mapping[str, tuple[str, ...]] = {}
     policies: Mapping[str, tuple[PolicyLayer, ...]] = {}
+    peers: Mapping[str, tuple[str, ...]] = {}
+    former: Mapping[str, Leases] = {}
     again_in: float | None = None
 
 
@@ -95,8 +111,7 @@ def plan(
     problems = [*seen.findings]
     moved = tuple(moves(seen, decided, ranges.given))
     for _, rosproxy in sorted(seen.rosproxies.items()):
-        own = [*reconcile_service(context, rosproxy), *reconcile_policies(context, rosproxy)]
-        own += reconcile_proxies(context, rosproxy)
+        own = [action for step in _STEPS for action in step(context, rosproxy)]
         states = tuple(_states(context, rosproxy))
         found = _problems(context, rosproxy, states, moved)
         master, _ = master_of(rosproxy, observed)
@@ -118,12 +133,28 @@ def plan(
         gone=gone.gone,
         callers=callers(whole),
         policies=policies(whole, settings),
+        peers=peers(context),
+        former=former_ports(seen, decided.former),
         again_in=min((*soon, *retries.waits(), *departures.waits(gone, now)), default=None),
     )
 
 
+def stand_by(
+    observed: ClusterSnapshot, settings: ClusterSettings, state: ClusterState, now: float
+) -> ClusterState:
+    """What an operator remembers while another one acts, to begin where that one ends.
+
+    That is what can't be seen any more once it is needed: which ports participants had, and which
+    addresses pods had. Everything else is learnt from the cluster by the first plan.
+    """
+    seen = departures.gone(observed, state, now).state
+    former = remember(view(within_bounds(observed, settings)), state.former)
+    return ClusterState(former=former, addresses=seen.addresses, strange=seen.strange)
+
+
 def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
     """What a RosProxy has on each node that its status names: also where it had a proxy."""
+    ears = [one for one in context.observed.ears if one.owner == of.uid]
     named = {*of.former, *(place.node for place in context.view.places.get(of.id, ()))}
     for node in sorted(named & context.observed.nodes.keys()):
         place = ProxyPlace(of.id, node)
@@ -139,6 +170,7 @@ def _states(context: ClusterContext, of: RosProxy) -> Iterator[NodeState]:
             pods=context.view.wanted.get(place, ()),
             answer=context.observed.reports.get(current.pod.uid) if current else None,
             obstacle=site if isinstance(site, Obstacle) else None,
+            ear=next((one for one in ears if one.on == node), None),
         )
 
 
@@ -158,7 +190,9 @@ def _problems(
         *((finding(of, "NoNetworkPolicy", text),) if unlisted else ()),
         *findings(of, states, context.retries.failures(of.id)),
         *(one for one in others if one.of == of.id),
-        *filter(None, (unwired(pod, of, address) for pod in pods)),
+        *filter(None, (unwired(pod, of, address) for pod in pods if of.spec.ros1)),
+        *(one for pod in pods for one in unmet(pod, of, address)),
+        *ear_findings(context, of),
     )
 
 

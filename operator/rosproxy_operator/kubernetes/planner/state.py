@@ -17,12 +17,20 @@ from rosproxy_operator.common.allocation import (
     RETRY_FOR,
     TAKEN_FOR,
     Move,
+    after_move,
     overlap,
     within,
 )
+from rosproxy_operator.kubernetes.planner.former_ports import FormerPorts, remember
 from rosproxy_operator.kubernetes.planner.retries import RetryRecord, Task
 from rosproxy_operator.kubernetes.planner.view import View, has_ports, place_of, serves
-from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Pod, ProxyPlace, Stuck
+from rosproxy_operator.kubernetes.resources.cluster import Stuck
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
+    Pod,
+    ProxyPlace,
+    RosProxySpec,
+)
 from rosproxy_operator.kubernetes.status.findings import finding
 
 TRIED_FOR = 60.0
@@ -40,7 +48,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     be had in the first place. ``attempts`` are actions that have not shown an effect yet,
     ``reported`` problems that Events were made of. ``addresses`` are, by node, those that pods have
     or had, and when they were last seen to; ``strange``, by node and address, those that a proxy
-    has named and that no pod was seen with, since when.
+    has named and that no pod was seen with, since when. ``former``: see `former_ports`.
     """
 
     begun: bool = False
@@ -56,6 +64,7 @@ class ClusterState(msgspec.Struct, frozen=True):
     reported: Mapping[ClusterFinding, float] = {}
     addresses: Mapping[str, Mapping[str, float]] = {}
     strange: Mapping[tuple[str, str], float] = {}
+    former: Mapping[ProxyPlace, FormerPorts] = {}
 
 
 def learn(view: View, state: ClusterState, now: float) -> ClusterState:
@@ -72,6 +81,7 @@ def learn(view: View, state: ClusterState, now: float) -> ClusterState:
     return replace(
         state,
         begun=True,
+        former=remember(view, state.former),
         absent={place: state.absent.get(place, now) for place in absent},
         lost={node: state.lost.get(node, now) for node in lost},
         served=served,
@@ -100,19 +110,17 @@ def moves(
     view: View, state: ClusterState, ranges: Mapping[ProxyPlace, PortRange]
 ) -> Iterator[ClusterFinding]:
     """Who has had to leave which ports."""
-    for left, why in ((state.moved, _MOVED), (state.tried, _TRIED)):
+    for left, served in ((state.moved, True), (state.tried, False)):
         for place, move in sorted(left.items()):
             if place in ranges and not _is_kept(move.ports, ranges[place]):
+                of = view.rosproxies[place.of]
+                why = "they could not be had: nothing needs to be done"
+                if served:
+                    lost = after_move(of.spec.ros1, of.spec.ros2 is not None)
+                    why = f"something else has taken them or the RosProxy forbids them now: {lost}"
                 what = f"has left ports {move.ports} for {ranges[place]}"
-                text = f"the proxy on node {place.node} {what}, {why}"
-                yield finding(view.rosproxies[place.of], "PortConflict", text)
-
-
-_MOVED = (
-    "since something else has taken them or the RosProxy forbids them now: nodes that had "
-    "registered under the old ones can't be reached until they register anew: restart their pods"
-)
-_TRIED = "since they could not be had: nothing needs to be done"
+                text = f"the proxy on node {place.node} {what}, since {why}"
+                yield finding(of, "PortConflict", text)
 
 
 def _served(view: View, state: ClusterState) -> dict[ProxyPlace, PortRange]:
@@ -158,9 +166,10 @@ def _refused(
             waiting[place] = began
             continue
         others = (one.pod for one in there if place_of(one) != place)
-        held = ports_held((*view.strangers.get(proxy.on, ()), *others))
+        spec = view.rosproxies[place.of].spec
+        held = ports_held((*view.strangers.get(proxy.on, ()), *others), spec)
         # Whoever holds them is seen, or all of them are avoided.
-        seen = held & proxy.pod.host_ports
+        seen = held & proxy.pod.every_port
         hit = held.intersection(proxy.range.ports()) if seen else proxy.range.ports()
         taken |= {(proxy.on, port) for port in hit}
     return waiting, taken
@@ -172,9 +181,9 @@ def _waits(view: View, place: ProxyPlace) -> bool:
     return place in view.wanted and (proxy is None or not has_ports(proxy))
 
 
-def ports_held(pods: Iterable[Pod]) -> set[int]:
-    """The hostPorts of pods."""
-    return {port for pod in pods for port in pod.host_ports}
+def ports_held(pods: Iterable[Pod], spec: RosProxySpec) -> set[int]:
+    """The hostPorts of pods that a RosProxy can't have."""
+    return {port for pod in pods for port in pod.ports_of(spec)}
 
 
 def _left(

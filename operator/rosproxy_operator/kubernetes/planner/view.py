@@ -10,16 +10,14 @@ from typing import TypeVar
 import msgspec
 
 from rosproxy.telemetry.text import listed
-from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.planner.pods.selection import chosen, on_node
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, Stuck
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
-    ClusterSnapshot,
     Name,
     Pod,
     ProxyPlace,
-    ProxyPod,
     RosProxy,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.resources.names import is_own, proxy_id
 from rosproxy_operator.kubernetes.status.findings import finding
@@ -37,8 +35,8 @@ class View(msgspec.Struct, frozen=True):
     meant for, all proxies that hold ports, whosever they are. ``wanted`` are the places where pods
     want a proxy, and those pods; ``places`` those where a proxy is wanted or there, in order;
     ``taken`` all pods that a RosProxy has taken, wherever they are. ``strangers`` are, by node, the
-    other pods on it that hold ports, ``others`` the names of all that are no proxies. ``findings``
-    are those about pods.
+    other pods on it that hold ports, ``others`` the names of all that are no proxies, ``names``
+    those of all proxies. ``findings`` are those about pods.
     """
 
     observed: ClusterSnapshot
@@ -52,6 +50,7 @@ class View(msgspec.Struct, frozen=True):
     taken: Mapping[Name, tuple[Pod, ...]]
     strangers: Mapping[str, tuple[Pod, ...]]
     others: frozenset[Name]
+    names: frozenset[Name]
     findings: tuple[ClusterFinding, ...]
 
 
@@ -77,7 +76,7 @@ def view(observed: ClusterSnapshot) -> View:
     proxies = grouped((place_of(one), one) for one in observed.proxies if _owned(one, rosproxies))
     unusable = {one.uid for one in observed.unusable.values()}
     orphans = (one for one in observed.proxies if not _owned(one, rosproxies))
-    own = {one.pod.uid for one in observed.proxies}
+    own = {one.pod.uid for one in observed.proxies} | {ear.pod.uid for ear in observed.ears}
     others = {pod.uid: pod for pod in observed.pods if pod.uid not in own}.values()
     taken, findings = _taken(observed, rosproxies)
     wanted, left_out = _wanted(observed, rosproxies, taken)
@@ -97,9 +96,10 @@ def view(observed: ClusterSnapshot) -> View:
         places=grouped((place.of, place) for place in sorted({*wanted, *proxies})),
         taken=taken,
         strangers=grouped(
-            (pod.node, pod) for pod in others if pod.node and pod.host_ports and not pod.ended
+            (pod.node, pod) for pod in others if pod.node and pod.every_port and not pod.ended
         ),
         others=frozenset(pod.id for pod in others),
+        names=frozenset(one.pod.id for one in observed.proxies),
         findings=(*findings, *left_out),
     )
 

@@ -58,6 +58,10 @@ class Field(msgspec.Struct, frozen=True):
         """A text."""
         return self._of(str, default, "a text, in quotes")
 
+    def truth(self) -> bool:
+        """True or false, which is the default."""
+        return self._of(bool, False, "true or false")
+
     def number(self, default: N, least: int, most: int) -> N:
         """A number of the type that the default has, within bounds."""
         if self.value is None:

@@ -1,4 +1,7 @@
-"""What the operator sees in a Kubernetes cluster, in Kubernetes' words."""
+"""What users and the cluster have: RosProxies, nodes and pods, in Kubernetes' words.
+
+What the operator has made of it is in `cluster`.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -62,6 +65,19 @@ class MasterSpec(msgspec.Struct, frozen=True):
     publish: int = 0
 
 
+class Ros2Spec(msgspec.Struct, frozen=True):
+    """What it asks for of ROS 2. ``domain`` None is 0, pods are not told it; ``peers``: hosts."""
+
+    domain: int | None = None
+    peers: tuple[str, ...] = ()
+    multicast: bool = False
+
+    @property
+    def number(self) -> int:
+        """The domain."""
+        return self.domain or 0
+
+
 class Advertise(Enum):
     """Which of a node's addresses outside is told (``status.addresses[].type``)."""
 
@@ -76,7 +92,8 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     ``pod_selector`` None means: the pods whose label rosproxy.io/inject is "true" or the
     RosProxy's name. ``cleanup_after`` and ``grace`` are in seconds. ``image`` empty means the
     operator's default. ``policy`` is one layer or none. ``resources``, ``tolerations``,
-    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are.
+    ``host_aliases`` and ``image_pull_secrets`` go into the pods as they are. It is for ROS 1 if
+    ``ros1`` is set (``master`` says nothing otherwise), for ROS 2 if ``ros2`` is there.
     """
 
     master: MasterSpec
@@ -93,18 +110,32 @@ class RosProxySpec(msgspec.Struct, frozen=True):
     data_plane: DataPlane = "auto"
     direction: Direction = "out"
     pod_egress: PodEgress = "any"
+    udp: bool = False
     image: str = ""
     image_pull_policy: str = ""
     image_pull_secrets: tuple[Json, ...] = ()
     resources: Json = {}
     host_aliases: tuple[Json, ...] = ()
+    ros1: bool = True
+    ros2: Ros2Spec | None = None
+
+    @property
+    def multicast(self) -> bool:
+        """Whether each proxy has an ear, at the last port of its range."""
+        return self.ros2 is not None and self.ros2.multicast
+
+    @property
+    def takes_udp(self) -> bool:
+        """Whether its proxies take UDP ports of their nodes: for DDS, or for UDPROS."""
+        return self.ros2 is not None or self.udp
 
 
 class RosProxy(msgspec.Struct, frozen=True):
     """A RosProxy, the custom resource.
 
     ``former`` are the ranges by node name that its status holds; ``cluster_ip`` is the address
-    that its Service has, or had; ``status`` is its status as it is now.
+    that its Service has, or had; ``status`` is its status as it is now. ``remakes``: whether pods
+    that came by unwired are to be made anew.
     """
 
     id: Name
@@ -115,6 +146,7 @@ class RosProxy(msgspec.Struct, frozen=True):
     cluster_ip: str = ""
     status: Json = {}
     deleting: bool = False
+    remakes: bool = False
 
 
 class ClusterNode(msgspec.Struct, frozen=True):
@@ -137,13 +169,21 @@ ELSEWHERE = "$()"
 """Stands for a value that is only known once the container runs."""
 
 
+class PodContainer(msgspec.Struct, frozen=True):
+    """A container of a pod: its image, and those of its variables that matter to ROS 2."""
+
+    image: str = ""
+    variables: Mapping[str, str] = {}
+
+
 class Pod(msgspec.Struct, frozen=True):
     """A pod. ``node`` and ``ip`` are empty until it has them; ``ips`` are all of its addresses.
 
     ``host_ports`` are the TCP ports that its containers take on the node. ``own_masters`` are
     the ROS_MASTER_URIs that its template sets itself, so that the webhook left them alone; one that
     is not a plain text (from a ConfigMap, for one) is `ELSEWHERE`. ``wired`` is the one that the
-    webhook has set, empty if it has not.
+    webhook has set, empty if it has not; ``static_peers`` the same of ROS_STATIC_PEERS.
+    ``udp_ports`` are the UDP ports that it takes, ``controller`` is the kind of what made it.
     """
 
     id: Name
@@ -158,111 +198,25 @@ class Pod(msgspec.Struct, frozen=True):
     own_masters: tuple[str, ...] = ()
     wired: str = ""
     ips: tuple[str, ...] = ()
+    udp_ports: frozenset[int] = frozenset()
+    static_peers: str = ""
+    containers: tuple[PodContainer, ...] = ()
+    controller: str = ""
+
+    @property
+    def every_port(self) -> frozenset[int]:
+        """The ports that it takes, by either protocol."""
+        return self.host_ports | self.udp_ports
+
+    def ports_of(self, spec: RosProxySpec) -> frozenset[int]:
+        """Those that a RosProxy can't have: by the protocols that it takes ports of."""
+        tcp = self.host_ports if spec.ros1 else frozenset[int]()
+        return tcp | self.udp_ports if spec.takes_udp else tcp
 
     @property
     def ended(self) -> bool:
         """Whether it has run to its end: it holds no ports any more."""
         return self.phase in ("Succeeded", "Failed")
-
-
-class Stuck(Enum):
-    """Why a proxy's pod does not run."""
-
-    PORTS = "ports"  # one of its hostPorts is taken
-    SCHEDULING = "scheduling"  # the scheduler or the kubelet does not admit it for another reason
-    IMAGE = "image"
-    CRASHING = "crashing"
-    SANDBOX = "sandbox"  # the kubelet can't set it up
-
-
-class ProxyPod(msgspec.Struct, frozen=True):
-    """A pod of the operator in which a proxy runs, or is to run.
-
-    ``of`` and ``owner`` are the name and uid of its RosProxy, ``on`` the node that it is meant for
-    (``pod.node`` may still be empty). ``image`` is what its spec names. ``stuck`` and ``message``
-    say why it does not run, in the words of the scheduler or the kubelet; ``ready`` is its
-    condition Ready. ``restarts`` counts those of its container. ``token`` is that of its admin
-    endpoint where it stands in the pod, as former operators wrote it.
-    """
-
-    pod: Pod
-    of: Name
-    owner: str
-    on: str
-    range: PortRange
-    fingerprint: str
-    image: str
-    token: str = ""
-    ready: bool = False
-    stuck: Stuck | None = None
-    message: str = ""
-    restarts: int = 0
-
-
-class ProxyService(msgspec.Struct, frozen=True):
-    """A Service of the operator: under its address pods find the proxy on their node."""
-
-    of: Name
-    owner: str
-    uid: str
-    cluster_ip: str
-    fingerprint: str
-    deleting: bool = False
-
-
-class ProxyPolicy(msgspec.Struct, frozen=True):
-    """A NetworkPolicy of the operator, for the proxies of a RosProxy or for its pods."""
-
-    id: Name
-    of: Name
-    owner: str
-    uid: str
-    spec: Json
-    deleting: bool = False
-
-
-class ProxyReport(msgspec.Struct, frozen=True):
-    """What a proxy says of itself (``/status``), as far as it matters here.
-
-    ``nodes`` are the names of the ROS nodes behind it, by their pod's IP; ``problems`` what it
-    warns of; ``error`` is why its master is not reached, or why the proxy itself does not answer;
-    ``refusal`` why it does not take its policy.
-    """
-
-    answered: bool
-    master_up: bool = False
-    error: str = ""
-    nodes: Mapping[str, tuple[str, ...]] = {}
-    topics: frozenset[str] = frozenset()
-    problems: tuple[str, ...] = ()
-    refusal: str = ""
-
-
-class Obstacle(msgspec.Struct, frozen=True):
-    """What keeps a proxy from being made or changed, told with the node's name before it.
-
-    ``reason`` is the same in one CamelCase word.
-    """
-
-    reason: str
-    text: str
-
-
-class NodeState(msgspec.Struct, frozen=True):
-    """What one RosProxy has on one node, and what it gets there: a line of its status.
-
-    ``pods`` are the selected ones that are neither ended nor being deleted; a node without any is
-    told for its ``range``, so that it gets the same again. ``range`` is None if there is none to be
-    had. ``proxy`` is the pod that serves the node, None where there is none yet or any more.
-    """
-
-    name: str
-    advertise_host: str
-    range: PortRange | None
-    proxy: ProxyPod | None = None
-    pods: tuple[Pod, ...] = ()
-    answer: ProxyReport | None = None
-    obstacle: Obstacle | None = None
 
 
 class Reference(msgspec.Struct, frozen=True):
@@ -298,34 +252,3 @@ class InvalidRosProxy(msgspec.Struct, frozen=True):
     text: str
     status: Json = {}
     reason: str = "Invalid"
-
-
-class ClusterSnapshot(msgspec.Struct, frozen=True):
-    """A cluster at one moment, as far as it matters.
-
-    ``pods`` are those that a RosProxy selects, and all others on the nodes where those run.
-    ``masters`` gives, for each Service that a RosProxy names as its master, its address and what is
-    wrong; one of them is empty. ``consents`` gives, for the same, the namespaces whose RosProxies
-    may name it, besides its own. ``selected`` are the uids of the pods that a RosProxy selects.
-    ``policies`` are the operator's own NetworkPolicies by their names; ``no_policies`` is why they
-    can't be listed. ``key`` is that from which the proxies' tokens are made.
-    ``unusable`` are the RosProxies that can't be read at all: what they have is left as it is.
-    ``reports`` are what the proxies say of themselves, by the uid of the pod; ``failures`` are, by
-    RosProxy and object, what the API server said of the actions that failed at the last try:
-    neither is listed, the operator puts them here.
-    """
-
-    rosproxies: tuple[RosProxy, ...] = ()
-    nodes: Mapping[str, ClusterNode] = {}
-    pods: tuple[Pod, ...] = ()
-    proxies: tuple[ProxyPod, ...] = ()
-    services: Mapping[Name, ProxyService] = {}
-    masters: Mapping[Name, tuple[str, str]] = {}
-    consents: Mapping[Name, frozenset[str]] = {}
-    selected: frozenset[str] = frozenset()
-    policies: Mapping[Name, ProxyPolicy] = {}
-    no_policies: str = ""
-    key: bytes = b""
-    reports: Mapping[str, ProxyReport] = {}
-    unusable: Mapping[Name, InvalidRosProxy] = {}
-    failures: Mapping[Name, Mapping[Name, str]] = {}

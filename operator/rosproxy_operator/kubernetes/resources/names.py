@@ -4,6 +4,7 @@ import hashlib
 import hmac
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 
 from rosproxy_operator.kubernetes.resources.model import Name
 
@@ -27,15 +28,20 @@ MASTER_URI = "rosproxy.io/master-uri"
 ALLOW_FROM = "rosproxy.io/allow-from"
 """Annotation of masters' Services: namespaces whose RosProxies may name them."""
 
+STATIC_PEERS = "rosproxy.io/static-peers"
+"""Annotation of users' pods: the ROS_STATIC_PEERS that the webhook has set."""
+
+REMAKE = "rosproxy.io/remake-unwired"
+"""Annotation of RosProxies: "true" has pods made anew that came by unwired."""
+
 NAME_LABEL = "app.kubernetes.io/name"
 COMPONENT_LABEL = "app.kubernetes.io/component"
 MANAGED_BY_LABEL = "app.kubernetes.io/managed-by"
-_OWN = {
-    NAME_LABEL: "rosproxy",
-    COMPONENT_LABEL: "proxy",
-    MANAGED_BY_LABEL: "rosproxy-operator",
-}
-OWN_SELECTOR = ",".join(f"{label}={value}" for label, value in _OWN.items())
+PROXY, EAR = "proxy", "ear"
+"""What is made for a RosProxy, by the component label."""
+_OWN = {NAME_LABEL: "rosproxy", MANAGED_BY_LABEL: "rosproxy-operator"}
+_EITHER = f"{COMPONENT_LABEL} in ({EAR},{PROXY})"
+OWN_SELECTOR = ",".join([*(f"{label}={value}" for label, value in _OWN.items()), _EITHER])
 """Label selector, in the API's words, of everything that the operator makes."""
 
 MASTER_PORT = 11311
@@ -53,14 +59,20 @@ _LONGEST = 63
 _SLUG = 30
 
 
-def own_labels(of: str) -> dict[str, str]:
+def own_labels(of: str, component: str = PROXY) -> dict[str, str]:
     """The labels of a proxy's pod and of the Service of the RosProxy that is called ``of``."""
-    return {**_OWN, PROXY_OF: of}
+    return {**_OWN, COMPONENT_LABEL: component, PROXY_OF: of}
 
 
 def is_own(labels: Mapping[str, str]) -> bool:
     """Whether labels are those that the operator gives to what it makes."""
-    return all(labels.get(label) == value for label, value in _OWN.items()) and PROXY_OF in labels
+    same = all(labels.get(label) == value for label, value in _OWN.items())
+    return same and labels.get(COMPONENT_LABEL) in (PROXY, EAR) and PROXY_OF in labels
+
+
+def is_ear(labels: Mapping[str, str]) -> bool:
+    """Whether they are those of an ear."""
+    return is_own(labels) and labels[COMPONENT_LABEL] == EAR
 
 
 def service_id(of: Name) -> Name:
@@ -68,6 +80,7 @@ def service_id(of: Name) -> Name:
     return Name(of.namespace, f"{_PREFIX}{of.name}")
 
 
+@lru_cache(maxsize=8192)
 def proxy_id(of: Name, node: str) -> Name:
     """The name of a RosProxy's pod on a node, always the same, so that there are never two."""
     digest = hashlib.sha256(f"{of.name} {node}".encode()).hexdigest()[:_DIGITS]
@@ -75,6 +88,12 @@ def proxy_id(of: Name, node: str) -> Name:
     slug = re.sub(r"[^a-z0-9]+", "-", node.lower())[: max(room, 0)].strip("-")
     parts = (f"{_PREFIX}{of.name}", slug, digest)
     return Name(of.namespace, "-".join(part for part in parts if part))
+
+
+def ear_id(of: Name, node: str) -> Name:
+    """The name of the pod in which the ear of a RosProxy's proxy on a node runs."""
+    proxy = proxy_id(of, node)
+    return Name(proxy.namespace, f"{proxy.name}-ear")
 
 
 def policy_id(of: Name) -> Name:

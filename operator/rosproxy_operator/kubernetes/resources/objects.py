@@ -7,15 +7,20 @@ is missing is as if it were empty.
 from collections.abc import Iterator
 
 from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.cluster import (
+    EarPod,
+    MasterService,
+    ProxyPod,
+    ProxyPolicy,
+    ProxyService,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ELSEWHERE,
     ClusterNode,
     Json,
     Name,
     Pod,
-    ProxyPod,
-    ProxyPolicy,
-    ProxyService,
+    PodContainer,
 )
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck
 from rosproxy_operator.kubernetes.resources.values import (
@@ -29,6 +34,17 @@ from rosproxy_operator.kubernetes.resources.values import (
 )
 
 VARIABLE = "ROS_MASTER_URI"
+ROS2_VARIABLES = frozenset(
+    {
+        "ROS_STATIC_PEERS",
+        "ROS_DOMAIN_ID",
+        "ROS_DISTRO",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "RMW_IMPLEMENTATION",
+    }
+)
+"""Those by which it is told what a pod can't have of ROS 2."""
 
 
 def node(obj: Json) -> ClusterNode:
@@ -58,12 +74,16 @@ def pod(obj: Json) -> Pod:
         node=word(spec, "nodeName"),
         phase=word(status, "phase") or "Pending",
         ip=word(status, "podIP"),
-        host_ports=frozenset(_host_ports(spec)),
+        host_ports=frozenset(_host_ports(spec, "TCP")),
+        udp_ports=frozenset(_host_ports(spec, "UDP")),
         host_network=spec.get("hostNetwork") is True,
         deleting=is_deleted(meta),
         own_masters=tuple(uri for uri in _masters(spec) if not wired or uri != wired),
         wired=wired,
+        static_peers=word(part(meta, "annotations"), names.STATIC_PEERS),
+        containers=tuple(map(_container, parts(spec, "containers"))),
         ips=tuple(filter(None, (word(one, "ip") for one in parts(status, "podIPs")))),
+        controller=_controller(meta),
     )
 
 
@@ -75,7 +95,9 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     container = next((one for one in containers if one.get("name") == names.CONTAINER), None)
     ports = port_range(notes, names.PORT_RANGE)
     on, owner = notes.get(names.NODE, ""), _owner(meta)
-    if not names.is_own(labels) or ports is None or not (on and owner and container):
+    if not names.is_own(labels) or names.is_ear(labels):
+        return None
+    if ports is None or not (on and owner and container):
         return None
     reason, message = stuck(status)
     variables = {word(one, "name"): word(one, "value") for one in parts(container, "env")}
@@ -95,6 +117,28 @@ def proxy_pod(obj: Json) -> ProxyPod | None:
     )
 
 
+def ear_pod(obj: Json) -> EarPod | None:
+    """An ear's pod; None if the object is not one that this operator made, or not whole."""
+    meta, status = part(obj, "metadata"), part(obj, "status")
+    labels, notes = words(meta, "labels"), words(meta, "annotations")
+    container = next(iter(parts(part(obj, "spec"), "containers")), {})
+    on, owner = notes.get(names.NODE, ""), _owner(meta)
+    if not names.is_ear(labels) or not (on and owner):
+        return None
+    reason, message = stuck(status)
+    return EarPod(
+        pod=pod(obj),
+        of=Name(word(meta, "namespace"), labels[names.PROXY_OF]),
+        owner=owner,
+        on=on,
+        fingerprint=notes.get(names.FINGERPRINT, ""),
+        image=word(container, "image"),
+        ready=_is_ready(status),
+        stuck=reason,
+        message=message,
+    )
+
+
 def service(obj: Json) -> ProxyService | None:
     """A Service; None if the object is not one that this operator made."""
     meta, address = part(obj, "metadata"), word(part(obj, "spec"), "clusterIP")
@@ -109,6 +153,18 @@ def service(obj: Json) -> ProxyService | None:
         cluster_ip="" if address == "None" else address,
         fingerprint=word(part(meta, "annotations"), names.FINGERPRINT),
         deleting=is_deleted(meta),
+    )
+
+
+def master_service(obj: Json) -> MasterService:
+    """A Service, as far as a master's matters."""
+    spec, ports = part(obj, "spec"), parts(part(obj, "spec"), "ports")
+    return MasterService(
+        id=name_of(part(obj, "metadata")),
+        address=word(spec, "clusterIP"),
+        type=word(spec, "type"),
+        ports=frozenset(number(one, "port") for one in ports),
+        allowed=allowed_from(obj),
     )
 
 
@@ -147,7 +203,17 @@ def _is_ready(status: Json) -> bool:
     return any(one.get("type") == "Ready" and one.get("status") == "True" for one in conditions)
 
 
-def _host_ports(spec: Json) -> Iterator[int]:
+def _container(obj: Json) -> PodContainer:
+    """What a container's own variables and its image say of ROS 2."""
+    variables = {
+        name: ELSEWHERE if one.get("valueFrom") is not None else word(one, "value")
+        for one in parts(obj, "env")
+        if (name := word(one, "name")) in ROS2_VARIABLES
+    }
+    return PodContainer(word(obj, "image"), variables)
+
+
+def _host_ports(spec: Json, protocol: str) -> Iterator[int]:
     """Those of containers that run all the time, as the scheduler counts them.
 
     That is ``GetHostPorts`` in k8s.io/kubernetes, pkg/scheduler/util/utils.go.
@@ -156,7 +222,7 @@ def _host_ports(spec: Json) -> Iterator[int]:
     lasting = (one for one in inits if one.get("restartPolicy") == "Always")
     for container in (*parts(spec, "containers"), *lasting):
         for port in parts(container, "ports"):
-            if port.get("protocol", "TCP") == "TCP" and (taken := number(port, "hostPort")):
+            if port.get("protocol", "TCP") == protocol and (taken := number(port, "hostPort")):
                 yield taken
 
 
@@ -167,6 +233,12 @@ def _masters(spec: Json) -> Iterator[str]:
                 value = word(variable, "value")
                 later = variable.get("valueFrom") is not None or "$(" in value
                 yield ELSEWHERE if later else value
+
+
+def _controller(meta: Json) -> str:
+    """The kind of the controller that made an object; empty if none did."""
+    owners = parts(meta, "ownerReferences")
+    return next((word(one, "kind") for one in owners if one.get("controller") is True), "")
 
 
 def _owner(meta: Json) -> str:

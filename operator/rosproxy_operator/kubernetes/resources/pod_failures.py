@@ -7,8 +7,9 @@ import re
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
-from rosproxy_operator.kubernetes.resources.model import Json, Stuck
-from rosproxy_operator.kubernetes.resources.names import CONTAINER
+from rosproxy_operator.kubernetes.resources.cluster import Stuck
+from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.names import CONTAINER, EAR
 from rosproxy_operator.kubernetes.resources.values import number, part, parts, word
 
 PORTS_TAKEN = "didn't have free ports for the requested pod ports"
@@ -66,7 +67,7 @@ def stuck(status: Json) -> tuple[Stuck | None, str]:
         if one.get("type") == "PodScheduled" and one.get("status") == "False":
             return _unscheduled(word(one, "reason"), word(one, "message"))
     for container in parts(status, "containerStatuses"):
-        if container.get("name") == CONTAINER:
+        if container.get("name") in (CONTAINER, EAR):
             return _waiting(container)
     return None, ""
 

@@ -28,8 +28,9 @@ from rosproxy_operator.kubernetes.resources.model import (
     RosProxySpec,
     Selector,
 )
-from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, service_id
+from rosproxy_operator.kubernetes.resources.names import MASTER_PORT, REMAKE, service_id
 from rosproxy_operator.kubernetes.resources.objects import is_deleted, name_of
+from rosproxy_operator.kubernetes.resources.ros2_spec import check_ports, ros2_spec, versions
 from rosproxy_operator.kubernetes.resources.values import (
     is_label,
     is_label_key,
@@ -40,6 +41,7 @@ from rosproxy_operator.kubernetes.resources.values import (
     parts,
     port_range,
     word,
+    words,
 )
 
 MOST_PORTS = 500
@@ -99,6 +101,7 @@ def rosproxy(obj: Json) -> RosProxy:
     """A RosProxy. Raises InvalidField."""
     meta, status = part(obj, "metadata"), part(obj, "status")
     id, where = name_of(meta), parse_slave_uri(word(status, "masterURI"))
+    address = where.host if where else word(status, "staticPeers")
     if not is_label(id.name) or len(id.name) > MOST_NAME:
         fix = f"a RosProxy's name has at most {MOST_NAME} characters a-z, 0-9 and -"
         raise Field("metadata.name", id.name).refused("does not fit", fix)
@@ -108,9 +111,10 @@ def rosproxy(obj: Json) -> RosProxy:
         generation=number(meta, "generation"),
         spec=_spec(Field("spec", bare(obj.get("spec"))), id),
         former=_former(status),
-        cluster_ip=where.host if where and is_address(where.host) else "",
+        cluster_ip=address if is_address(address) else "",
         status=status,
         deleting=is_deleted(meta),
+        remakes=words(meta, "annotations").get(REMAKE) == "true",
     )
 
 
@@ -122,9 +126,16 @@ def invalid(obj: Json, error: InvalidField) -> InvalidRosProxy:
 
 
 def _spec(given: Field, of: Name) -> RosProxySpec:
-    ports = given["ports"].number(32, 1, MOST_PORTS)
+    ports, for_ros = given["ports"].number(32, 1, MOST_PORTS), versions(given["ros"])
+    for name in ("master", "udp"):
+        if "1" not in for_ros and given[name].value not in (None, False):
+            raise given[name].refused("is for ROS 1, which spec.ros leaves out", "leave it out")
+    ros2 = ros2_spec(given, "2" in for_ros)
+    check_ports(given["ports"], ports, ros2)
     return RosProxySpec(
-        master=_master(given["master"], of),
+        ros1="1" in for_ros,
+        ros2=ros2,
+        master=_master(given["master"], of) if "1" in for_ros else MasterSpec(),
         ports=ports,
         window=_window(given["portWindow"], ports),
         pod_selector=_selector(given["podSelector"]),
@@ -138,6 +149,7 @@ def _spec(given: Field, of: Name) -> RosProxySpec:
         data_plane=given["dataPlane"].one_of(_DATA_PLANE, "Auto"),
         direction=given["direction"].one_of(_DIRECTION, "Out"),
         pod_egress=_pod_egress(given),
+        udp=_udp(given),
         image=given["image"].text(),
         image_pull_policy=given["imagePullPolicy"].one_of(_PULL_POLICY, ""),
         image_pull_secrets=tuple(one.map() for one in given["imagePullSecrets"].each()),
@@ -151,6 +163,14 @@ def _pod_egress(given: Field) -> PodEgress:
     if found == "proxy" and direction.one_of(_DIRECTION, "Out") == "out":
         fix = "the pods would hear nobody outside: choose spec.direction: Both, too"
         raise given["podEgress"].refused("does not go with spec.direction: Out", fix)
+    return found
+
+
+def _udp(given: Field) -> bool:
+    found = given["udp"].truth()
+    if found and given["direction"].one_of(_DIRECTION, "Out") == "out":
+        fix = "datagrams get in with both directions alone: choose spec.direction: Both, too"
+        raise given["udp"].refused("does not go with spec.direction: Out", fix)
     return found
 
 

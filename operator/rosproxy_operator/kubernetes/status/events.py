@@ -8,9 +8,12 @@ import msgspec
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreateEar,
     CreateProxy,
+    DeleteEar,
     DeleteProxy,
     Emit,
+    EvictPod,
     SetImage,
 )
 from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Json, Reference, RosProxy
@@ -21,12 +24,20 @@ QUIET = 60.0
 """Seconds that a problem must have been away before it is told again."""
 MOST = 50
 """Warnings that are made at once; the others have their turn at the next look."""
+MOST_RESULTS = 20
+"""Events of one kind about what is done to a RosProxy's proxies at once; one more sums up."""
 LONGEST = 1024
 """Bytes of an Event's message."""
 COUNT_EVERY = 60.0
 """Seconds in which the same Event is counted once at most."""
 _COMPONENT = "rosproxy-operator"
 _LONGEST_NAME = 200
+_ENDED: Mapping[type, tuple[str, str]] = {
+    DeleteProxy: ("ProxyDeleted", "deleted"),
+    DeleteEar: ("EarDeleted", "deleted"),
+    EvictPod: ("PodEvicted", "evicted"),
+}
+"""Reason and verb of the Events about what goes."""
 
 
 class NewEvents(msgspec.Struct, frozen=True):
@@ -58,18 +69,33 @@ def warnings(
 def results(rosproxy: RosProxy, actions: Iterable[Action]) -> Iterator[Emit]:
     """Normal Events for what is done to a RosProxy's proxies, to be made once it was done."""
     of = Reference(KIND, rosproxy.id, rosproxy.uid)
-    for action in actions:
-        match action:
-            case CreateProxy(body={"metadata": {"name": name, "annotations": notes}}):
-                where = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
-                reason, text = "ProxyCreated", f"created pod {name} {where}"
-            case SetImage(id=id, image=image):
-                reason, text = "ImageSet", f"gave pod {id.name} the image {image}"
-            case DeleteProxy(id=id, why=why):
-                reason, text = "ProxyDeleted", f"deleted pod {id.name}: {why}"
-            case _:
-                continue
-        yield Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
+    texts: dict[str, list[str]] = {}
+    for reason, text in map(_result, actions):
+        texts.setdefault(reason, []).append(text)
+    texts.pop("", None)
+    for reason, told in texts.items():
+        for text in told[:MOST_RESULTS]:
+            yield Emit(rosproxy.id, of, "Normal", reason, _bounded(text))
+        if len(told) > MOST_RESULTS:
+            text = f"and {len(told) - MOST_RESULTS} more at once, which the operator's log names"
+            yield Emit(rosproxy.id, of, "Normal", reason, text)
+
+
+def _result(action: Action) -> tuple[str, str]:
+    """The reason and the text of an Event about an action; empty if there is to be none."""
+    match action:
+        case CreateProxy(body={"metadata": {"name": name, "annotations": notes}}):
+            where = f"on node {notes[NODE]} with ports {notes[PORT_RANGE]}"
+            return "ProxyCreated", f"created pod {name} {where}"
+        case SetImage(id=id, image=image):
+            return "ImageSet", f"gave pod {id.name} the image {image}"
+        case DeleteProxy(id=id, why=why) | DeleteEar(id=id, why=why) | EvictPod(id=id, why=why):
+            reason, verb = _ENDED[type(action)]
+            return reason, f"{verb} pod {id.name}: {why}"
+        case CreateEar(body={"metadata": {"name": name, "annotations": notes}}):
+            return "EarCreated", f"created pod {name} on node {notes[NODE]}"
+        case _:
+            return "", ""
 
 
 def event_body(event: Emit, now: float) -> Json:

@@ -7,16 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from rosproxy.telemetry.text import clean
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.kubernetes.resources.cluster import EarPod, NodeState, ProxyPod, Stuck
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
     Name,
-    NodeState,
     Pod,
-    ProxyPod,
     Reference,
     RosProxy,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.resources.names import ADMIN_PORT, KIND
 
@@ -50,6 +48,8 @@ def of_node(rosproxy: RosProxy, state: NodeState) -> Iterator[ClusterFinding]:
     """What is wrong on one node. What keeps it from being served comes first, and is fatal."""
     if state.obstacle is not None:
         yield _finding(rosproxy, f"node {state.name}", state.obstacle.text, state.obstacle.reason)
+    if state.ear is not None and state.ear.stuck is not None and not state.ear.pod.deleting:
+        yield _deaf(rosproxy, state.ear)
     proxy = state.proxy
     if proxy is None or proxy.pod.deleting:
         return
@@ -99,6 +99,16 @@ def _stuck(rosproxy: RosProxy, proxy: ProxyPod, why: Stuck) -> ClusterFinding:
     }
     reason = CONFLICT if why is Stuck.PORTS else STUCK
     return _finding(rosproxy, _subject(proxy), texts[why], reason)
+
+
+def _deaf(rosproxy: RosProxy, ear: EarPod) -> ClusterFinding:
+    id = ear.pod.id
+    text = (
+        f"it does not run ({ear.message}), so that the LAN is not heard: kubectl -n {id.namespace} "
+        f"describe pod {id.name}"
+    )
+    subject = f"ear {id.name} on node {ear.on}"
+    return finding(rosproxy, "EarStuck", bounded(text, _LONGEST), subject=subject)
 
 
 def _answered(rosproxy: RosProxy, state: NodeState, proxy: ProxyPod) -> Iterator[ClusterFinding]:
@@ -165,6 +175,8 @@ def _security_remedy(low: str, rosproxy: RosProxy) -> str:
         return "allow proxies NET_ADMIN in that namespace, or set spec.dataPlane: Auto"
     kernel = rosproxy.spec.data_plane == "kernel"
     takes = "hostPorts (and NET_ADMIN for spec.dataPlane: Kernel)" if kernel else "hostPorts"
+    if rosproxy.spec.multicast:
+        takes += ", its ear hostNetwork"
     return (
         f"a proxy takes {takes}, which needs Pod Security privileged: kubectl label namespace "
         f"{rosproxy.id.namespace} {_ENFORCE}=privileged --overwrite"

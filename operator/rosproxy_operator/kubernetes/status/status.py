@@ -8,14 +8,17 @@ import msgspec
 
 from rosproxy.telemetry.text import clean, plural, shorten
 from rosproxy_operator.common.problem import bounded
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    NodeState,
+    ProxyReport,
+    Stuck,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     InvalidRosProxy,
     Json,
-    NodeState,
-    ProxyReport,
     RosProxy,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.resources.names import INJECT, master_uri
 from rosproxy_operator.kubernetes.resources.values import number, parts, word
@@ -74,18 +77,20 @@ def status_of(
     lines = [_line(rosproxy, state, names) for state in shown]
     nodes = sum(number(line, "rosNodes") for line in lines)
     wanted = [state for state in states if state.pods]
+    spec, members = rosproxy.spec, sum(number(line, "participants") for line in lines)
+    served = [plural(nodes, "ROS node")] if spec.ros1 else []
+    if spec.ros2:
+        served.append(f"{plural(members, 'participant')} of domain {spec.ros2.number}")
     judged = (
-        _ready(rosproxy, wanted, problems, nodes),
+        _ready(rosproxy, wanted, problems, " and ".join(served)),
         _allocated(wanted, problems),
-        _reached(states, problems, former),
+        *([_reached(states, problems, former)] if spec.ros1 else []),
         _degraded(problems),
     )
-    # The former one as long as there is no Service: it is to be had again.
-    uri = master_uri(cluster_ip) if cluster_ip else word(former, "masterURI")
     return {
         "observedGeneration": rosproxy.generation,
-        "master": master,
-        "masterURI": uri,
+        **_addressed(rosproxy, cluster_ip, master),
+        **({"domain": spec.ros2.number, "participants": members} if spec.ros2 else {}),
         "nodes": len(wanted),
         "proxies": f"{sum(map(_serving, wanted))}/{len(wanted)}",
         "rosNodes": nodes,
@@ -94,6 +99,31 @@ def status_of(
         "perNode": lines,
         "conditions": _conditions(judged, former, rosproxy.generation, stamp),
     }
+
+
+def participants(observed: ClusterSnapshot) -> dict[int, int]:
+    """How many participants there are behind the proxies, by domain."""
+    domains = {one.uid: one.spec.ros2.number for one in observed.rosproxies if one.spec.ros2}
+    counts = dict.fromkeys(domains.values(), 0)
+    for proxy in observed.proxies:
+        answer = observed.reports.get(proxy.pod.uid)
+        if answer is not None and proxy.owner in domains:
+            counts[domains[proxy.owner]] += sum(map(len, answer.participants.values()))
+    return counts
+
+
+def _addressed(of: RosProxy, cluster_ip: str, master: str) -> dict[str, object]:
+    """Under which address pods find their proxy, and the master, if there is one.
+
+    It is the former one as long as there is no Service: it is to be had again.
+    """
+    found: dict[str, object] = {}
+    if of.spec.ros1:
+        uri = master_uri(cluster_ip) if cluster_ip else word(of.status, "masterURI")
+        found = {"master": master, "masterURI": uri}
+    if of.spec.ros2:
+        found["staticPeers"] = cluster_ip or of.cluster_ip
+    return found
 
 
 def status_of_invalid(rosproxy: InvalidRosProxy, stamp: str) -> Json:
@@ -141,13 +171,17 @@ def _ros(state: NodeState, most: int, former: Json) -> dict[str, object]:
     if _has_answered(state.answer):
         names = sorted({name for found in state.answer.nodes.values() for name in found})
         shown = [shorten(clean(name), _NAME) for name in names[:most]]
-        return {"rosNodes": len(names), "names": shown, "topics": len(state.answer.topics)}
+        told = state.answer.participants
+        members = {"participants": sum(map(len, told.values()))} if told else {}
+        count = len(state.answer.topics)
+        return {"rosNodes": len(names), "names": shown, "topics": count, **members}
     lines = parts(former, "perNode") if state.proxy is not None else ()
     was = next((line for line in lines if line.get("name") == state.name), {})
     return {
         "rosNodes": number(was, "rosNodes"),
         "names": list(was.get("names") or ()),
         "topics": number(was, "topics"),
+        **({"participants": number(was, "participants")} if "participants" in was else {}),
     }
 
 
@@ -214,7 +248,7 @@ def _one_line(problem: ClusterFinding) -> str:
 
 
 def _ready(
-    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[ClusterFinding], nodes: int
+    rosproxy: RosProxy, wanted: Sequence[NodeState], problems: Sequence[ClusterFinding], served: str
 ) -> Condition:
     if not wanted:
         fix = "give pods the labels that spec.podSelector asks for"
@@ -223,7 +257,7 @@ def _ready(
         return Condition(READY, "True", _NO_PODS, f"no pod is selected: {fix}")
     waiting = [state for state in wanted if not _serving(state)]
     if not waiting:
-        text = f"{len(wanted)} of {len(wanted)} proxies serve {plural(nodes, 'ROS node')}"
+        text = f"{len(wanted)} of {len(wanted)} proxies serve {served}"
         return Condition(READY, "True", "Serving", text)
     blocking = [problem for problem in problems if problem.fatal and not _of_pod(problem)]
     if blocking:

@@ -16,13 +16,13 @@ from datetime import datetime
 
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import SOON, Api, ApiAway, ApiError, ApiGone
-from rosproxy_operator.kubernetes.planner.bounds import Consents, objection
-from rosproxy_operator.kubernetes.planner.injection import Wiring, wire
-from rosproxy_operator.kubernetes.planner.selection import chosen, nobody
+from rosproxy_operator.kubernetes.api.client import SOON, Api, ApiAway, ApiError, ApiGone
+from rosproxy_operator.kubernetes.planner.access.bounds import Consents, objection
+from rosproxy_operator.kubernetes.planner.pods.injection import Wiring, target_of, wire
+from rosproxy_operator.kubernetes.planner.pods.selection import chosen, nobody
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import Json, RosProxy
-from rosproxy_operator.kubernetes.resources.names import master_uri, service_id
+from rosproxy_operator.kubernetes.resources.names import service_id
 from rosproxy_operator.kubernetes.resources.spec import rosproxies
 from rosproxy_operator.kubernetes.settings import ClusterSettings
 
@@ -109,7 +109,7 @@ class Injector:
         of = chosen(pod, usable)
         if isinstance(of, RosProxy):
             address, hold = self._address(of, dry_run)
-            return wire(body, master_uri(address), of.spec.host_aliases), hold
+            return wire(body, target_of(of, address), of.spec.host_aliases), hold
         if of is not None:
             return Wiring(warnings=(NOT_WIRED + of.text,)), 0.0
         text = nobody(pod, usable)

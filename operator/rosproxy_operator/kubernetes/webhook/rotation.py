@@ -10,7 +10,7 @@ from pathlib import Path
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.problem import Problem, ProblemLog
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import (
+from rosproxy_operator.kubernetes.api.client import (
     WEBHOOKS,
     Api,
     ApiAway,
@@ -18,6 +18,7 @@ from rosproxy_operator.kubernetes.api import (
     ApiError,
     ApiGone,
     ApiInvalid,
+    NotLeading,
 )
 from rosproxy_operator.kubernetes.resources.model import Json, Name
 from rosproxy_operator.kubernetes.resources.values import part, parts, words
@@ -58,11 +59,16 @@ class CertificateDirectory:
             raise InvalidCertificate(f"--webhook-cert-dir {self._directory}: {error}") from None
 
 
+class NotMadeYet(Exception):
+    """There is no certificate, and it is for the operator that leads to make it."""
+
+
 class SelfSigned:
     """A certificate that is made here, kept in a Secret, its CA in the webhook's configuration.
 
     First a new CA is trusted, together with the one before, then its certificate is served; so
-    there is no moment at which an API server refuses what is served.
+    there is no moment at which an API server refuses what is served. Of several operators all serve
+    the one in the Secret; only one that ``leads`` writes.
     """
 
     every = EVERY
@@ -74,16 +80,21 @@ class SelfSigned:
         secret: Name | None,
         configuration: str,
         now: Callable[[], datetime] = certificates.now,
+        leads: Callable[[], bool] = lambda: True,
     ) -> None:
-        self._api, self._names, self._now = api, names, now
+        self._api, self._names, self._now, self._leads = api, names, now, leads
         self._secret, self._configuration = secret, configuration
         self._pair: KeyPair | None = None
+        self._unsaved: KeyPair | None = None
         self._serving: KeyPair | None = None
         self._trusted_at: datetime | None = None
         self.problems: list[Problem] = []
 
     def refresh(self) -> KeyPair:
-        """Renew it if it is due, and see to it that its CA is trusted. Raises ApiError."""
+        """Renew it if it is due, and see to it that its CA is trusted.
+
+        Raises ApiError, and NotMadeYet.
+        """
         self.problems = []
         now, self._pair = self._now(), self._kept()
         trusted = self._trust(self._pair.ca)
@@ -107,33 +118,51 @@ class SelfSigned:
         except ApiError as error:
             if self._pair is None and isinstance(error, ApiAway):
                 raise
-            self._complain(error)
+            if not isinstance(error, ApiAway):  # of that the operator's looks tell
+                self._complain(error)
         found = self._pair if there is None else self._read(there)
-        if found and not found.due(self._now()) and found.names() >= set(self._names):
+        if found and self._does(found):
+            self._unsaved = None
             return found
-        before = found or self._pair
-        pair = certificates.make(self._names, self._now(), before.ca if before else b"")
+        if not self._leads():
+            if found and found.expires > self._now():
+                return found
+            raise NotMadeYet
+        pair = self._made(found or self._pair)
         if self._secret and there is not None:
             self._put(self._secret, pair, there)
         return pair
+
+    def _made(self, before: KeyPair | None) -> KeyPair:
+        """A new pair, in place of one before, or the one that could not be written yet.
+
+        With another one each time, API servers would have to learn of a CA each time, and those
+        that are trusted would grow in number.
+        """
+        if self._unsaved is None or not self._does(self._unsaved):
+            trusted = before.ca if before else b""
+            self._unsaved = certificates.make(self._names, self._now(), trusted)
+            log.info("webhook: made a certificate that is valid until %s", self._unsaved.expires)
+        return self._unsaved
+
+    def _does(self, pair: KeyPair) -> bool:
+        """Whether a pair is for our names and has not lived too long."""
+        return not pair.due(self._now()) and pair.names() >= set(self._names)
 
     def _put(self, secret: Name, pair: KeyPair, there: Json) -> None:
         """Write a pair into the Secret. Whoever was faster has the right one."""
         try:
             self._api.fill_secret(secret, there, pair.secret())
         except (ApiInvalid, ApiConflict) as error:
+            self._unsaved = None
             raise ApiAway(f"somebody else writes {secret}: {error}") from None
+        except NotLeading:
+            raise
         except ApiError as error:
             self._complain(error)
-        log.info("webhook: made a certificate that is valid until %s", pair.expires)
 
     def _complain(self, error: ApiError) -> None:
-        """Tell that the Secret can't be used: the certificate is then this process's alone.
-
-        That the API server is away the operator's looks tell.
-        """
-        if isinstance(error, ApiAway):
-            return
+        """Tell that the Secret can't be used: the certificate is then this process's alone."""
         text = f"Secret {self._secret}: {error}; the certificate is kept in memory meanwhile"
         if isinstance(error, ApiGone):
             text += "; create an empty Secret of this name (the chart does)"
@@ -156,6 +185,8 @@ class SelfSigned:
         try:
             name = Name("", self._configuration)
             operations = _trust_patch(self._api.get(WEBHOOKS, name), authorities)
+            if operations and not self._leads():
+                return False
             if operations:
                 self._api.patch(WEBHOOKS, name, operations)
                 log.info("webhook: its CA is now in %s", self._configuration)
@@ -184,10 +215,15 @@ def _trust_patch(configuration: Json, authorities: bytes) -> list[Json]:
 
 
 class CertificateRotation:
-    """Holds the certificate that is to be served. `pair` may be read from any thread."""
+    """Holds the certificate that is to be served. `pair` may be read from any thread.
+
+    ``not_made_yet``: the operator that leads is yet to make it. One without a webhook, whose place
+    this one is about to take, never will.
+    """
 
     def __init__(self, source: CertificateDirectory | SelfSigned, metrics: ClusterMetrics) -> None:
         self.pair: KeyPair | None = None
+        self.not_made_yet = False
         self._source, self._metrics = source, metrics
         self._log = ProblemLog()
 
@@ -199,8 +235,11 @@ class CertificateRotation:
 
     async def refresh(self) -> None:
         """Check it once, and renew it if it is due."""
+        not_made_yet, problems = False, list[Problem]()
         try:
             pair = await in_thread(self._source.refresh)
+        except NotMadeYet:
+            not_made_yet = True
         except (ApiError, InvalidCertificate) as error:
             problems = [Problem(_SUBJECT, f"no certificate: {error}")]
         except Exception as error:  # a mistake of ours must not end the certificate
@@ -212,12 +251,15 @@ class CertificateRotation:
                 log.info("webhook: serving a certificate that is valid until %s", pair.expires)
             self.pair = pair
             self._metrics.certificate_expiry.set(pair.expires.timestamp())
+        self.not_made_yet = not_made_yet
         self._log.update(problems)
 
 
-def source(api: Api, settings: WebhookSettings) -> CertificateDirectory | SelfSigned:
+def source(
+    api: Api, settings: WebhookSettings, leads: Callable[[], bool]
+) -> CertificateDirectory | SelfSigned:
     """Where the certificate comes from, by the settings."""
     if settings.directory or settings.service is None:
         return CertificateDirectory(settings.directory)
     names = certificates.service_names(settings.service.namespace, settings.service.name)
-    return SelfSigned(api, names, settings.secret, settings.configuration)
+    return SelfSigned(api, names, settings.secret, settings.configuration, leads=leads)

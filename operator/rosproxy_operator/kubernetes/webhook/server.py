@@ -38,6 +38,20 @@ class WebhookServer:
 
     def __init__(self, bind: HostPort, rotation: CertificateRotation) -> None:
         self._bind, self._rotation = bind, rotation
+        self._serving, self._draining = False, False
+
+    def unready(self) -> str | None:
+        """Why pods are not wired here; None if they are. May be asked from any thread.
+
+        As long as there is no certificate nobody wires any, and whoever leads may have to go first.
+        """
+        if self._serving or self._rotation.not_made_yet:
+            return None
+        return "the webhook is not served yet"
+
+    def drain(self) -> None:
+        """Let API servers open no more than one request on each connection: it ends soon."""
+        self._draining = True
 
     async def __call__(self, fn: kopf.WebhookFn) -> AsyncIterator[kopf.WebhookClientConfig]:
         """Serve until cancelled."""
@@ -46,16 +60,24 @@ class WebhookServer:
         while (pair := self._rotation.pair) is None:  # noqa: ASYNC110 - set in another thread
             await asyncio.sleep(CHECK)
         certificates.load(context, pair)
-        runner = web.AppRunner(_application(fn), access_log=None, shutdown_timeout=ENDING)
+        application = _application(fn)
+        application.on_response_prepare.append(self._prepare)
+        runner = web.AppRunner(application, access_log=None, shutdown_timeout=ENDING)
         await runner.setup()
         try:
             bind = self._bind
             await web.TCPSite(runner, bind.host, bind.port, ssl_context=context).start()
             log.info("wiring pods at https://%s", bind)
+            self._serving = True
             yield kopf.WebhookClientConfig(url=f"https://{bind}")
             await self._keep(context, pair)
         finally:
+            self._serving = False
             await runner.cleanup()
+
+    async def _prepare(self, _: web.Request, response: web.StreamResponse) -> None:
+        if self._draining:
+            response.force_close()
 
     async def _keep(self, context: ssl.SSLContext, served: KeyPair) -> None:
         """Serve another certificate as soon as there is one."""

@@ -8,6 +8,7 @@ import copy
 import itertools
 import json
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -26,11 +27,13 @@ PLURALS = {
     "secrets": "Secret",
     "rosproxies": "RosProxy",
     "networkpolicies": "NetworkPolicy",
+    "leases": "Lease",
     "mutatingwebhookconfigurations": "MutatingWebhookConfiguration",
 }
 GROUPS = {
     "rosproxies": "rosproxy.io/v1alpha1",
     "networkpolicies": "networking.k8s.io/v1",
+    "leases": "coordination.k8s.io/v1",
     "mutatingwebhookconfigurations": "admissionregistration.k8s.io/v1",
 }
 
@@ -43,10 +46,13 @@ class ApiServer:
         self.requests: list[tuple[str, str, dict[str, str]]] = []
         self.bodies: list[Any] = []
         self.refusals: dict[tuple[str, str], tuple[int, str]] = {}
+        self.held = Counter[str]()  # how often addresses are refused
         self.gone_for_watches = False
+        self.retry_after = ""
         self.url = ""
         self._numbers = itertools.count(1)
         self._watches: list[tuple[str, str, asyncio.Queue[Object]]] = []
+        self._past: list[tuple[int, str, str, Object]] = []
 
     def put(self, kind: str, obj: Object, namespace: str = "ns") -> Object:
         """Hold an object, and tell those who watch."""
@@ -63,6 +69,10 @@ class ApiServer:
         """Lose an object, and tell those who watch."""
         key = kind, "" if kind == "nodes" else namespace, name
         self._hold("DELETED", key, self.objects[key])
+
+    def forget(self, kind: str, name: str, namespace: str = "ns") -> None:
+        """Lose an object, and tell nobody."""
+        del self.objects[kind, "" if kind == "nodes" else namespace, name]
 
     def get(self, kind: str, name: str, namespace: str = "ns") -> Object:
         return self.objects[kind, namespace, name]
@@ -82,9 +92,11 @@ class ApiServer:
         self.objects[key] = obj
         if event == "DELETED":
             del self.objects[key]
+        told = {"type": event, "object": copy.deepcopy(obj)}
+        self._past.append((int(obj["metadata"]["resourceVersion"]), key[0], key[1], told))
         for kind, namespace, queue in self._watches:
             if kind == key[0] and namespace in ("", key[1]):
-                queue.put_nowait({"type": event, "object": copy.deepcopy(obj)})
+                queue.put_nowait(told)
         return obj
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
@@ -101,7 +113,10 @@ class ApiServer:
         kind, name, sub = (*parts, "", "")[:3]
         refusal = self.refusals.get((request.method, kind))
         if refusal:
-            return _status(*refusal)
+            response = _status(*refusal)
+            if self.retry_after:
+                response.headers["Retry-After"] = self.retry_after
+            return response
         if request.query.get("watch"):
             return await self._watch(request, kind, namespace)
         body = await request.json() if request.can_read_body else None
@@ -112,6 +127,9 @@ class ApiServer:
         self, request: web.Request, key: tuple[str, str, str], sub: str, body: Any
     ) -> web.Response:
         kind, namespace, name = key
+        if request.method == "POST" and sub == "eviction":
+            must = body["deleteOptions"]
+            return self._delete(key, sub, must) if key in self.objects else _status(404, "gone")
         if request.method == "POST":
             return self._create(kind, namespace, body)
         if not name:
@@ -126,9 +144,10 @@ class ApiServer:
         return web.json_response(self.objects[key])
 
     def _delete(self, key: tuple[str, str, str], sub: str, body: Any) -> web.Response:
-        uid = (body or {}).get("preconditions", {}).get("uid")
-        if uid not in (None, self.objects[key]["metadata"]["uid"]):
-            return _status(409, f"Precondition failed: UID in precondition: {uid}")
+        there = self.objects[key]["metadata"]
+        for name, value in (body or {}).get("preconditions", {}).items():
+            if value != there[name]:
+                return _status(409, f"Precondition failed: {name} in precondition: {value}")
         self.drop(key[0], key[2], key[1])
         return web.json_response({"kind": "Status", "status": "Success"})
 
@@ -136,10 +155,11 @@ class ApiServer:
         key = kind, namespace, body["metadata"]["name"]
         if key in self.objects:
             return _status(409, f'{kind} "{key[2]}" already exists')
-        if kind == "services" and body["spec"].get("clusterIP") == "10.96.9.9":
-            return _status(422, "spec.clusterIPs: failed to allocate IP 10.96.9.9: in use")
         if kind == "services":
-            body["spec"].setdefault("clusterIP", "10.96.0.7")
+            address = body["spec"].setdefault("clusterIP", "10.96.0.7")
+            if self.held[address] > 0:
+                self.held[address] -= 1
+                return _status(422, f"spec.clusterIPs: failed to allocate IP {address}: in use")
         return web.json_response(self.put(kind, body, namespace), status=201)
 
     def _patch(self, key: tuple[str, str, str], sub: str, body: Any) -> web.Response:
@@ -161,7 +181,11 @@ class ApiServer:
             and _has_fields(query.get("fieldSelector", ""), obj)
         ]
         meta = {"resourceVersion": str(next(self._numbers))}
-        return web.json_response({"kind": "List", "metadata": meta, "items": items})
+        first, limit = int(query.get("continue") or 0), int(query.get("limit") or 10**6)
+        if len(items) > first + limit:
+            meta["continue"] = str(first + limit)
+        page = items[first : first + limit]
+        return web.json_response({"kind": "List", "metadata": meta, "items": page})
 
     async def _watch(self, request: web.Request, kind: str, namespace: str) -> web.StreamResponse:
         response = web.StreamResponse()
@@ -170,11 +194,17 @@ class ApiServer:
         if self.gone_for_watches:
             error = {"kind": "Status", "code": 410, "message": "too old resource version"}
             queue.put_nowait({"type": "ERROR", "object": error})
+        since = int(request.query.get("resourceVersion", "0"))
+        for version, its, where, event in self._past:
+            if version > since and its == kind and namespace in ("", where):
+                queue.put_nowait(event)
         entry = kind, namespace, queue
         self._watches.append(entry)
         try:
             while True:
                 event = await queue.get()
+                if not event:
+                    return response
                 await response.write(json.dumps(event).encode() + b"\n")
                 if event["type"] == "ERROR":
                     return response
@@ -184,6 +214,10 @@ class ApiServer:
     def watches(self, kind: str) -> int:
         """How many watch a kind now."""
         return sum(entry[0] == kind for entry in self._watches)
+
+    def close_watches(self) -> None:
+        """End all watches, as after a while."""
+        self.end_watches({})
 
     def end_watches(self, event: Object) -> None:
         """Tell all who watch the same, for example an error."""

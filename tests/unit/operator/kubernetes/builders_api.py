@@ -3,19 +3,16 @@
 from typing import Any
 
 from rosproxy.leases.ports import PortRange
+from rosproxy_operator.kubernetes.resources.cluster import NodeState, ProxyPod, ProxyReport, Stuck
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterFinding,
     Json,
     MasterSpec,
     Name,
-    NodeState,
     Pod,
-    ProxyPod,
-    ProxyReport,
     RosProxy,
     RosProxySpec,
     Selector,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.resources.names import own_labels, proxy_id, service_id
 from rosproxy_operator.kubernetes.status.findings import findings

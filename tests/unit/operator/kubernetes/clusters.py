@@ -12,6 +12,7 @@ from rosproxy_operator.kubernetes.resources.model import Name
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
     NAMESPACE,
+    Object,
     Refused,
     deleting,
     is_own,
@@ -19,7 +20,7 @@ from tests.unit.operator.kubernetes.simulation import (
     name_of,
     node_of,
 )
-from tests.unit.operator.kubernetes.worlds import FIRST, NODES, World, spec
+from tests.unit.operator.kubernetes.worlds import FIRST, World, spec
 
 ROSPROXIES = ("robot", "arm")
 SERVICE = {"service": {"name": "roscore", "namespace": NAMESPACE, "port": 11311}}
@@ -45,9 +46,25 @@ CHANGES: tuple[dict[str, Any], ...] = (
     {"advertise": "ExternalIP"},
     {"advertise": "InternalIP"},
     {"cleanupAfterSeconds": 7},
+    {"ros": 2, "multicast": True, "peers": ["robot"]},
+    {"ros": 2, "multicast": None, "domain": 7},
+    {"ros": "1,2", "multicast": True},
+    {"ros": 1},
 )
 LABELS = ({names.INJECT: "true"}, {names.INJECT: "robot", "app": "x"}, {names.INJECT: "arm"})
 T = TypeVar("T")
+
+
+def mended(spec: Object) -> Object:
+    """A spec that the API server takes, whichever version of ROS it is for."""
+    ros = str(spec.get("ros", 1))
+    if "1" not in ros:
+        spec = spec | {"master": None}
+    elif not spec["master"]:
+        spec = spec | {"master": {"uri": "http://robot:11311"}}
+    if "2" not in ros:
+        return spec | dict.fromkeys(("multicast", "peers", "domain"))
+    return spec | {"ports": max(spec["ports"], 5)}
 
 
 def pick(items: Sequence[T], number: int) -> T:
@@ -78,12 +95,13 @@ class Clusters(World):
         if self.nodes:
             self.pods += 1
             with contextlib.suppress(Refused):
-                self.cluster.add_pod(f"pod-{self.pods}", pick(self.nodes, n), {}, [FIRST + m % 14])
+                node, protocol = pick(self.nodes, n), pick(("TCP", "UDP"), m // 14)
+                self.cluster.add_pod(f"pod-{self.pods}", node, {}, [FIRST + m % 14], protocol)
             self.cluster.schedule()
 
     def namesake(self, n: int, m: int) -> None:
         """A pod that is called as a proxy would be."""
-        id = names.proxy_id(Name(NAMESPACE, pick(ROSPROXIES, n)), pick(list(NODES), m))
+        id = names.proxy_id(Name(self.namespace, pick(ROSPROXIES, n)), pick(list(self.names), m))
         if self.nodes and id not in self.cluster.state.pods:
             self.cluster.add_pod(id.name, pick(self.nodes, n), {})
 
@@ -117,9 +135,9 @@ class Clusters(World):
             self.held = {place: r for place, r in self.held.items() if place.node != node}
 
     def join_node(self, n: int, _: int) -> None:
-        name = pick(list(NODES), n)
+        name = pick(list(self.names), n)
         if name not in self.nodes:
-            self.cluster.add_node(name, NODES[name])
+            self.cluster.add_node(name, self.names[name])
 
     def annotate(self, n: int, m: int) -> None:
         if self.nodes:
@@ -132,12 +150,12 @@ class Clusters(World):
     def change(self, n: int, m: int) -> None:
         if every := sorted(self.cluster.state.rosproxies.items()):
             _, rosproxy = pick(every, n)
-            rosproxy["spec"] |= pick(CHANGES, m)
+            rosproxy["spec"] = mended(rosproxy["spec"] | pick(CHANGES, m))
             rosproxy["metadata"]["generation"] += 1
 
     def create(self, n: int, m: int) -> None:
         name = pick(ROSPROXIES, n)
-        if Name(NAMESPACE, name) not in self.cluster.state.rosproxies:
+        if Name(self.namespace, name) not in self.cluster.state.rosproxies:
             self.cluster.add_rosproxy(name, spec(m))
 
     def delete(self, n: int, _: int) -> None:
@@ -168,7 +186,9 @@ class Clusters(World):
         if every := list(self.cluster.state.services):
             gone = self.cluster.state.services.pop(pick(every, n))
             if m % 3 == 0 and is_own(gone):
-                other = {"metadata": {"name": f"s-{self.cluster.uid('s')}", "namespace": NAMESPACE}}
+                other = {
+                    "metadata": {"name": f"s-{self.cluster.uid('s')}", "namespace": self.namespace}
+                }
                 where = {"clusterIP": gone["spec"]["clusterIP"]}
                 with contextlib.suppress(Refused):
                     self.cluster.create_service({**other, "spec": where})

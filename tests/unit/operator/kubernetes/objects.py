@@ -13,17 +13,19 @@ from rosproxy_operator.kubernetes.planner.manifests import Site
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.cluster import (
+    ClusterSnapshot,
+    ProxyPod,
+    ProxyService,
+    Stuck,
+)
 from rosproxy_operator.kubernetes.resources.model import (
     ClusterNode,
-    ClusterSnapshot,
     MasterSpec,
     Name,
     Pod,
-    ProxyPod,
-    ProxyService,
     RosProxy,
     RosProxySpec,
-    Stuck,
 )
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 

@@ -13,9 +13,11 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
+    CreateEar,
     CreatePolicy,
     CreateProxy,
     CreateService,
+    DeleteEar,
     DeletePolicy,
     DeleteProxy,
     DeleteService,
@@ -30,7 +32,8 @@ from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
 from rosproxy_operator.kubernetes.resources import objects as parse
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, Name, ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyReport
+from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 
 NAMESPACE = "ros"
@@ -64,14 +67,22 @@ def node_of(pod: Object) -> str:
     return pod["spec"].get("nodeName", "")
 
 
-def host_ports(pod: Object) -> set[int]:
-    return set(parse.pod(pod).host_ports)
+def host_ports(pod: Object) -> set[tuple[str, int]]:
+    found = parse.pod(pod)
+    return {("TCP", port) for port in found.host_ports} | {
+        ("UDP", port) for port in found.udp_ports
+    }
 
 
 def is_own(obj: Object) -> bool:
     """Whether the operator has made an object."""
     owned = any(ref["kind"] == names.KIND for ref in meta(obj).get("ownerReferences", ()))
     return names.is_own(meta(obj).get("labels", {})) and owned
+
+
+def is_ear(obj: Object) -> bool:
+    """Whether it is an ear."""
+    return names.is_ear(meta(obj).get("labels", {}))
 
 
 def bound_to(pod: Object) -> str:
@@ -101,8 +112,8 @@ class Cluster:
     a proxy knows: the addresses of ROS nodes by the uid of the proxy's pod.
     """
 
-    def __init__(self) -> None:
-        self.state = State()
+    def __init__(self, namespace: str = NAMESPACE) -> None:
+        self.namespace, self.state = namespace, State()
         self.forbidden = False
         self.numbers = itertools.count(1)
         self.addresses: dict[str, str] = {}
@@ -125,20 +136,26 @@ class Cluster:
         }
 
     def add_rosproxy(self, name: str, spec: Object) -> None:
-        self.state.rosproxies[Name(NAMESPACE, name)] = {
+        self.state.rosproxies[Name(self.namespace, name)] = {
             "metadata": {
-                "name": name, "namespace": NAMESPACE, "uid": self.uid("rosproxy"), "generation": 1,
+                "name": name, "namespace": self.namespace, "uid": self.uid("rosproxy"),
+                "generation": 1,
             },
             "spec": spec,
         }  # fmt: skip
 
     def add_pod(
-        self, name: str, node: str, labels: dict[str, str], ports: Iterable[int] = ()
+        self,
+        name: str,
+        node: str,
+        labels: dict[str, str],
+        ports: Iterable[int] = (),
+        protocol: str = "TCP",
     ) -> None:
         """A pod of a user, bound to a node at once, or left to the scheduler if it takes ports."""
-        taken = [{"containerPort": port, "hostPort": port} for port in ports]
+        taken = [{"containerPort": port, "hostPort": port, "protocol": protocol} for port in ports]
         pod: Object = {
-            "metadata": {"name": name, "namespace": NAMESPACE, "labels": labels},
+            "metadata": {"name": name, "namespace": self.namespace, "labels": labels},
             "spec": {"containers": [{"name": "main", "image": "user", "ports": taken}]},
         }
         if taken:
@@ -150,7 +167,7 @@ class Cluster:
         self.create_pod(pod)
 
     def uid(self, kind: str) -> str:
-        return f"{kind}-{next(self.numbers)}"
+        return f"{self.namespace}-{kind}-{next(self.numbers)}"
 
     # what the API server does
 
@@ -228,7 +245,7 @@ class Cluster:
         pod["spec"]["nodeName"] = node
         return ""
 
-    def held(self, node: str) -> set[int]:
+    def held(self, node: str) -> set[tuple[str, int]]:
         """The hostPorts that the scheduler counts on a node."""
         there = [pod for pod in self.state.pods.values() if node_of(pod) == node]
         return {port for pod in there if not ended(pod) for port in host_ports(pod)}
@@ -265,7 +282,7 @@ class Cluster:
             "conditions": [{"type": "Ready", "status": str(ready)}],
             "containerStatuses": [{"name": container["name"], "state": state, "restartCount": 0}],
         }
-        if is_own(pod) and ready:
+        if is_own(pod) and ready and not is_ear(pod):
             self.ros.setdefault(uid, set())
 
     # what the operator sees
@@ -275,6 +292,7 @@ class Cluster:
         seen = old or self.state
         pods = [parse.pod(one) for one in seen.pods.values()]
         own = [found for one in seen.pods.values() if (found := parse.proxy_pod(one))]
+        ears = filter(None, map(parse.ear_pod, seen.pods.values()))
         services = filter(None, map(parse.service, seen.services.values()))
         policies = seen.policies.values()
         of = tuple(parse_rosproxy.rosproxy(one) for one in self.state.rosproxies.values())
@@ -285,6 +303,7 @@ class Cluster:
             nodes={name: parse.node(one) for name, one in seen.nodes.items()},
             pods=tuple(pods),
             proxies=tuple(own),
+            ears=tuple(ears),
             services={one.of: one for one in services},
             policies={one.id: one for one in filter(None, map(parse.policy, policies))},
             key=self.key,
@@ -310,7 +329,7 @@ class Cluster:
                     if "allocated" not in str(error):
                         raise
                     self.create_service(dict(without_cluster_ip(body)))
-            case CreateProxy(body=body):
+            case CreateProxy(body=body) | CreateEar(body=body):
                 self.made += 1
                 self.create_pod(dict(body))
             case CreatePolicy(body=body):
@@ -322,7 +341,7 @@ class Cluster:
             case SetPolicy(id=id, uid=uid, spec=spec):
                 if policy := self._own(self.state.policies, id, uid):
                     policy["spec"] = copy.deepcopy(dict(spec))
-            case DeleteProxy(id=id, uid=uid):
+            case DeleteProxy(id=id, uid=uid) | DeleteEar(id=id, uid=uid):
                 if pod := self._own(self.state.pods, id, uid):
                     self.delete_pod(pod)
             case DeleteService(id=id, uid=uid):
@@ -382,9 +401,11 @@ class Controller:
         try:
             self.cluster.apply(action)
         except Refused as error:
-            assert isinstance(action, CreateProxy | CreateService | CreatePolicy)
+            assert isinstance(action, CreateProxy | CreateEar | CreateService | CreatePolicy)
             name, state = name_of(dict(action.body)), self.cluster.state
-            kinds = {CreateProxy: state.pods, CreateService: state.services}
+            kinds = {
+                CreateProxy: state.pods, CreateEar: state.pods, CreateService: state.services,
+            }  # fmt: skip
             there = kinds.get(type(action), state.policies).get(name)
             if str(error) == "AlreadyExists" and there is not None:
                 text = "a Pod of this name that is not the operator's is there"

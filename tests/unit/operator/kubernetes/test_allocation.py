@@ -10,12 +10,8 @@ from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProx
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
 from rosproxy_operator.kubernetes.resources import names
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterSnapshot,
-    MasterSpec,
-    ProxyPlace,
-    Stuck,
-)
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, Stuck
+from rosproxy_operator.kubernetes.resources.model import MasterSpec, ProxyPlace
 from tests.unit.operator.kubernetes.objects import (
     RANGE,
     ROBOT,
@@ -171,7 +167,7 @@ def test_who_has_left_his_ports_is_told() -> None:
     _, found = changed(window=PortRange(11410, 11420))
     (text,) = told(found, "PortConflict")
     assert "has left ports 11400-11403 for 11410-11413" in text
-    assert "restart their pods" in text
+    assert "restart them" in text
 
 
 # conflicts
@@ -213,7 +209,7 @@ def test_ports_that_have_served_are_tried_for_a_while() -> None:
     third = look(STUCK, second.state, 121.0)
     assert kinds(third) == [DeleteProxy]
     assert third.state.given[HERE] == NEXT
-    assert any("restart their pods" in text for text in told(third, "PortConflict"))
+    assert any("restart them" in text for text in told(third, "PortConflict"))
 
 
 def test_a_rejected_pod_is_made_anew_on_the_same_ports_for_a_while() -> None:

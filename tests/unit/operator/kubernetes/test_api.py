@@ -7,16 +7,17 @@ from types import SimpleNamespace
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import (
+from rosproxy_operator.kubernetes.api.client import (
+    SOON,
     Api,
     ApiAway,
     ApiConflict,
     ApiError,
     ApiGone,
     ApiInvalid,
-    missing_rule,
     refusal,
 )
+from rosproxy_operator.kubernetes.api.rbac import missing_rule
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.api_server import ApiServer, listening, write_kubeconfig
@@ -31,46 +32,48 @@ def pod(name: str, **labels: str) -> dict[str, object]:
     return {"metadata": {"name": name, "labels": labels}, "spec": {"nodeName": "node1"}}
 
 
+def names(found: list[dict[str, dict[str, str]]]) -> set[str]:
+    return {each["metadata"]["name"] for each in found}
+
+
 async def test_lists_with_selectors(server: ApiServer, api: Api) -> None:
     server.put("pods", pod("a", app="x"))
-    server.put("pods", pod("b", app="y"))
     server.put("pods", pod("other", app="x"), "elsewhere")
     server.put("pods", {"metadata": {"name": "mine", "labels": own_labels("arm")}})
-
-    def names(found: list[dict[str, dict[str, str]]]) -> set[str]:
-        return {each["metadata"]["name"] for each in found}
-
-    assert names(await in_thread(api.pods, "ns", "app in (x,z)")) == {"a"}
-    assert names(await in_thread(api.pods_on, "node1")) == {"a", "b", "other"}
-    assert names(await in_thread(api.own, "pods")) == {"mine"}
+    assert names(await in_thread(api.fresh, "pods", "", "spec.nodeName=node1")) == {"a", "other"}
+    assert names(await in_thread(api.fresh, "pods", "ns", "metadata.name=a")) == {"a"}
+    assert names(await in_thread(api.own_pods)) == {"mine"}
+    assert not any("resourceVersion" in query for query in server.asked("GET", "pods"))
 
 
-async def test_a_list_from_memory_is_never_older_than_the_one_before(
-    server: ApiServer, api: Api
+async def test_a_list_comes_in_pages(
+    server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With several API servers one may lag behind another."""
-    await in_thread(api.nodes)
-    server.put("nodes", {"metadata": {"name": "node1"}})
-    await in_thread(api.nodes)
-    first, second = server.asked("GET", "nodes")
-    assert first == {"resourceVersion": "0"}
-    assert int(second["resourceVersion"]) > 0
-    assert second["resourceVersionMatch"] == "NotOlderThan"
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.client.PAGE", 2)
+    for name in "abc":
+        server.put("pods", pod(name))
+    first = await in_thread(api.page, "pods", "")
+    last = await in_thread(api.page, "pods", "", first.more)
+    assert (names(first.items), names(last.items), last.more) == ({"a", "b"}, {"c"}, "")
 
 
-async def test_a_store_that_was_set_back_is_asked_itself(server: ApiServer, api: Api) -> None:
-    await in_thread(api.nodes)
-    server.refuse("GET", "nodes", 504, "Timeout: Too large resource version: 9, current: 3")
-    with pytest.raises(ApiError):
-        await in_thread(api.nodes)
-    server.refusals.clear()
-    await in_thread(api.nodes)
-    assert [("resourceVersion" in query) for query in server.asked("GET", "nodes")] == [
-        True,
-        True,
-        False,
-        True,
-    ]
+async def test_who_is_put_off_asks_again_when_told(
+    server: ApiServer, api: Api, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """API Priority and Fairness answers so; who has little time is told at once."""
+    slept: list[float] = []
+    monkeypatch.setattr("rosproxy_operator.kubernetes.api.client.time.sleep", slept.append)
+    server.refuse("GET", "nodes", 429, "too many requests")
+    server.retry_after = "7"
+    with pytest.raises(ApiAway, match="too many requests"):
+        await in_thread(api.page, "nodes", "")
+    assert slept == [7.0] * 4
+    with pytest.raises(ApiAway):
+        await in_thread(api.get, "nodes", Name("", "node1"), SOON)
+    server.retry_after = "999999"
+    with pytest.raises(ApiAway):
+        await in_thread(api.page, "nodes", "")
+    assert max(slept) == 10.0
 
 
 async def test_rosproxies_are_listed_from_the_store(server: ApiServer, api: Api) -> None:
@@ -128,17 +131,17 @@ async def test_an_api_server_that_is_away_and_back(
     write_kubeconfig(tmp_path / "config", other.url)
     late = Api()
     with pytest.raises(ApiError, match=f"API server at {other.url} can't be reached") as caught:
-        await in_thread(late.nodes)
+        await in_thread(late.page, "nodes", "")
     assert type(caught.value) is ApiAway
     async with listening(other, port):
-        assert await in_thread(late.nodes) == []
+        assert (await in_thread(late.page, "nodes", "")).items == []
         late.close()
 
 
 async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> None:
     server.refuse("GET", "nodes", 200, "hello")
     with pytest.raises(ApiError, match="is no API server") as caught:
-        await in_thread(api.nodes)
+        await in_thread(api.page, "nodes", "")
     assert type(caught.value) is ApiAway
 
 
@@ -146,10 +149,10 @@ async def test_what_is_no_api_server_is_away(server: ApiServer, api: Api) -> Non
 async def test_what_does_not_answer_in_json_is_away(
     api: Api, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
-    answer = SimpleNamespace(status=200, reason="OK", read=lambda: text)
+    answer = SimpleNamespace(status=200, reason="OK", read=lambda: text, getheader=lambda *_: "")
     monkeypatch.setattr(api._client, "call_api", lambda *_, **__: answer)
     with pytest.raises(ApiAway, match="/api/v1/nodes is no API server"):
-        await in_thread(api.nodes)
+        await in_thread(api.page, "nodes", "")
 
 
 def test_no_cluster_is_one_line_that_says_what_to_do(

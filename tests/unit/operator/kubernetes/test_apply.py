@@ -1,5 +1,6 @@
 """What is done to the cluster, through the real client, against an API server on loopback."""
 
+import copy
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -8,7 +9,7 @@ from aiohttp import web
 
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import ProxyClient
-from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.api.client import Api
 from rosproxy_operator.kubernetes.apply import ClusterApplier
 from rosproxy_operator.kubernetes.planner.actions import (
     Action,
@@ -19,20 +20,24 @@ from rosproxy_operator.kubernetes.planner.actions import (
     DeleteProxy,
     DeleteService,
     Emit,
+    EvictPod,
     PatchStatus,
     SetImage,
     SetPolicy,
 )
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterSnapshot,
-    Name,
-    Reference,
-    RosProxy,
-)
+from rosproxy_operator.kubernetes.resources import objects
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.model import Name, Reference, RosProxy
 from rosproxy_operator.kubernetes.resources.names import own_labels, token_of
 from rosproxy_operator.kubernetes.resources.spec import rosproxy
 from tests.unit.operator.kubernetes.api_server import ApiServer
-from tests.unit.operator.kubernetes.builders_api import NAMESPACE, proxy_obj, rosproxy_obj
+from tests.unit.operator.kubernetes.builders_api import (
+    NAMESPACE,
+    pod_obj,
+    proxy_obj,
+    rosproxy_obj,
+)
+from tests.unit.operator.kubernetes.known import known
 
 OF = Name(NAMESPACE, "arm")
 KEY = b"k" * 32
@@ -46,7 +51,11 @@ class Carried:
     def __init__(self, api: Api) -> None:
         self.counted: list[tuple[str, str]] = []
         self.tasks, self.proxies = Tasks(), ProxyClient()
-        self.applier = ClusterApplier(api, self.proxies, self.tasks, self.count)
+        self.applier = ClusterApplier(api, self.proxies, self.tasks, self.count, self.doubt)
+        self.doubts = 0
+
+    def doubt(self) -> None:
+        self.doubts += 1
 
     def count(self, action: Action, outcome: str) -> None:
         self.counted.append((type(action).__name__, outcome))
@@ -90,10 +99,12 @@ async def test_proxies_are_created(server: ApiServer, carry: Carried) -> None:
     await carry.out(create_pod("one"), create_pod("two"))
     assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["one", "two"]
     assert carry.applier.failures == {OF: {}}
+    assert (carry.applier.busy, carry.applier.failed) == (0, 0)
     assert carry.counted == [("CreateProxy", "ok")] * 2
 
 
 async def test_a_policy_is_made_mended_and_deleted(server: ApiServer, carry: Carried) -> None:
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
     made = {**body("NetworkPolicy", "rosproxy-arm"), "apiVersion": "networking.k8s.io/v1"}
     id = Name(NAMESPACE, "rosproxy-arm")
     await carry.out(CreatePolicy(OF, made))
@@ -123,12 +134,16 @@ async def test_somebody_elses_pod_is_left_alone(server: ApiServer, carry: Carrie
     ((id, text),) = carry.applier.failures[OF].items()
     assert id == Name(NAMESPACE, "proxy")
     assert "not the operator's is there: rename it" in text
+    assert (carry.applier.busy, carry.applier.failed) == (0, 1)
     assert server.get("pods", "proxy", NAMESPACE)["metadata"].get("labels") is None
 
 
 async def test_a_lost_service_gets_its_address_or_another(
-    server: ApiServer, carry: Carried
+    server: ApiServer, carry: Carried, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """That of one just deleted is given back only after its deletion was told."""
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    server.held.update({"10.96.0.5": 2, "10.96.9.9": 1000})
     service = body("Service", "rosproxy-arm", clusterIP="10.96.0.5")
     taken = body("Service", "rosproxy-leg", clusterIP="10.96.9.9")
     await carry.out(CreateService(OF, service), CreateService(OF, taken))
@@ -138,17 +153,39 @@ async def test_a_lost_service_gets_its_address_or_another(
 
 
 async def test_nothing_is_deleted_but_what_was_seen(server: ApiServer, carry: Carried) -> None:
-    uid = server.put("pods", body("Pod", "old"), NAMESPACE)["metadata"]["uid"]
-    server.put("pods", body("Pod", "new"), NAMESPACE)
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    old, new = proxy_obj(), proxy_obj(node="node2")
+    for pod in (old, new):
+        server.put("pods", pod, NAMESPACE)
     server.put("services", body("Service", "new"), NAMESPACE)
-    await carry.out(
-        DeleteProxy(OF, Name(NAMESPACE, "old"), uid, "why"),
-        DeleteProxy(OF, Name(NAMESPACE, "new"), "another", "why"),
+    names = [Name(NAMESPACE, one["metadata"]["name"]) for one in (old, new)]
+    actions = (
+        DeleteProxy(OF, names[0], old["metadata"]["uid"], "why"),
+        DeleteProxy(OF, names[1], "another", "why"),
         DeleteProxy(OF, Name(NAMESPACE, "never was"), "x", "why"),
         DeleteService(OF, Name(NAMESPACE, "new"), "another", "why"),
     )
-    assert [pod["metadata"]["name"] for pod in server.all("pods")] == ["new"]
+    await carry.applier.carry_out(actions, known(server))
+    assert [pod["metadata"]["name"] for pod in server.all("pods")] == [names[1].name]
     assert server.all("services")
+    assert carry.applier.failures == {OF: {}}
+
+
+async def test_what_stays_another_than_it_is_known_is_doubted(
+    server: ApiServer, carry: Carried
+) -> None:
+    """Once it is a watch that lags."""
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    old = server.put("pods", proxy_obj(), NAMESPACE)
+    action = DeleteProxy(
+        OF, Name(NAMESPACE, old["metadata"]["name"]), old["metadata"]["uid"], "why"
+    )
+    seen = known(server)
+    server.drop("rosproxies", "arm", NAMESPACE)
+    for times in (0, 1, 1, 2):
+        await carry.applier.carry_out([action], seen)
+        assert carry.doubts == times
+    assert server.all("pods")
     assert carry.applier.failures == {OF: {}}
 
 
@@ -301,11 +338,59 @@ async def _retire(server: ApiServer, carry: Carried, ip: str) -> None:
 
     obj = proxy_obj(status={"phase": "Running", "podIP": ip})
     server.put("pods", obj, NAMESPACE)
-    proxy = proxy_pod(obj)
+    proxy, seen = proxy_pod(obj), known(server, KEY)
     assert proxy is not None
     action = DeleteProxy(OF, proxy.pod.id, proxy.pod.uid, "RosProxy deleted", retire=True)
-    await carry.out(action, action, proxies=(proxy,), key=KEY)
+    await carry.applier.carry_out([action, action], seen)
     for task in [*carry.tasks._tasks]:
         await task
-    await carry.out(action, proxies=(proxy,))  # a pod that ends slowly is told once
+    await carry.applier.carry_out([action], seen)  # a pod that ends slowly is told once
     assert not carry.tasks._tasks
+
+
+def evict(server: ApiServer) -> tuple[EvictPod, dict[str, Any]]:
+    """The eviction of a pod that is there, and what was seen."""
+    labels = {"rosproxy.io/inject": "true"}
+    server.put("rosproxies", rosproxy_obj(), NAMESPACE)
+    server.put("pods", pod_obj("talker", labels), NAMESPACE)
+    id = Name(NAMESPACE, "talker")
+    observed = {"pods": (objects.pod(server.get("pods", "talker", NAMESPACE)),)}
+    return EvictPod(OF, id, "uid-talker", "it is not wired"), observed
+
+
+async def test_pods_are_evicted(server: ApiServer, carry: Carried) -> None:
+    action, observed = evict(server)
+    await carry.out(action, **observed)
+    assert server.all("pods") == []
+    assert carry.counted == [("EvictPod", "ok")]
+    assert "/pods/talker/eviction" in server.requests[-1][1]
+
+
+async def test_a_pod_that_was_wired_meanwhile_is_not_evicted(
+    server: ApiServer, carry: Carried
+) -> None:
+    action, observed = evict(server)
+    wired = copy.deepcopy(server.get("pods", "talker", NAMESPACE))
+    wired["metadata"]["annotations"] = {"rosproxy.io/master-uri": "http://10.96.0.7:11311"}
+    server.put("pods", wired, NAMESPACE)
+    await carry.out(action, **observed)
+    assert len(server.all("pods")) == 1
+
+
+async def test_a_budget_that_does_not_allow_an_eviction(server: ApiServer, carry: Carried) -> None:
+    """It is asked once, and tried again when it is planned again."""
+    action, observed = evict(server)
+    server.retry_after = "10"
+    server.refuse("POST", "pods", 429, "Cannot evict pod: disruption budget")
+    await carry.out(action, **observed)
+    assert len(server.asked("POST", "pods")) == 1
+    assert "disruption budget" in str(carry.applier.failures)
+
+
+async def test_one_that_leads_no_more_has_failed_at_nothing(
+    server: ApiServer, carry: Carried, api: Api
+) -> None:
+    api.gate.open = lambda: False
+    await carry.out(create_pod())
+    assert (server.requests, carry.counted) == ([], [])
+    assert carry.applier.failed == 0

@@ -7,8 +7,9 @@ import pytest
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.planner.bounds import may_name, objection, within_bounds
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, MasterSpec, Name
+from rosproxy_operator.kubernetes.planner.access.bounds import may_name, objection, within_bounds
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.model import MasterSpec, Name
 from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,

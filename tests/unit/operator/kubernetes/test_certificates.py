@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from cryptography import x509
 
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiError
+from rosproxy_operator.kubernetes.api.client import Api, ApiError
 from rosproxy_operator.kubernetes.resources.model import Name
 from rosproxy_operator.kubernetes.webhook import certificates, rotation
 from rosproxy_operator.kubernetes.webhook.certificates import InvalidCertificate, KeyPair
@@ -169,6 +170,49 @@ async def test_a_restart_finds_the_same(server: ApiServer, api: Api) -> None:
     assert await in_thread(source(api, Clock()).refresh) == first
     assert len(server.asked("PATCH", "secrets")) == before
     assert len(server.asked("PATCH", "mutatingwebhookconfigurations")) == 1
+
+
+async def test_one_that_cannot_be_written_is_kept(server: ApiServer, api: Api) -> None:
+    """With another one each time, what is served would not always be trusted."""
+    put(server)
+    clock = Clock()
+    one = source(api, clock)
+    old = await in_thread(one.refresh)
+    server.refuse("PATCH", "secrets", 500, "failed calling webhook")
+    clock.forward(days=61)
+    served = []
+    for _ in range(4):
+        served.append(await in_thread(one.refresh))
+        authorities = {c.subject for c in x509.load_pem_x509_certificates(bundle(server))}
+        assert x509.load_pem_x509_certificate(served[-1].certificate).issuer in authorities
+        assert len(authorities) == 2
+        assert "kept in memory" in one.problems[0].text
+        clock.forward(seconds=20)
+    assert served[0] == old
+    assert served[1] != old
+    assert len(set(served[1:])) == 1
+    server.refusals.clear()
+    assert await in_thread(one.refresh) == served[-1]
+    assert certificates.read(server.get("secrets", "wh")["data"]) == served[-1]
+
+
+async def test_only_the_operator_that_leads_makes_it(server: ApiServer, api: Api) -> None:
+    """One that waits for it is ready: an upgrade may wait for that before it ends the other."""
+    put(server)
+    leading = False
+    one = SelfSigned(api, NAMES, SECRET, "wh", Clock(), leads=lambda: leading)
+    kept = CertificateRotation(one, ClusterMetrics())
+    webhook = WebhookServer(HostPort("127.0.0.1", 0), kept)
+    assert webhook.unready()
+
+    await kept.refresh()
+    assert (kept.pair, webhook.unready()) == (None, None)
+    assert server.asked("PATCH", "secrets") == []
+
+    leading = True
+    await kept.refresh()
+    assert kept.pair == certificates.read(server.get("secrets", "wh")["data"])
+    assert webhook.unready()
 
 
 async def test_renewed_and_trusted_before_it_is_served(server: ApiServer, api: Api) -> None:

@@ -3,16 +3,9 @@
 import pytest
 from msgspec.structs import replace
 
-from rosproxy_operator.kubernetes.proxy_sync import no_answer
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterFinding,
-    MasterSpec,
-    Name,
-    Obstacle,
-    ProxyReport,
-    Reference,
-    Stuck,
-)
+from rosproxy_operator.kubernetes.proxies.proxy_report import no_answer
+from rosproxy_operator.kubernetes.resources.cluster import Obstacle, ProxyReport, Stuck
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, MasterSpec, Name, Reference
 from rosproxy_operator.kubernetes.status.findings import findings
 from tests.unit.operator.kubernetes.builders_api import (
     answer,

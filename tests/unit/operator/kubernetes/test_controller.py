@@ -13,12 +13,14 @@ from rosproxy.settings import hash_token
 from rosproxy_operator.common import control_loop
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.kubernetes import controller as module
-from rosproxy_operator.kubernetes import proxy_sync
-from rosproxy_operator.kubernetes.api import Api
+from rosproxy_operator.kubernetes.api.client import Api
 from rosproxy_operator.kubernetes.controller import KubernetesController
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot
+from rosproxy_operator.kubernetes.proxies import proxy_sync
+from rosproxy_operator.kubernetes.proxies.sandbox import SandboxFailures
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
 from rosproxy_operator.kubernetes.settings import ClusterSettings, KubernetesSettings
+from rosproxy_operator.kubernetes.watch import reflector
 from rosproxy_operator.kubernetes.webhook.injector import Injector
 from tests.unit.operator.kubernetes.api_server import ApiServer, until
 from tests.unit.operator.kubernetes.builders_api import INJECT, NAMESPACE, pod_obj, rosproxy_obj
@@ -33,12 +35,17 @@ NODE = {
 }
 
 
+LOST = {"type": "ERROR", "object": {"code": 500, "message": "etcd"}}
+
+
 class Running:
     """A controller at work."""
 
     def __init__(self, api: Api) -> None:
-        self.metrics = ClusterMetrics()
-        self.controller = KubernetesController(KubernetesSettings(resync=60.0), api, self.metrics)
+        self.metrics, self.term = ClusterMetrics(), 1
+        api.gate.open = lambda: bool(self.term)
+        settings = KubernetesSettings(resync=60.0)
+        self.controller = KubernetesController(settings, api, self.metrics, lambda: self.term)
         self.task = asyncio.create_task(self.controller.run())
 
     def looks(self, outcome: str = "ok") -> float:
@@ -51,8 +58,10 @@ async def running(api: Api, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Ru
     monkeypatch.setattr(module, "DEBOUNCE", 0.01)
     monkeypatch.setattr(module, "SETTLED", 0.05)
     monkeypatch.setattr(control_loop, "PAUSES", (0.02,))
+    monkeypatch.setattr(reflector, "PAUSES", (0.02,))
     monkeypatch.setattr(proxy_sync, "EVERY", 0.05)
     monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.02)
+    monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.05)
     one = Running(api)
     yield one
     one.task.cancel()
@@ -98,6 +107,27 @@ async def test_a_pod_that_is_created_with_its_rosproxy_is_wired(
     assert len(server.asked("POST", "services")) == 1
 
 
+async def test_what_happens_during_a_look_is_seen_by_the_next_one(
+    server: ApiServer, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And not only when everything is looked at, in a minute here."""
+    put_all(server)
+    server.drop("pods", "talker", NAMESPACE)
+    await until(lambda: bool(server.all("services")) and running.looks() > 2)
+    store, real = running.controller._store, SandboxFailures.read
+
+    async def read(self: SandboxFailures, observed: ClusterSnapshot) -> set[str]:
+        found = await real(self, observed)
+        if not observed.pods:
+            server.put("pods", pod_obj("talker", INJECT), NAMESPACE)
+            await until(lambda: bool(store.snapshot().pods))
+        return found
+
+    monkeypatch.setattr(SandboxFailures, "read", read)
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)), 20.0)
+
+
 async def test_it_settles(server: ApiServer, running: Running) -> None:
     """Nothing is written when nothing happens."""
 
@@ -122,13 +152,44 @@ async def test_it_settles(server: ApiServer, running: Running) -> None:
     assert [await look() for _ in range(3)] == [now] * 3
 
 
+async def test_one_that_does_not_lead_looks_on(server: ApiServer, running: Running) -> None:
+    """And begins at once when it does; when it does no more, it ends."""
+
+    def written() -> list[str]:
+        return [method for method, _, _ in server.requests if method != "GET"]
+
+    running.term = 0
+    put_all(server)
+    looks = running.looks()
+    running.controller.wake()
+    await until(lambda: running.looks() > looks + 1 or running.controller._stood_by > 0)
+    assert written() == []
+    assert running.controller.unready() is None
+    running.term = 1
+    running.controller.wake()
+    await until(lambda: bool(proxies(server)))
+    running.term = 0
+    running.controller.wake()
+    await until(lambda: running.controller._acting == 0)
+    before = len(written())
+    server.put("pods", pod_obj("late", INJECT, nodeName="node2"), NAMESPACE)
+    server.put("nodes", {**NODE, "metadata": {"name": "node2"}})
+    looks = running.looks()
+    running.controller.wake()
+    await until(lambda: running.looks() > looks)
+    assert len(written()) == before
+    running.term = 2
+    running.controller.wake()
+    await until(lambda: len(proxies(server)) == 2)
+
+
 async def test_an_api_server_that_is_away(
     server: ApiServer, running: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     await until(lambda: running.looks() > 0)
     server.refuse("GET", "rosproxies", 503, "starting")
-    running.controller.wake()
+    server.end_watches(LOST)
     await until(lambda: running.looks("unavailable") > 3)
     assert running.controller.unready() == "the API server answers HTTP 503: starting"
     assert running.controller.dead() is None
@@ -139,14 +200,11 @@ async def test_an_api_server_that_is_away(
 
 
 async def test_a_crd_that_comes_late(server: ApiServer, running: Running) -> None:
-    appeared: list[bool] = []
-    running.controller.appeared = lambda: appeared.append(True)
     server.refuse("GET", "rosproxies", 404, "not found")
-    running.controller.wake()
+    server.end_watches(LOST)
     await until(lambda: "CustomResourceDefinition" in (running.controller.unready() or ""))
-    assert not appeared
     server.refusals.clear()
-    await until(lambda: bool(appeared))
+    await until(lambda: running.controller.unready() is None)
 
 
 async def test_a_mistake_of_ours_does_not_end_it(
@@ -218,19 +276,19 @@ async def test_a_proxy_is_asked_and_told(
     await until(lambda: bool(proxies(server)))
     (proxy,) = proxies(server)
     ready = [{"type": "Ready", "status": "True"}]
-    proxy["status"] = {"phase": "Running", "podIP": "127.0.0.79", "conditions": ready}
-    running.controller.wake()
+    runs = {"phase": "Running", "podIP": "127.0.0.79", "conditions": ready}
+    server.put("pods", {**proxy, "status": runs}, NAMESPACE)
     await until(
         lambda: server.get("rosproxies", "arm", NAMESPACE)["status"].get("proxies") == "1/1"
     )
     gone[proxy["metadata"]["uid"]] = ("10.244.1.9",)
     running.controller.wake()
-    await until(lambda: len([1 for _, body in told if "gone" in body]) == 2)
+    await until(lambda: len([1 for _, body in told if "gone" in body]) >= 2)
     gone.clear()
     env = proxy["spec"]["containers"][0]["env"]
     hashed = next(one["value"] for one in env if one["name"] == "ROSPROXY_ADMIN_TOKEN_HASH")
     (who,) = {who for who, _ in told}
     assert hash_token(who.removeprefix("Bearer ")) == hashed
-    assert [body for _, body in told if "gone" in body] == [{"gone": ["10.244.1.9"]}] * 2
+    assert [body for _, body in told if "gone" in body][:2] == [{"gone": ["10.244.1.9"]}] * 2
     assert told[0][1] == {"selected": ["10.244.1.5"]}
     await runner.cleanup()

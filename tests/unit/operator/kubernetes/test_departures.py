@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from rosproxy_operator.kubernetes.planner.departures import AGAIN, REMEMBERED, UNSEEN, gone, waits
 from rosproxy_operator.kubernetes.planner.state import ClusterState
-from rosproxy_operator.kubernetes.resources.model import ClusterSnapshot, ProxyReport
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyReport
 from tests.unit.operator.kubernetes.objects import look, node, observed, pod, proxy, rosproxy
 
 PROXY = "uid-proxy-robot-one"

@@ -11,6 +11,7 @@ from rosproxy_operator.kubernetes.resources.model import ClusterFinding, Name, R
 from rosproxy_operator.kubernetes.status.events import (
     LONGEST,
     MOST,
+    MOST_RESULTS,
     QUIET,
     event_body,
     results,
@@ -123,3 +124,17 @@ def test_what_is_done_is_told():
         ("Normal", "ProxyDeleted", f"deleted pod {pod.name}: no selected pod is left on node1"),
     ]
     assert {one.about for one in found} == {OF_ARM}
+
+
+def test_what_is_done_to_many_is_summed_up():
+    of_all = 3 * MOST_RESULTS
+    actions: list[Action] = [
+        DeleteProxy(ARM, Name("robots", f"pod-{number}"), "u", "gone") for number in range(of_all)
+    ]
+
+    *each, last = results(rosproxy(), actions)
+
+    assert len(each) == MOST_RESULTS
+    assert (
+        last.message == f"and {of_all - MOST_RESULTS} more at once, which the operator's log names"
+    )

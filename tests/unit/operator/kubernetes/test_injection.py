@@ -7,11 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy_operator.kubernetes.planner.injection import MIRROR, Wiring, unwired, wire
+from rosproxy_operator.kubernetes.planner.pods.injection import (
+    MIRROR,
+    Target,
+    Wiring,
+    unwired,
+    wire,
+)
 from rosproxy_operator.kubernetes.resources import objects
 from rosproxy_operator.kubernetes.resources.model import ELSEWHERE
 from tests.unit.operator.kubernetes.builders_api import CLUSTER_IP, URI, pod, rosproxy
 
+TO = Target(URI)
 MASTER = {"name": "ROS_MASTER_URI", "value": URI}
 IP = {
     "name": "ROS_IP",
@@ -46,7 +53,7 @@ def env_of(wiring: Wiring, kind: str = "containers", place: int = 0) -> Any:
 
 
 def test_a_pod_is_wired():
-    found = wire(admitted(container()), URI)
+    found = wire(admitted(container()), TO)
 
     assert env_of(found) == [MASTER, IP]
     assert (found.annotations, found.warnings) == ({ANNOTATION: URI}, ())
@@ -61,7 +68,7 @@ def test_every_container_is_wired_and_nothing_else_changes():
     )
     before = copy.deepcopy(obj)
 
-    found = wire(obj, URI)
+    found = wire(obj, TO)
 
     assert obj == before
     assert found.spec is not None
@@ -73,7 +80,7 @@ def test_every_container_is_wired_and_nothing_else_changes():
 def test_variables_of_the_template_can_use_those_that_are_set():
     url = {"name": "URL", "value": "$(ROS_MASTER_URI)/x"}
 
-    assert env_of(wire(admitted(container(url)), URI)) == [MASTER, IP, url]
+    assert env_of(wire(admitted(container(url)), TO)) == [MASTER, IP, url]
 
 
 @pytest.mark.parametrize(
@@ -87,23 +94,23 @@ def test_variables_of_the_template_can_use_those_that_are_set():
     ],
 )
 def test_a_container_keeps_what_it_sets_itself(own, set_too):
-    assert env_of(wire(admitted(container(own)), URI)) == [*set_too, own]
+    assert env_of(wire(admitted(container(own)), TO)) == [*set_too, own]
 
 
 def test_a_pod_that_sets_all_itself_stays_as_it_is():
     own = [{"name": "ROS_MASTER_URI", "value": "http://robot:11311"}, {"name": "ROS_IP"}]
 
-    assert wire(admitted(container(*own)), URI) == Wiring()
+    assert wire(admitted(container(*own)), TO) == Wiring()
 
 
 def test_a_pod_of_which_one_container_sets_it_is_still_wired():
     own = {"name": "ROS_MASTER_URI", "value": "http://robot:11311"}
 
-    found = wire(admitted(container(own), container(name="b")), URI)
+    found = wire(admitted(container(own), container(name="b")), TO)
 
     assert env_of(found, place=1) == [MASTER, IP]
     assert found.annotations == {ANNOTATION: URI}
-    assert wire(admitted(container(own, MASTER, IP)), URI).annotations == {ANNOTATION: URI}
+    assert wire(admitted(container(own, MASTER, IP)), TO).annotations == {ANNOTATION: URI}
 
 
 def test_host_aliases_are_added_to_those_of_the_pod():
@@ -112,7 +119,7 @@ def test_host_aliases_are_added_to_those_of_the_pod():
 
     found = wire(
         admitted(container(), hostAliases=[own]),
-        URI,
+        TO,
         [{"ip": "192.0.2.7", "hostnames": ["robot", "robot.example"]}, other],
     )
 
@@ -124,7 +131,7 @@ def test_host_aliases_are_added_to_those_of_the_pod():
 
 
 def test_without_host_aliases_none_are_made():
-    spec = wire(admitted(container()), URI).spec
+    spec = wire(admitted(container()), TO).spec
 
     assert spec is not None
     assert "hostAliases" not in spec
@@ -133,9 +140,9 @@ def test_without_host_aliases_none_are_made():
 
 def test_a_copy_of_a_wired_pod_is_wired_anew():
     obj = admitted(container())
-    copied = applied(obj, wire(obj, "http://10.96.0.1:11311"))
+    copied = applied(obj, wire(obj, Target("http://10.96.0.1:11311")))
 
-    found = wire(copied, URI)
+    found = wire(copied, TO)
 
     assert env_of(found) == [MASTER, IP]
     assert found.annotations == {ANNOTATION: URI}
@@ -145,7 +152,7 @@ def test_a_static_pods_picture_is_not_changed():
     obj = admitted(container())
     obj["metadata"]["annotations"] = {MIRROR: "hash"}
 
-    found = wire(obj, URI)
+    found = wire(obj, TO)
 
     assert (found.spec, found.annotations) == (None, {})
     assert "static pod" in found.warnings[0]
@@ -179,8 +186,8 @@ _pods = st.builds(
 
 @given(_pods, _aliases)
 def test_wiring_twice_changes_nothing_more(obj, aliases):
-    first = wire(obj, URI, aliases)
-    second = wire(applied(obj, first), URI, aliases)
+    first = wire(obj, TO, aliases)
+    second = wire(applied(obj, first), TO, aliases)
 
     assert second.spec is None
     assert second.annotations == first.annotations
@@ -188,7 +195,7 @@ def test_wiring_twice_changes_nothing_more(obj, aliases):
 
 @given(_pods)
 def test_what_a_template_sets_comes_through_unharmed_and_last(obj):
-    found = wire(obj, URI)
+    found = wire(obj, TO)
     spec = found.spec or obj["spec"]
 
     for kind in ("containers", "initContainers"):
@@ -201,7 +208,7 @@ def test_what_a_template_sets_comes_through_unharmed_and_last(obj):
 
 @given(_pods)
 def test_every_container_has_a_master_and_an_address_in_the_end(obj):
-    spec = wire(obj, URI).spec or obj["spec"]
+    spec = wire(obj, TO).spec or obj["spec"]
 
     for one in (*spec["containers"], *spec["initContainers"]):
         there = {variable["name"] for variable in one["env"]}
@@ -212,7 +219,7 @@ def test_every_container_has_a_master_and_an_address_in_the_end(obj):
 def test_a_wired_pod_is_wired():
     obj = admitted(container())
 
-    stored = objects.pod(applied(obj, wire(obj, URI)))
+    stored = objects.pod(applied(obj, wire(obj, TO)))
 
     assert stored.wired == URI
     assert unwired(stored, rosproxy(), CLUSTER_IP) is None

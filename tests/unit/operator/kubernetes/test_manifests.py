@@ -92,6 +92,14 @@ def test_each_port_is_the_same_on_the_node() -> None:
     ]
 
 
+def test_ports_for_datagrams_are_those_of_the_range() -> None:
+    made = container(site(rosproxy(direction="both", udp=True), node(), publish=11500))
+    ports = {kind: {one["hostPort"] for one in made["ports"] if one["protocol"] == kind}
+             for kind in ("TCP", "UDP")}  # fmt: skip
+    assert ports["TCP"] == ports["UDP"] | {11500}
+    assert {"name": "ROSPROXY_UDP", "value": "1"} in made["env"]
+
+
 def test_it_can_do_nothing_that_it_need_not() -> None:
     pod, box = spec(), container()
     assert pod["automountServiceAccountToken"] is False

@@ -49,8 +49,9 @@ def test_names_are_in_the_rosproxys_namespace() -> None:
 def test_own_labels_are_recognized_and_selected() -> None:
     labels = names.own_labels("robot")
     assert names.is_own(labels)
-    assert all(f"{key}={value}" in names.OWN_SELECTOR for key, value in labels.items()
-               if key != names.PROXY_OF)  # fmt: skip
+    assert names.OWN_SELECTOR.endswith("app.kubernetes.io/component in (ear,proxy)")
+    rest = labels.items() - {(names.PROXY_OF, "robot"), (names.COMPONENT_LABEL, "proxy")}
+    assert all(f"{key}={value}" in names.OWN_SELECTOR for key, value in rest)
 
 
 @pytest.mark.parametrize("missing", list(names.own_labels("robot")))

@@ -9,19 +9,12 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.ros1.registry.stand_ins import PORTS
 from rosproxy_operator.kubernetes.planner import manifests
 from rosproxy_operator.kubernetes.planner.actions import CreatePolicy, DeletePolicy, SetPolicy
-from rosproxy_operator.kubernetes.planner.network_policy import policy, wanted_policies
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.planner.steps.network_policy import policy, wanted_policies
 from rosproxy_operator.kubernetes.resources import names, objects
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterSnapshot,
-    Json,
-    MasterSpec,
-    Name,
-    ProxyPolicy,
-    RosProxy,
-    Selector,
-)
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPolicy
+from rosproxy_operator.kubernetes.resources.model import Json, MasterSpec, Name, RosProxy, Selector
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,
     SETTINGS,
@@ -185,10 +178,17 @@ def test_a_role_that_lacks_the_right_is_told() -> None:
 
 
 def test_the_ports_that_stand_in_for_outside_are_for_selected_pods() -> None:
+    """For UDP, too: there the proxy takes what UDPROS sends out."""
     everybody, pods, _ = rules(direction="both")
-    stand_ins = {"protocol": "TCP", "port": PORTS[0], "endPort": PORTS[-1]}
-    assert pods["ports"] == [{"protocol": "TCP", "port": 11311}, stand_ins]
-    assert stand_ins not in everybody["ports"]
+    first, last = PORTS[0], PORTS[-1]
+    stand_ins = [{"protocol": one, "port": first, "endPort": last} for one in ("TCP", "UDP")]
+    assert pods["ports"] == [{"protocol": "TCP", "port": 11311}, *stand_ins]
+    assert not [one for one in stand_ins if one in everybody["ports"]]
+
+
+def test_the_window_is_open_for_datagrams_where_they_are_asked_for() -> None:
+    (tcp,) = rules(direction="both")[0]["ports"]
+    assert rules(direction="both", udp=True)[0]["ports"] == [tcp, {**tcp, "protocol": "UDP"}]
 
 
 def held(**changes: Any) -> RosProxy:

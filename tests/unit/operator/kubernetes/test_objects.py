@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.admin.status_document import read_status
-from rosproxy_operator.kubernetes.proxy_sync import RECENT, no_answer, report
+from rosproxy_operator.kubernetes.proxies.proxy_report import RECENT, no_answer, report
 from rosproxy_operator.kubernetes.resources.model import ELSEWHERE, Name
 from rosproxy_operator.kubernetes.resources.objects import node, pod, proxy_pod, service
 from rosproxy_operator.kubernetes.resources.values import host_problem

@@ -16,15 +16,13 @@ from rosproxy_operator.kubernetes.planner.actions import (
 )
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
 from rosproxy_operator.kubernetes.resources import names
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod, Stuck
 from rosproxy_operator.kubernetes.resources.model import (
     Advertise,
-    ClusterSnapshot,
     InvalidRosProxy,
     MasterSpec,
     Name,
-    ProxyPod,
     Reference,
-    Stuck,
 )
 from tests.unit.operator.kubernetes.objects import (
     ROBOT,

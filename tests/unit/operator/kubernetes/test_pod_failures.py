@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from rosproxy_operator.kubernetes.resources.model import Stuck
+from rosproxy_operator.kubernetes.resources.cluster import Stuck
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck as stuck_by_status
 from rosproxy_operator.kubernetes.resources.pod_failures import stuck_by_event
 

@@ -1,7 +1,7 @@
 """What is known of proxies that start, answer, fall silent and go."""
 
 import asyncio
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -13,9 +13,9 @@ from rosproxy.admin.status_document import ProxyStatus, read_status
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.tasks import Tasks
 from rosproxy_operator.common.proxy_client import PolicyRefused, ProxyClient, ProxyError
-from rosproxy_operator.kubernetes import proxy_sync
-from rosproxy_operator.kubernetes.proxy_sync import ClusterProxySync, token_for
-from rosproxy_operator.kubernetes.resources.model import ProxyPod
+from rosproxy_operator.kubernetes.proxies import proxy_sync
+from rosproxy_operator.kubernetes.proxies.proxy_sync import ClusterProxySync, token_for
+from rosproxy_operator.kubernetes.resources.cluster import ProxyPod
 from rosproxy_operator.kubernetes.resources.names import token_of
 from rosproxy_operator.kubernetes.resources.objects import proxy_pod
 from tests.unit.operator.kubernetes.api_server import until
@@ -37,6 +37,9 @@ class Told(ProxyClient):
         self.told: list[Any] = []
         self.callers: list[Any] = []
         self.deaf = False
+        self.former, self.version, self.listening = True, "1", 0
+        self.changed = asyncio.Event()
+        self.waited: list[tuple[str, float]] = []
         self.policies: list[Any] = []
         self.refuses: ProxyError | None = None
 
@@ -46,6 +49,22 @@ class Told(ProxyClient):
         if self.says is None or self.failing >= 0:
             raise ProxyError(f"{where} refuses connections")
         return read_status(self.says)
+
+    async def changes(
+        self, where: HostPort, token: str, since: str, within: float
+    ) -> tuple[str, ProxyStatus]:
+        self.waited.append((since, within))
+        if self.former:
+            raise ProxyError("no such path", status=404)
+        if not within or since != self.version:
+            return self.version, await self.status(where)
+        self.listening += 1
+        try:
+            await asyncio.wait_for(self.changed.wait(), within)
+        finally:
+            self.listening -= 1
+        self.changed.clear()
+        return self.version, await self.status(where)
 
     async def containers(self, where: HostPort, token: str, body: Any) -> dict[str, Any]:
         self.told.append(body)
@@ -58,8 +77,16 @@ class Told(ProxyClient):
         if self.refuses:
             raise self.refuses
 
-    async def selected(self, where: HostPort, token: str, addresses: Collection[str]) -> None:
+    async def selected(
+        self,
+        where: HostPort,
+        token: str,
+        addresses: Collection[str],
+        peers: Collection[str] | None = None,
+        former: Mapping[str, Sequence[int]] | None = None,
+    ) -> None:
         self.callers.append((token, *addresses))
+        self.peers = peers
         if self.deaf:
             raise ProxyError("unknown field selected")
 
@@ -69,7 +96,8 @@ class Talk:
         self.proxies, self.tasks, self.changes = Told(), Tasks(), 0
         self.all = ClusterProxySync(self.tasks, self.proxies, self.changed)
 
-    def changed(self) -> None:
+    def changed(self, namespaces: Iterable[str]) -> None:
+        assert [*namespaces] == ["robots"]
         self.changes += 1
 
     async def asked(self, times: int = 3) -> None:
@@ -81,6 +109,7 @@ class Talk:
 async def talk(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Talk]:
     monkeypatch.setattr(proxy_sync, "EVERY", 0.01)
     monkeypatch.setattr(proxy_sync, "EVERY_STARTING", 0.01)
+    monkeypatch.setattr(proxy_sync, "EVERY_FORMER", 0.01)
     one = Talk()
     yield one
     await one.tasks.cancel()
@@ -146,9 +175,9 @@ async def test_news_are_repeated_until_they_are_heard(talk: Talk) -> None:
     talk.all.report_gone({UID: ["10.0.0.2"], "nobody": ["10.0.0.3"]})
     await until(lambda: len(talk.proxies.told) > 2)
     talk.all.report_gone({UID: ["10.0.0.1"]})
-    talk.proxies.hears = True
+    talk.proxies.hears, changes = True, talk.changes
     await until(lambda: talk.proxies.told[-1] == {"gone": ["10.0.0.1", "10.0.0.2"]})
-    count, changes = len(talk.proxies.told), talk.changes
+    count = len(talk.proxies.told)
     await talk.asked()
     assert len(talk.proxies.told) == count
     assert talk.changes == changes + 1  # one more look whether the nodes are still there
@@ -188,14 +217,14 @@ async def test_it_is_told_who_may_call(talk: Talk) -> None:
     talk.all.follow([proxy()], KEY)
     await talk.asked()
     assert talk.proxies.callers == []  # nobody knows yet
-    talk.all.report_callers({UID: ("10.244.1.5",), "nobody": ()})
+    talk.all.report_callers({UID: ("10.244.1.5",), "nobody": ()}, {}, {})
     await until(lambda: bool(talk.proxies.callers))
     token = token_of(KEY, proxy().pod.id, "node1")
     assert talk.proxies.callers == [(token, "10.244.1.5")]
-    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     await talk.asked()
     assert len(talk.proxies.callers) == 1
-    talk.all.report_callers({UID: ()})
+    talk.all.report_callers({UID: ()}, {}, {})
     await until(lambda: len(talk.proxies.callers) == 2)
     assert talk.proxies.callers[-1] == (token,)
 
@@ -204,7 +233,7 @@ async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
     """And what a proxy does not understand keeps nothing else from it."""
     talk.proxies.says, talk.proxies.deaf = UP, True
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     talk.all.report_gone({UID: ["10.0.0.1"]})
     await until(lambda: len(talk.proxies.callers) > 2)
     assert talk.proxies.told == [{"gone": ["10.0.0.1"]}]
@@ -214,7 +243,7 @@ async def test_who_may_call_is_repeated_until_it_is_heard(talk: Talk) -> None:
 async def test_a_proxy_that_was_started_again_is_told_anew(talk: Talk) -> None:
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     await until(lambda: len(talk.proxies.callers) == 1)
     talk.all.follow([replace(proxy(), restarts=1)], KEY)
     await until(lambda: len(talk.proxies.callers) == 2)
@@ -258,7 +287,7 @@ async def test_without_its_policy_nobody_is_let_in(talk: Talk) -> None:
     talk.proxies.says, talk.proxies.refuses = UP, PolicyRefused("knows no policies")
     talk.all.follow([proxy()], KEY)
     talk.all.report_policies({UID: (LAYER,)})
-    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     talk.all.report_gone({UID: ["10.0.0.1"]})
     await until(lambda: UID in talk.all.reports)
     assert talk.all.reports[UID].refusal == "knows no policies"
@@ -273,7 +302,7 @@ async def test_it_is_told_now_and_then(talk: Talk, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(proxy_sync, "REPEATED", 0.02)
     talk.proxies.says = UP
     talk.all.follow([proxy()], KEY)
-    talk.all.report_callers({UID: ("10.244.1.5",)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
     await until(lambda: len(talk.proxies.callers) > 2)
 
 
@@ -281,7 +310,7 @@ async def test_another_key_is_another_token(talk: Talk) -> None:
     talk.proxies.says = UP
     for key in (KEY, b"l" * 32):
         talk.all.follow([proxy()], key)
-        talk.all.report_callers({UID: ("10.244.1.5",)})
+        talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
         said = token_of(key, proxy().pod.id, "node1")
         await until(lambda said=said: (said, "10.244.1.5") in talk.proxies.callers)  # type: ignore[misc]
 
@@ -292,3 +321,176 @@ def test_a_former_operators_token_is_in_the_pod() -> None:
     found = proxy_pod(obj)
     assert found is not None
     assert token_for(found, KEY) == "secret"
+
+
+async def listening(talk: Talk) -> None:
+    """Wait until the proxy is waited for."""
+    await until(lambda: talk.proxies.listening == 1)
+
+
+async def test_one_that_tells_of_changes_is_not_asked(talk: Talk) -> None:
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    asked = talk.proxies.asked
+    talk.proxies.says, talk.proxies.version = DOWN, "2"
+    talk.proxies.changed.set()
+    await until(lambda: not talk.all.reports[UID].master_up)
+    await listening(talk)
+    assert talk.proxies.asked == asked + 1
+    assert talk.proxies.waited[-1][0] == "2"
+    assert talk.changes == 2
+
+
+async def test_who_is_waited_for_can_be_told(talk: Talk) -> None:
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    talk.all.report_policies({UID: (LAYER,)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    await until(lambda: len(talk.proxies.callers) == 1)
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await until(lambda: talk.proxies.told == [{"gone": ["10.0.0.1"]}])
+    await until(lambda: talk.changes == 2)  # one more look whether the nodes are still there
+    await listening(talk)
+    # Once to begin, once to wait, once after it was told, and once more a while later.
+    assert [bool(within) for _, within in talk.proxies.waited] == [False, True, False, False]
+
+
+async def test_what_stays_there_is_not_told_over_and_over(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The operator looks again what has become of it after a while, not at once."""
+    monkeypatch.setattr(proxy_sync, "EVERY", 3600.0)
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await until(lambda: len(talk.proxies.waited) == 3)  # it is asked after it was told
+    assert talk.changes == 1
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await until(lambda: len(talk.proxies.waited) == 4)
+    assert talk.changes == 1
+
+
+@pytest.mark.parametrize("what", ["policy", "callers"])
+async def test_what_is_not_confirmed_is_told_again(talk: Talk, what: str) -> None:
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    if what == "policy":
+        talk.proxies.refuses = PolicyRefused("knows no policies")
+        talk.all.report_policies({UID: (LAYER,)})
+        await until(lambda: talk.all.reports[UID].refusal == "knows no policies")
+        talk.proxies.refuses = None
+        await until(lambda: talk.all.reports[UID].refusal == "")
+    else:
+        talk.proxies.deaf = True
+        talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+        await until(lambda: len(talk.proxies.callers) > 2)
+
+
+async def test_another_process_is_told_anew(talk: Talk) -> None:
+    talk.proxies.former, talk.proxies.says = False, {**UP, "instance": "a"}
+    talk.all.follow([proxy()], KEY)
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    await listening(talk)
+    talk.proxies.says, talk.proxies.version = {**UP, "instance": "b"}, "2"
+    talk.proxies.changed.set()
+    await until(lambda: len(talk.proxies.callers) == 2)
+
+
+async def test_one_that_falls_silent_is_asked_until_it_answers(talk: Talk) -> None:
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    talk.proxies.says, talk.proxies.version = None, "2"
+    talk.proxies.changed.set()
+    await until(lambda: not talk.all.reports[UID].answered)
+    talk.proxies.says = UP
+    await until(lambda: talk.all.reports[UID].answered)
+    await listening(talk)
+
+
+async def test_nobody_is_waited_for_who_is_not_there(talk: Talk) -> None:
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    talk.all.follow([])
+    await until(lambda: talk.proxies.listening == 0)
+
+
+async def test_proxies_whose_masters_hang_keep_nobody_waiting(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hung = 0
+
+    async def containers(*_: object) -> dict[str, Any]:
+        nonlocal hung
+        hung += 1
+        await asyncio.Event().wait()
+        return {}
+
+    monkeypatch.setattr(talk.proxies, "containers", containers)
+    talk.proxies.former, talk.proxies.says = False, UP
+    (well, *sick) = [
+        replace(proxy(), pod=replace(proxy().pod, uid=f"uid-{number}"))
+        for number in range(proxy_sync.AT_ONCE + 2)
+    ]
+    talk.all.follow([well, *sick], KEY)
+    await until(lambda: talk.proxies.listening == len(sick) + 1)
+    talk.all.report_gone({one.pod.uid: ["10.0.0.1"] for one in sick})
+    await until(lambda: hung == len(sick))
+    talk.all.report_callers({well.pod.uid: ("10.244.1.5",)}, {}, {})
+    await until(lambda: bool(talk.proxies.callers))
+
+
+async def test_one_that_leads_no_more_tells_nothing_more(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if it lost the lead while it was telling something."""
+    leading, asked, hears = True, asyncio.Event(), asyncio.Event()
+
+    async def policy(*_: object) -> None:
+        asked.set()
+        await hears.wait()
+
+    monkeypatch.setattr(talk.proxies, "policy", policy)
+    talk.proxies.former, talk.proxies.says = False, UP
+    talk.all = ClusterProxySync(talk.tasks, talk.proxies, talk.changed, lambda: leading)
+    talk.all.follow([proxy()], KEY)
+    await listening(talk)
+    talk.all.report_policies({UID: (LAYER,)})
+    talk.all.report_callers({UID: ("10.244.1.5",)}, {}, {})
+    talk.all.report_gone({UID: ["10.0.0.1"]})
+    await asked.wait()
+    leading = False
+    hears.set()
+    await talk.asked()
+    assert not talk.proxies.callers
+    assert not talk.proxies.told
+
+
+async def test_a_poller_that_ended_by_a_mistake_is_replaced(
+    talk: Talk, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def mistake(_: HostPort) -> ProxyStatus:
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(talk.proxies, "status", mistake)
+        talk.all.follow([proxy()], KEY)
+        await until(lambda: bool(caplog.records))
+    assert "polling" in caplog.text
+    talk.proxies.says = UP
+    talk.all.follow([proxy()], KEY)
+    await talk.asked()
+
+
+async def test_where_the_live_page_asks_each_proxy_and_with_which_token(talk: Talk) -> None:
+    talk.all.follow([proxy()], KEY)
+    ((name, way),) = talk.all.ways.items()
+    assert name == str(proxy().pod.id)
+    assert way == (HostPort("10.244.1.7", 11312), token_for(proxy(), KEY))
+    talk.all.follow([], KEY)
+    assert not talk.all.ways

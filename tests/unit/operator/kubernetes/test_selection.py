@@ -1,26 +1,15 @@
 """Which pods a RosProxy takes."""
 
-import re
-from collections.abc import Mapping
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from rosproxy_operator.kubernetes.planner.selection import (
+from rosproxy_operator.kubernetes.planner.pods.selection import (
     chosen,
-    label_selector,
     matches,
     nobody,
     on_node,
 )
-from rosproxy_operator.kubernetes.resources.model import (
-    ClusterFinding,
-    ClusterNode,
-    Name,
-    Selector,
-)
+from rosproxy_operator.kubernetes.resources.model import ClusterFinding, ClusterNode, Name, Selector
 from rosproxy_operator.kubernetes.resources.names import own_labels
 from tests.unit.operator.kubernetes.builders_api import pod, rosproxy
 
@@ -52,67 +41,6 @@ def expression(key: str, operator: str, *values: str) -> Selector:
 )
 def test_label_selectors(selector, labels, fits):
     assert matches(selector, labels) is fits
-
-
-def test_by_default_pods_are_asked_for_by_their_label():
-    assert label_selector(rosproxy().spec, "arm") == "rosproxy.io/inject in (arm,true)"
-
-
-def test_a_selector_as_the_api_server_takes_it():
-    selector = Selector(
-        {"b": "2", "a": ""},
-        (
-            ("tier", "NotIn", frozenset({"x", "y"})),
-            ("on", "Exists", frozenset()),
-            ("off", "DoesNotExist", frozenset()),
-        ),
-    )
-
-    assert label_selector(rosproxy(selector=selector).spec, "arm") == (
-        "a=,b=2,tier notin (x,y),on,!off,rosproxy.io/inject notin (,false)"
-    )
-
-
-def server_side(selector: str, labels: Mapping[str, str]) -> bool:
-    """What the API server makes of a selector: written anew from its grammar."""
-    return all(
-        requirement(one, labels) for one in re.split(r",(?![^(]*\))", selector) if one.strip()
-    )
-
-
-def requirement(text: str, labels: Mapping[str, str]) -> bool:
-    listed = re.fullmatch(r"(\S+) (in|notin) \((.*)\)", text)
-    if listed:
-        among = labels.get(listed[1]) in listed[3].split(",")
-        return among if listed[2] == "in" else not among
-    if "=" in text:
-        key, _, value = text.partition("=")
-        return labels.get(key) == value
-    return text[1:] not in labels if text.startswith("!") else text in labels
-
-
-_keys = st.sampled_from(["app", "example.org/tier", INJECT])
-_values = st.sampled_from(["", "a", "true", "false", "arm", "leg"])
-_labels = st.dictionaries(_keys, _values)
-
-
-def _expressions() -> st.SearchStrategy[tuple[str, str, frozenset[str]]]:
-    some = st.frozensets(_values, min_size=1, max_size=3)
-    return st.tuples(_keys, st.sampled_from(["In", "NotIn"]), some) | st.tuples(
-        _keys, st.sampled_from(["Exists", "DoesNotExist"]), st.just(frozenset())
-    )
-
-
-_selectors = st.builds(Selector, _labels, st.lists(_expressions(), max_size=3).map(tuple))
-
-
-@given(_selectors | st.none(), _labels)
-def test_the_api_server_gives_exactly_the_pods_that_are_taken(selector, labels):
-    one = rosproxy(selector=selector)
-
-    asked = server_side(label_selector(one.spec, one.id.name), labels)
-
-    assert asked is (chosen(pod(labels=labels), [one]) is one)
 
 
 @pytest.mark.parametrize(

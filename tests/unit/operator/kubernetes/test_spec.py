@@ -97,13 +97,17 @@ def test_masters(uri, read):
 def test_directions():
     def read(**spec):
         found = rosproxy(rosproxy_obj({"master": {"uri": "http://robot"}, **spec})).spec
-        return found.direction, found.pod_egress
+        return found.direction, found.pod_egress, found.udp
 
-    assert read() == ("out", "any")
-    assert read(direction="Both") == ("both", "any")
-    assert read(direction="Both", podEgress="Proxy") == ("both", "proxy")
+    assert read() == ("out", "any", False)
+    assert read(direction="Both") == ("both", "any", False)
+    assert read(direction="Both", podEgress="Proxy", udp=True) == ("both", "proxy", True)
     with pytest.raises(InvalidField, match=r"spec\.podEgress.*direction: Both"):
         read(podEgress="Proxy")
+    with pytest.raises(InvalidField, match=r"spec\.udp.*direction: Both"):
+        read(udp=True)
+    with pytest.raises(InvalidField, match=r"spec\.udp: 'yes' does not fit: write true or false"):
+        read(udp="yes")
 
 
 def test_a_masters_address():
@@ -260,7 +264,7 @@ _FIELDS = [
     *("master", "uri", "address", "service", "publish", "ports", "portWindow", "first", "last"),
     *("podSelector", "matchLabels", "matchExpressions", "key", "operator", "values", "advertise"),
     *("nodeSelector", "tolerations", "policy", "slaveControl", "cleanupAfterSeconds", "image"),
-    *("dataPlane", "direction", "podEgress"),
+    *("dataPlane", "direction", "podEgress", "udp"),
     *("imagePullSecrets", "resources", "hostAliases", "ip", "hostnames"),
 ]
 _json = st.recursive(

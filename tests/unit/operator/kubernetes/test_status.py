@@ -7,14 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rosproxy.leases.ports import PortRange
-from rosproxy_operator.kubernetes.resources.model import (
-    InvalidRosProxy,
-    NodeState,
-    Obstacle,
-    ProxyReport,
-    Selector,
-    Stuck,
-)
+from rosproxy_operator.kubernetes.resources.cluster import NodeState, Obstacle, ProxyReport, Stuck
+from rosproxy_operator.kubernetes.resources.model import InvalidRosProxy, Selector
 from rosproxy_operator.kubernetes.status.status import (
     LONGEST,
     MOST_NAMES,

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 
 from rosproxy_operator.common.threads import in_thread
-from rosproxy_operator.kubernetes.api import Api, ApiAway
+from rosproxy_operator.kubernetes.api.client import Api, ApiAway
+from rosproxy_operator.kubernetes.proxies.token_key import LENGTH, TokenKey
 from rosproxy_operator.kubernetes.resources.model import Name
-from rosproxy_operator.kubernetes.token_key import LENGTH, TokenKey
 from tests.unit.operator.kubernetes.api_server import ApiServer
 
 SECRET = Name("ns", "key")

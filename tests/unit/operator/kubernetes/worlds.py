@@ -3,28 +3,29 @@
 import copy
 from collections.abc import Iterator
 
+from msgspec.structs import replace
+
 from rosproxy.leases.ports import PortRange
 from rosproxy.settings import hash_token
 from rosproxy_operator.kubernetes.planner.actions import CreateProxy, DeleteProxy
-from rosproxy_operator.kubernetes.planner.network_policy import policy
 from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
-from rosproxy_operator.kubernetes.planner.selection import chosen, on_node
+from rosproxy_operator.kubernetes.planner.pods.selection import chosen, on_node, selects
+from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
 from rosproxy_operator.kubernetes.resources import names, objects
 from rosproxy_operator.kubernetes.resources import spec as parse_rosproxy
-from rosproxy_operator.kubernetes.resources.model import (
-    Name,
-    ProxyPlace,
-    ProxyPod,
-    RosProxy,
-)
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot, ProxyPod
+from rosproxy_operator.kubernetes.resources.model import Name, ProxyPlace, RosProxy
 from tests.unit.operator.kubernetes.simulation import (
     BAD_IMAGE,
+    NAMESPACE,
     SETTINGS,
     Cluster,
     Controller,
     Object,
     deleting,
     ended,
+    host_ports,
+    is_ear,
     is_own,
     meta,
     name_of,
@@ -44,13 +45,19 @@ def spec(number: int = 0) -> Object:
     }
 
 
+def container_of(pod: Object) -> Object:
+    found: Object = pod["spec"]["containers"][0]
+    return found
+
+
 class World:
     """A cluster with a controller, and what must always hold there."""
 
-    def __init__(self) -> None:
-        self.cluster = Cluster()
+    def __init__(self, namespace: str = NAMESPACE, names: dict[str, str] = NODES) -> None:
+        self.namespace, self.names = namespace, names
+        self.cluster = Cluster(namespace)
         self.controller = Controller(self.cluster, SETTINGS)
-        for name, ip in list(NODES.items())[:2]:
+        for name, ip in list(names.items())[:2]:
             self.cluster.add_node(name, ip)
         self.cluster.add_rosproxy("robot", spec())
         self.pods = 0
@@ -69,11 +76,19 @@ class World:
 
     def proxies(self) -> Iterator[tuple[Object, ProxyPod]]:
         for pod in self.own():
+            if is_ear(pod):
+                continue
             found = objects.proxy_pod(pod)
             assert found is not None
             yield pod, found
 
     # what the operator does
+
+    def observe(self) -> ClusterSnapshot:
+        """As the operator sees it."""
+        found = self.cluster.observe(self.controller.old, self.controller.failures)
+        selected = (pod for pod in found.pods if any(selects(of, pod) for of in found.rosproxies))
+        return replace(found, selected=frozenset(pod.uid for pod in selected))
 
     def in_status(self, place: ProxyPlace) -> PortRange | None:
         rosproxy = self.cluster.state.rosproxies.get(place.of)
@@ -119,7 +134,8 @@ class World:
             seen = self.controller.old or self.cluster.state
             there = [pod for pod in seen.pods.values() if node_of(pod) == place.node]
             others = (pod for pod in there if not ended(pod) and not is_own(pod))
-            taken = {port for pod in others for port in objects.pod(pod).host_ports}
+            of = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[action.of])
+            taken = {port for pod in others for port in objects.pod(pod).ports_of(of.spec)}
             assert not taken.intersection(range(first, last + 1)), "held by others"
         if before is not None and place not in self.may_move:
             count = self.cluster.state.rosproxies[action.of]["spec"]["ports"]
@@ -130,7 +146,8 @@ class World:
     def is_lawful(self, of: Name, ports: PortRange) -> bool:
         """Whether the RosProxy allows a range."""
         spec = self.cluster.state.rosproxies[of]["spec"]
-        own = {names.MASTER_PORT, names.ADMIN_PORT, spec["master"].get("publish", 0)}
+        publish = (spec["master"] or {}).get("publish", 0)
+        own = {names.MASTER_PORT, names.ADMIN_PORT, publish}
         inside = (
             spec["portWindow"]["first"] <= ports.first and ports.last <= spec["portWindow"]["last"]
         )
@@ -145,8 +162,9 @@ class World:
                 for pod in (state.pods.values() if state else ())
                 if place.node in (node_of(pod), meta(pod).get("annotations", {}).get(names.NODE))
                 and name_of(pod) != names.proxy_id(place.of, place.node)
+                and name_of(pod) != names.ear_id(place.of, place.node)
             ]
-            taken = {port for pod in others for port in objects.pod(pod).host_ports}
+            taken = {port for pod in others for port in objects.pod(pod).every_port}
             refused = {port for node, port in self.controller.state.taken if node == place.node}
             if any(port in ports for port in taken | refused):
                 self.may_move.add(place)
@@ -170,9 +188,7 @@ class World:
         assert len(there) == len(set(there)), "one proxy for each RosProxy on a node"
         for node in self.nodes:
             pods = [p for p in self.cluster.state.pods.values() if node_of(p) == node]
-            ports = [
-                port for p in pods if not ended(p) for port in sorted(objects.pod(p).host_ports)
-            ]
+            ports = [port for p in pods if not ended(p) for port in sorted(host_ports(p))]
             assert len(ports) == len(set(ports))
 
     def come_to_rest(self, _n: int = 0, _m: int = 0) -> None:
@@ -221,6 +237,27 @@ class World:
             assert there is not None
             assert there.spec == policy(one, SETTINGS)["spec"]
         self.check_addresses(unready)
+        self.check_ears(unready)
+
+    def check_ears(self, unready: set[str]) -> None:
+        """Each proxy that hears the LAN has an ear, which knows its address; nobody else has."""
+        there = {}
+        for pod in self.own():
+            if ear := objects.ear_pod(pod):
+                there[ProxyPlace(ear.of, ear.on)] = pod, ear
+        wanted = {}
+        for _, proxy in self.proxies():
+            of = self.cluster.state.rosproxies.get(proxy.of)
+            if of and of["spec"].get("multicast"):
+                wanted[ProxyPlace(proxy.of, proxy.on)] = proxy
+        assert {p for p in there if p.node not in unready} <= wanted.keys()
+        for place, proxy in wanted.items():
+            if place.node in unready or not proxy.pod.ip:
+                continue
+            env = {one["name"]: one["value"] for one in container_of(there[place][0])["env"]}
+            assert env["ROSPROXY_EAR_PROXY"] == f"{proxy.pod.ip}:{proxy.range.first}"
+            assert env["ROSPROXY_EAR_BIND"] == f"{self.names[place.node]}:{proxy.range.last}"
+            assert proxy.range.last not in proxy.pod.udp_ports
 
     def check_proxies(self, found: ClusterPlan, wanted: set[ProxyPlace], unready: set[str]) -> None:
         there = {ProxyPlace(one.of, one.on): (pod, one) for pod, one in self.proxies()}
@@ -238,13 +275,22 @@ class World:
                 found, place, "PortsExhausted"
             )
             env = {one["name"]: one["value"] for one in container["env"]}
+            self.check_versions(place, proxy, env)
             token = names.token_of(self.cluster.key, proxy.pod.id, place.node)
             assert env["ROSPROXY_ADMIN_TOKEN_HASH"] == hash_token(token)
-            service = "http://roscore.ros.svc:11311"
-            assert env["ROS_MASTER_URI"] == rosproxy["master"].get("uri", service)
-            publish = rosproxy["master"].get("publish")
+            service, master = "http://roscore.ros.svc:11311", rosproxy["master"]
+            assert env.get("ROS_MASTER_URI") == (master and master.get("uri", service))
+            publish = master and master.get("publish")
             if publish and not self.told(found, place, "PortConflict"):
                 assert env["ROSPROXY_PUBLISH_MASTER"] == str(publish)
+
+    def check_versions(self, place: ProxyPlace, proxy: ProxyPod, env: dict[str, str]) -> None:
+        """It has ports of the protocols that it needs, and is for the versions that are wanted."""
+        spec = parse_rosproxy.rosproxy(self.cluster.state.rosproxies[place.of]).spec
+        assert bool(proxy.pod.host_ports) == spec.ros1
+        assert bool(proxy.pod.udp_ports) == (spec.ros2 is not None)
+        domain = str(spec.ros2.number) if spec.ros2 else None
+        assert env.get("ROSPROXY_ROS2_DOMAINS") == domain
 
     def obstacles(self, found: ClusterPlan, place: ProxyPlace) -> bool:
         reasons = ("MasterUnknown", "NoAdvertiseHost", "NameTaken")

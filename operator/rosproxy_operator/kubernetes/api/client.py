@@ -1,0 +1,393 @@
+"""The API server as far as the operator needs it: a thin layer over the `kubernetes` client.
+
+Its service account may do exactly this. Those of the second part are for single objects, by
+name::
+
+    nodes                   list watch
+    pods                    get list watch create delete patch
+    pods/eviction           create
+    services                get list watch create delete
+    networkpolicies         get list watch create patch delete
+    events                  get list create patch
+    rosproxies              list watch
+    rosproxies/status       patch
+
+    secrets                                get patch
+    mutatingwebhookconfigurations          get patch
+    leases                                 get create patch
+
+Objects go in and out as JSON: the client's models would drop fields that are newer than they are.
+"""
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+from urllib.parse import quote
+
+import msgspec
+from kubernetes.client import ApiClient
+from kubernetes.client.exceptions import ApiException
+from kubernetes.config import ConfigException
+from urllib3.exceptions import HTTPError
+
+from rosproxy import __version__
+from rosproxy_operator.kubernetes.api.gate import Gate
+from rosproxy_operator.kubernetes.api.kubeconfig import NoCluster, configuration
+from rosproxy_operator.kubernetes.api.rbac import missing_rule
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.names import GROUP, OWN_SELECTOR, PLURAL, VERSION
+from rosproxy_operator.kubernetes.resources.values import part, word
+
+Found = dict[str, Any]
+Timeout = tuple[float, float]
+WITHIN: Timeout = (3.0, 15.0)
+"""Seconds to connect and to wait for an answer."""
+SOON: Timeout = (1.0, 2.0)
+"""The same while somebody waits for a pod to be admitted, or a Lease runs out."""
+ONCE: Timeout = (3.0, 10.0)
+"""The same where 429 is an answer: a PodDisruptionBudget does not allow it now."""
+WATCHED_FOR = 300
+"""Seconds after which the API server is to end a watch; another one goes on from there."""
+SILENT: Timeout = (3.0, 90.0)
+"""Seconds to connect for a watch, and without a word on it: a bookmark comes every minute."""
+PAGE = 500
+"""Objects in one answer to a list."""
+TRIES = 4
+"""How often something is asked that the API server puts off (429)."""
+LONGEST_PAUSE = 10.0
+"""Seconds that it may put it off at a time."""
+WEBHOOKS = "mutatingwebhookconfigurations"
+POLICIES = "networkpolicies"
+LEASES = "leases"
+_ROOTS = {
+    PLURAL: f"/apis/{GROUP}/{VERSION}",
+    WEBHOOKS: "/apis/admissionregistration.k8s.io/v1",
+    POLICIES: "/apis/networking.k8s.io/v1",
+    LEASES: "/apis/coordination.k8s.io/v1",
+}
+"""Where kinds are found that are not of the core group."""
+_TERMINATING = "because it is being terminated"
+"""What the admission plug-in NamespaceLifecycle says of a namespace that is being deleted.
+
+Nothing can be created there, and nothing is to be.
+"""
+_TEST_FAILED = "the server rejected our request due to an error in our request"
+"""All that the API server says when a ``test`` of a JSON patch fails."""
+_LONGEST = 500
+
+
+class ApiError(Exception):
+    """The API server did not do what it was asked; the message is one line.
+
+    Its subclasses say why, as far as that makes a difference.
+    """
+
+
+class ApiAway(ApiError):
+    """It can't be reached, or is not ready to answer."""
+
+
+class NotLeading(ApiAway):
+    """This operator does not lead: nothing was asked."""
+
+
+class ApiGone(ApiError):
+    """The object is not there, or the namespace is about to go that it is to be in."""
+
+
+class ApiConflict(ApiError):
+    """The name is taken, or the object is another one by now."""
+
+
+class ApiInvalid(ApiError):
+    """The object is not one that the API server takes."""
+
+
+class ApiLost(ApiAway):
+    """A watch has ended before its time: it goes on where it was."""
+
+
+class ApiExpired(ApiError):
+    """A list or a watch can't go on from where it was (410): list anew."""
+
+
+class Page(msgspec.Struct, frozen=True):
+    """A part of a list: the next one is asked for with ``more``, empty for the last.
+
+    ``version`` is that of the whole list: a watch goes on from there.
+    """
+
+    items: list[Found]
+    version: str
+    more: str
+
+
+class Event(msgspec.Struct, frozen=True):
+    """What a watch tells: ADDED, MODIFIED, DELETED, BOOKMARK (a version alone) or ERROR."""
+
+    type: str
+    object: Found
+
+
+class Watch:
+    """A watch that is open. Iterating gives events as they come, and ends with the watch."""
+
+    def __init__(self, response: Any) -> None:
+        self._response = response
+
+    def __iter__(self) -> Iterator[list[Event]]:
+        """Give events, those together that came together. Raises ApiLost."""
+        held = b""
+        try:
+            for chunk in self._response.stream():
+                *lines, held = (held + chunk).split(b"\n")
+                yield [_EVENT.decode(line) for line in lines if line]
+        except (HTTPError, OSError, msgspec.DecodeError, UnicodeDecodeError, ValueError) as error:
+            raise ApiLost(f"a watch was lost: {' '.join(str(error).split())[:200]}") from error
+        finally:
+            self._response.close()
+
+    def stop(self) -> None:
+        """End it, also from another thread."""
+        with contextlib.suppress(ValueError, RuntimeError, OSError):  # it has just ended
+            self._response.shutdown()
+
+
+_EVENT = msgspec.json.Decoder(Event)
+
+
+_KINDS: Mapping[int, type[ApiError]] = {
+    400: ApiInvalid,
+    401: ApiAway,  # the token has just been replaced, or the server does not know it yet
+    404: ApiGone,
+    409: ApiConflict,
+    410: ApiExpired,
+    422: ApiInvalid,
+    429: ApiAway,
+}
+
+
+class Api:
+    """The cluster that this process runs in, else the one that KUBECONFIG names.
+
+    Any thread may use it. Every method raises ApiError. ``namespaces``: looked after; none: all.
+    Nothing is changed, but for Leases, while the `Gate` is closed: NotLeading.
+    """
+
+    def __init__(self, namespaces: Sequence[str] = ()) -> None:
+        self._places, self.gate = tuple(namespaces) or ("",), Gate()
+        try:
+            settings = configuration()
+        except NoCluster as error:
+            raise ApiAway(str(error)) from error
+        self.server = str(settings.host)
+        self._client = ApiClient(settings)
+        self._client.user_agent = f"rosproxy-operator/{__version__}"
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._client.close()  # type: ignore[no-untyped-call]
+
+    def rosproxies(self, namespace: str = "", within: Timeout = WITHIN) -> list[Found]:
+        """All RosProxies, or those of a namespace, as they are at this moment."""
+        places = (namespace,) if namespace else self._places
+        lists = [self._ask("GET", _path(PLURAL, place), within=within) for place in places]
+        return [found for each in lists for found in self._items(each)]
+
+    def own_pods(self) -> list[Found]:
+        """The pods that the operator has made."""
+        query = {"labelSelector": OWN_SELECTOR}
+        lists = (self._ask("GET", _path("pods", place), query) for place in self._places)
+        return [found for each in lists for found in self._items(each)]
+
+    def places(self, kind: str) -> tuple[str, ...]:
+        """The namespaces in which a kind is watched; one that is empty for all of them.
+
+        Others' pods and Services count as well, so that those are all of the cluster.
+        """
+        return self._places if kind in (PLURAL, POLICIES) else ("",)
+
+    def page(self, kind: str, place: str, more: str = "") -> Page:
+        """A part of the list of a kind, as it is now. Raises ApiExpired, too."""
+        query = {"limit": str(PAGE), **_watched(kind), **({"continue": more} if more else {})}
+        found = self._ask("GET", _path(kind, place), query)
+        about = part(found, "metadata")
+        return Page(self._items(found), word(about, "resourceVersion"), word(about, "continue"))
+
+    def watch(self, kind: str, place: str, version: str) -> Watch:
+        """What happens to a kind after a version of its list. Raises ApiExpired, too."""
+        query = {"watch": "1", "resourceVersion": version, "allowWatchBookmarks": "true"}
+        query |= _watched(kind) | {"timeoutSeconds": str(WATCHED_FOR)}
+        answer = self._send("GET", _path(kind, place), query, within=SILENT)
+        if answer.status != 200:
+            raise refusal(int(answer.status), str(answer.reason or ""), self._body(answer))
+        return Watch(answer.response)
+
+    def fresh(self, kind: str, namespace: str, selector: str) -> list[Found]:
+        """What a field selector fits, as it is now in the API server's store."""
+        return self._items(self._ask("GET", _path(kind, namespace), {"fieldSelector": selector}))
+
+    def get(self, kind: str, id: Name, within: Timeout = WITHIN) -> Found:
+        """One object, for example of the kind ``services``."""
+        return self._ask("GET", _path(kind, id.namespace, id.name), within=within)
+
+    def create(self, kind: str, body: Json, within: Timeout = WITHIN) -> None:
+        """Create an object in the namespace that it names."""
+        self._ask("POST", _path(kind, body["metadata"]["namespace"]), body=body, within=within)
+
+    def delete(self, kind: str, id: Name, uid: str, version: str = "") -> None:
+        """Delete an object if it still has this uid, and this version if one is given."""
+        must = {"uid": uid, **({"resourceVersion": version} if version else {})}
+        options = {"apiVersion": "v1", "kind": "DeleteOptions", "preconditions": must}
+        self._ask("DELETE", _path(kind, id.namespace, id.name), body=options)
+
+    def evict(self, id: Name, uid: str) -> None:
+        """Delete a pod if it still has this uid. ApiAway: no PodDisruptionBudget allows it now."""
+        body = {
+            "apiVersion": "policy/v1",
+            "kind": "Eviction",
+            "metadata": {"namespace": id.namespace, "name": id.name},
+            "deleteOptions": {"preconditions": {"uid": uid}},
+        }
+        self._ask("POST", _path("pods/eviction", id.namespace, id.name), body=body, within=ONCE)
+
+    def patch(self, kind: str, id: Name, operations: list[Json], within: Timeout = WITHIN) -> None:
+        """Change an object, or a part of it as ``rosproxies/status``, by a JSON patch."""
+        self._ask("PATCH", _path(kind, id.namespace, id.name), body=operations, within=within)
+
+    def fill_secret(self, name: Name, there: Json, entries: Mapping[str, str]) -> None:
+        """Write entries (in base64) into a Secret, if it is as it was when it was read.
+
+        Raises ApiInvalid or ApiConflict if somebody else was faster, other ApiErrors.
+        """
+        version = word(part(there, "metadata"), "resourceVersion")
+        operations: list[Json] = [
+            {"op": "test", "path": "/metadata/resourceVersion", "value": version},
+            {"op": "add", "path": "/data", "value": {**part(there, "data"), **entries}},
+        ]
+        self.patch("secrets", name, operations)
+
+    def _items(self, found: Found) -> list[Found]:
+        items = found.get("items")
+        if not isinstance(items, list):
+            raise ApiAway(f"what answers at {self.server} is no API server")
+        return [item for item in items if isinstance(item, dict)]
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Json | list[Json] | None = None,
+        within: Timeout = WITHIN,
+    ) -> Found:
+        answer = self._patiently(method, path, query, body, within)
+        data = self._body(answer)
+        if not 200 <= answer.status <= 299:
+            raise refusal(int(answer.status), str(answer.reason or ""), data)
+        try:
+            return msgspec.json.decode(data, type=Found)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            raise ApiAway(f"what answers at {self.server}{path} is no API server") from None
+
+    def _patiently(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None,
+        body: Json | list[Json] | None,
+        within: Timeout,
+    ) -> Any:
+        """Its answer; where it puts callers off (429: nothing was begun) asked again, as it says.
+
+        Whoever has little time tries again himself.
+        """
+        for _ in range(TRIES if within is WITHIN else 1):
+            answer = self._send(method, path, query, body, within)
+            after = str(answer.getheader("Retry-After", ""))
+            if answer.status != 429 or not after.isdecimal():
+                break
+            self._body(answer)
+            time.sleep(min(float(after), LONGEST_PAUSE))
+        return answer
+
+    def _send(
+        self,
+        method: str,
+        path: str,
+        query: Mapping[str, str] | None = None,
+        body: Json | list[Json] | None = None,
+        within: Timeout = WITHIN,
+    ) -> Any:
+        """Its answer, of which the body is yet to be read. Raises ApiAway."""
+        patch = isinstance(body, list)
+        headers = {
+            "Accept": "application/json",
+            "Content-Type": "application/json-patch+json" if patch else "application/json",
+        }
+        try:
+            request = self._client.param_serialize(
+                method,
+                path,
+                query_params=[*(query or {}).items()],
+                header_params=headers,
+                body=body,
+                auth_settings=["BearerToken"],
+            )
+            if method == "GET" or path.startswith(_ROOTS[LEASES]):
+                return self._client.call_api(*request, _request_timeout=within)
+            with self.gate.passing() as may:
+                if not may:
+                    raise NotLeading("this operator does not lead")
+                return self._client.call_api(*request, _request_timeout=within)
+        except (HTTPError, ApiException, ConfigException, OSError) as error:
+            raise self._away(error) from error
+
+    def _body(self, answer: Any) -> bytes:
+        try:
+            return bytes(answer.read())
+        except (HTTPError, OSError) as error:
+            raise self._away(error) from error
+
+    def _away(self, error: Exception) -> ApiAway:
+        text = " ".join(str(error).split())[:200] or type(error).__name__
+        return ApiAway(f"the API server at {self.server} can't be reached: {text}")
+
+
+def _watched(kind: str) -> dict[str, str]:
+    """Which objects of a kind are watched: others' NetworkPolicies are nobody's business here."""
+    return {"labelSelector": OWN_SELECTOR} if kind == POLICIES else {}
+
+
+def _path(kind: str, namespace: str, name: str = "") -> str:
+    """Where objects of a kind, or one of them or a part of it as ``kind/part``, are found."""
+    kind, _, part = kind.partition("/")
+    where = ["namespaces", namespace, kind, name, part] if namespace else [kind, name, part]
+    return "/".join([_ROOTS.get(kind, "/api/v1"), *(quote(one, safe="") for one in where if one)])
+
+
+def refusal(status: int, reason: str, body: bytes) -> ApiError:
+    """The error for what the API server answered: HTTP status, reason phrase, body."""
+    message = _message(body) or reason
+    kind = _KINDS.get(status, ApiAway if status >= 500 else ApiError)
+    if status == 403:  # by a role, or by an admission plug-in that has looked at the object
+        if rule := missing_rule(message):
+            return ApiError(f"{rule} ({message})")
+        return ApiGone(message) if _TERMINATING in message else ApiInvalid(message)
+    if status == 422 and message == _TEST_FAILED:
+        return ApiConflict("the object has changed meanwhile")
+    if status == 401:
+        message = f"the API server does not know the operator's token or certificate ({message})"
+    elif kind is ApiAway:
+        message = f"the API server answers HTTP {status}: {message}"
+    return kind(message)
+
+
+def _message(body: bytes) -> str:
+    """The message of the ``Status`` object with which the API server refuses."""
+    text = body.decode(errors="replace")
+    with contextlib.suppress(ValueError, KeyError, TypeError):  # something else has answered
+        text = str(json.loads(text)["message"])
+    return " ".join(text.split())[:_LONGEST]

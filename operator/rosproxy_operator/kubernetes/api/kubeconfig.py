@@ -1,0 +1,33 @@
+"""Where the API server is, and who this process is to it."""
+
+import os
+from typing import Any
+
+from kubernetes.client import Configuration
+from kubernetes.config import ConfigException, load_incluster_config, load_kube_config
+
+CONNECTIONS = 16
+"""Connections to the API server that are kept."""
+
+
+class NoCluster(Exception):
+    """No cluster is known here; the message says what to do."""
+
+
+def configuration() -> Any:
+    """How to reach the API server. Raises NoCluster."""
+    found = Configuration()
+    try:
+        if os.environ.get("KUBERNETES_SERVICE_HOST"):
+            load_incluster_config(client_configuration=found)  # type: ignore[no-untyped-call]
+        else:
+            load_kube_config(client_configuration=found)  # type: ignore[no-untyped-call]
+    except (ConfigException, OSError) as error:
+        raise NoCluster(
+            f"no cluster is known here ({error}): run it in a pod with a service account, or name "
+            "a kubeconfig (KUBECONFIG)"
+        ) from error
+    # Whoever asks tries again, and is to know at once.
+    found.retries = False
+    found.connection_pool_maxsize = CONNECTIONS
+    return found

@@ -1,0 +1,28 @@
+"""The command below ``rosproxy-operator kubernetes``: it looks, and needs no running operator.
+
+It imports what it needs when it runs: the Kubernetes client may not be installed.
+"""
+
+import click
+
+from rosproxy_operator.common.words import one_line
+
+
+@click.command()
+@click.argument("names", nargs=-1, metavar="[TOPIC|NODE|SERVICE]...")
+@click.option("--json", "as_json", is_flag=True, help="Print it as JSON.")
+@click.pass_obj
+def doctor(namespaces: tuple[str, ...], names: tuple[str, ...], as_json: bool) -> None:
+    """Find out what is wrong in the cluster, and say what mends it, the first cause first.
+
+    Looks at the RosProxies, and asks the doctor of each proxy, in its pod, as you: that takes the
+    right to create pods/exec. With names: about those nodes, topics and services. Exits with 0 if
+    nothing is wrong, with 1 if something is.
+    """
+    from rosproxy.cli.questions import tell
+    from rosproxy_operator.kubernetes.api.client import ApiError
+    from rosproxy_operator.kubernetes.doctor import examine
+
+    with one_line(ApiError):
+        found = examine(namespaces, names)
+    tell(found, as_json)

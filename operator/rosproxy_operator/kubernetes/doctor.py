@@ -1,0 +1,85 @@
+"""``rosproxy-operator kubernetes doctor``: what is wrong in a cluster, the first cause first.
+
+First what the operator has written into the status of each RosProxy; then each proxy is asked by
+the doctor of its own pod (``kubectl exec``), which looks from where the proxy is. That takes the
+right to ``create`` ``pods/exec``, which whoever looks needs and the operator has not.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from kubernetes.client import ApiClient, CoreV1Api
+from kubernetes.client.exceptions import ApiException
+from kubernetes.stream import stream
+from websocket import WebSocketException
+
+from rosproxy.admin.findings import DoctorFinding, warning
+from rosproxy_operator.common.proxy_doctor import command, read_findings
+from rosproxy_operator.kubernetes.api.client import Api
+from rosproxy_operator.kubernetes.api.kubeconfig import configuration
+from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.names import ADVERTISE_HOST
+from rosproxy_operator.kubernetes.status.conditions import cluster_findings
+
+AT_ONCE = 4
+"""Proxies that are asked at the same time: each doctor is a Python of its own."""
+WITHIN = 60
+"""Seconds that a doctor has: it tries what may not answer."""
+_ADDRESS = f"spec.advertise, or the annotation {ADVERTISE_HOST}=ADDRESS on the node"
+CURES = {
+    "advertised host": _ADDRESS,
+    "published range": f"let its hostPorts through the node's firewall and any NetworkPolicy; or "
+    f"{_ADDRESS}",
+    "ports": "a larger spec.ports",
+}
+"""What mends what proxies find about themselves, by their checks."""
+
+
+def examine(namespaces: Sequence[str], names: Sequence[str]) -> list[DoctorFinding]:
+    """All findings; of proxies about these nodes and topics, if any. Raises ApiError."""
+    api = Api(namespaces)
+    try:
+        found = cluster_findings(api.rosproxies())
+        pods = [pod for pod in api.own_pods() if pod["status"].get("phase") == "Running"]
+    finally:
+        api.close()
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        said = threads.map(lambda pod: [*_ask(pod["metadata"], names)], pods)
+        return [*found, *(one for each in said for one in each)]
+
+
+def _ask(pod: Json, names: Sequence[str]) -> Iterator[DoctorFinding]:
+    """What the doctor in a pod finds."""
+    namespace, name = pod["namespace"], pod["name"]
+    subject = f"proxy {namespace}/{name}"
+    try:
+        said = _run(namespace, name, command(names))
+    except (ApiException, WebSocketException, OSError) as wrong:
+        why = getattr(wrong, "reason", "") or str(wrong)
+        first = str(why).strip().partition("\n")[0][:300]
+        text = f"its own doctor could not be asked ({first})"
+        fix = "may you create pods/exec? kubectl auth can-i create pods/exec -n "
+        yield warning("proxy", subject, text, fix + namespace)
+        return
+    yield from read_findings(subject, said, CURES)
+
+
+def _run(namespace: str, pod: str, words: Sequence[str]) -> bytes:
+    """What a command prints in a pod, to its end."""
+    with ApiClient(configuration()) as client:  # a stream makes it one for streams alone
+        channel = stream(
+            CoreV1Api(client).connect_get_namespaced_pod_exec,
+            pod,
+            namespace,
+            command=list(words),
+            stdout=True,
+            stderr=False,
+            stdin=False,
+            tty=False,
+            _preload_content=False,
+        )
+        try:
+            channel.run_forever(timeout=WITHIN)
+            return str(channel.read_stdout(timeout=1)).encode()
+        finally:
+            channel.close()

@@ -1,0 +1,177 @@
+"""Taking part in the choice of the operator that acts: reads the Lease, and writes it when it may.
+
+What is read and when is decided by `planner.leadership`; here are the clock, the requests, and who
+is told. The `leaderelection` of the `kubernetes` client does not do: it counts on the wall clock,
+renews in a loop that nobody can end and that gives nothing back, and does not say until when its
+leader may act. kopf's peering says of itself that it locks nothing.
+"""
+
+import asyncio
+import logging
+import random
+import socket
+import time
+import uuid
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from rosproxy_operator.common.metrics import ClusterMetrics
+from rosproxy_operator.common.threads import in_thread
+from rosproxy_operator.kubernetes.api.client import (
+    LEASES,
+    SOON,
+    Api,
+    ApiConflict,
+    ApiError,
+    ApiGone,
+)
+from rosproxy_operator.kubernetes.planner import leadership
+from rosproxy_operator.kubernetes.planner.leadership import LOOK, RENEW, Candidate, LeaseRecord
+from rosproxy_operator.kubernetes.resources.model import Json, Name
+from rosproxy_operator.kubernetes.resources.values import number, part, word
+
+log = logging.getLogger(__name__)
+
+LONGEST = 60.0
+"""Seconds that a Lease may promise at most: what is longer nobody here has written."""
+
+
+def clock() -> float:
+    """Seconds of a clock that nobody sets, and that goes on while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+class LeaderElection:
+    """One candidate. Without a ``lease`` there are no others, and it leads from the start.
+
+    `leads` may be asked from any thread, all else belongs to the event loop.
+    """
+
+    def __init__(self, api: Api, lease: Name | None, metrics: ClusterMetrics) -> None:
+        self._api, self._lease, self._metrics = api, lease, metrics
+        self._one = Candidate(f"{socket.gethostname()}_{uuid.uuid4()}")
+        self._leaving, self._room = False, asyncio.Lock()
+        self._shown = (-1, "")
+        self._error = ""
+        metrics.leader.set(lease is None)
+
+    def leads(self) -> bool:
+        """Whether this operator may act, at this moment."""
+        return self._lease is None or self._one.leads(clock())
+
+    def term(self) -> int:
+        """Which time this operator leads, from 1; 0: it does not."""
+        return (1 if self._lease is None else self._one.terms) if self.leads() else 0
+
+    async def run(self, changed: Callable[[], None]) -> None:
+        """Take part until it has left, or is cancelled. ``changed``: it leads now, or no more."""
+        while self._lease is not None and not self._leaving:
+            async with self._room:
+                if not self._leaving:
+                    self._one = await in_thread(self._round, self._one, self._lease)
+            self._show(changed)
+            # Not all at the same time; one that fails to renew has little time left.
+            calm = self.leads() and not self._error
+            await asyncio.sleep(RENEW if calm else LOOK * random.uniform(0.5, 1.0))  # noqa: S311
+        await asyncio.Event().wait()
+
+    def resign(self) -> None:
+        """Lead no more. The Lease is kept until `release`."""
+        self._leaving = self._lease is not None
+        self._one = leadership.resigned(self._one)
+
+    async def release(self) -> None:
+        """Let another one lead at once: this one has stopped to act."""
+        async with self._room:  # a renewal may be under way
+            self._one = leadership.resigned(self._one)
+            if self._lease is not None:
+                await in_thread(self._release, self._lease)
+        self._metrics.leader.set(0)
+
+    def _round(self, one: Candidate, lease: Name) -> Candidate:
+        """Look at the Lease once, and write it if that is right."""
+        try:
+            one = leadership.observe(one, self._read(lease), clock())
+            record = leadership.wanted(one, clock())
+            if record is not None:
+                begun = clock()
+                self._write(lease, record)
+                one = leadership.wrote(one, record, begun, clock())
+            self._error = ""
+        except ApiConflict:
+            log.debug("Lease %s: somebody else was faster", lease)
+        except ApiError as error:
+            if str(error) != self._error:
+                log.warning("Lease %s: %s", lease, error)
+            self._error = str(error)
+        return one
+
+    def _release(self, lease: Name) -> None:
+        try:
+            record = leadership.released(self._read(lease), self._one.name)
+            if record is not None:
+                self._write(lease, record)
+                log.info("leads no more: released the Lease %s", lease)
+        except ApiError as error:
+            log.warning("Lease %s: %s; another operator leads once it has run out", lease, error)
+
+    def _read(self, lease: Name) -> LeaseRecord | None:
+        try:
+            return lease_record(self._api.get(LEASES, lease, SOON))
+        except ApiGone:
+            return None
+
+    def _write(self, lease: Name, record: LeaseRecord) -> None:
+        """Write it if it is still as it was read. Raises ApiError."""
+        spec = lease_spec(record, datetime.now(UTC))
+        if not record.version:
+            meta = {"namespace": lease.namespace, "name": lease.name}
+            kind = {"apiVersion": "coordination.k8s.io/v1", "kind": "Lease"}
+            self._api.create(LEASES, {**kind, "metadata": meta, "spec": spec}, SOON)
+            return
+        operations: list[Json] = [
+            {"op": "test", "path": "/metadata/resourceVersion", "value": record.version},
+            {"op": "add", "path": "/spec", "value": spec},
+        ]
+        self._api.patch(LEASES, lease, operations, SOON)
+
+    def _show(self, changed: Callable[[], None]) -> None:
+        """Tell who leads, if that is another one than before."""
+        term, seen = self.term(), self._one.seen
+        other = seen.holder if seen and seen.holder != self._one.name else ""
+        holder = self._one.name if term else other
+        before, self._shown = self._shown, (term, holder)
+        if self._shown == before:
+            return
+        self._metrics.leader.set(bool(term))
+        if before[1] != holder and before[0] >= 0:
+            self._metrics.leader_changes.inc()
+        if term:
+            log.info("leads: this operator acts (%s)", holder)
+        else:
+            log.info("stands by: %s leads", holder or "nobody")
+        changed()
+
+
+def lease_record(obj: Json) -> LeaseRecord:
+    """A Lease, as k8s.io/api, coordination/v1/types.go, has it."""
+    spec = part(obj, "spec")
+    return LeaseRecord(
+        version=word(part(obj, "metadata"), "resourceVersion"),
+        holder=word(spec, "holderIdentity"),
+        duration=min(float(number(spec, "leaseDurationSeconds")), LONGEST),
+        transitions=number(spec, "leaseTransitions"),
+        acquired=word(spec, "acquireTime"),
+    )
+
+
+def lease_spec(record: LeaseRecord, now: datetime) -> Json:
+    """The spec of a Lease that is written ``now``; one that is taken says when that was."""
+    said = now.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    return {
+        "holderIdentity": record.holder,
+        "leaseDurationSeconds": int(record.duration),
+        "leaseTransitions": record.transitions,
+        "acquireTime": record.acquired or said,
+        "renewTime": said,
+    }

@@ -1,0 +1,120 @@
+"""Which pods a RosProxy takes."""
+
+from collections.abc import Iterable, Mapping
+
+from rosproxy_operator.kubernetes.resources.model import (
+    ClusterFinding,
+    ClusterNode,
+    Pod,
+    RosProxy,
+    Selector,
+)
+from rosproxy_operator.kubernetes.resources.names import COMPONENT_LABEL, INJECT, NAME_LABEL, is_own
+from rosproxy_operator.kubernetes.status.findings import pod_finding
+
+OFF = ("", "false")
+"""Values of the label with which a pod is left alone, whatever a podSelector says."""
+_ANY = "true"
+_PART_OF_LABEL = "app.kubernetes.io/part-of"
+
+
+def matches(selector: Selector, labels: Mapping[str, str]) -> bool:
+    """Whether a label selector fits labels.
+
+    As ``Requirement.Matches`` in k8s.io/apimachinery, pkg/labels/selector.go, says.
+    """
+    if any(labels.get(key) != value for key, value in selector.labels.items()):
+        return False
+    return all(_fits(*one, labels) for one in selector.expressions)
+
+
+def own_values(name: str) -> tuple[str, str]:
+    """The values of the label with which the RosProxy ``name`` is asked for."""
+    return _ANY, name
+
+
+def chosen(pod: Pod, rosproxies: Iterable[RosProxy]) -> RosProxy | ClusterFinding | None:
+    """The RosProxy of a pod, of those of any namespace that are not being deleted.
+
+    Of several it is the one that the pod's label names. A finding (reason Ambiguous or HostNetwork)
+    says why it has none though it was selected; None: it was not.
+    """
+    taking = sorted((one for one in rosproxies if selects(one, pod)), key=lambda one: one.id)
+    named = [one for one in taking if one.id.name == pod.labels.get(INJECT)]
+    if not taking:
+        return None
+    if not named and len(taking) > 1:
+        names = [one.id.name for one in taking]
+        text = (
+            f"is selected by RosProxy {' and '.join(names)}, so it is left out: set its label to "
+            f"one of them, as {INJECT}={names[0]}"
+        )
+        return pod_finding(pod, taking[0], "Ambiguous", text)
+    of = (named or taking)[0]
+    if pod.host_network:
+        text = (
+            "is in its node's own network (hostNetwork), so its ROS nodes need no proxy and get "
+            f"none: take hostNetwork off, or the label {INJECT}"
+        )
+        return pod_finding(pod, of, "HostNetwork", text)
+    return of
+
+
+def nobody(pod: Pod, rosproxies: Iterable[RosProxy]) -> str:
+    """Why no RosProxy takes a pod that is labelled, for a warning at admission.
+
+    Empty if the pod is not labelled, or its label says that it is to be left alone.
+    """
+    label = pod.labels.get(INJECT, "")
+    there = sorted(one.id.name for one in rosproxies if one.id.namespace == pod.id.namespace)
+    if label in OFF:
+        return ""
+    lost = "its ROS nodes are not reachable from outside"
+    if not there:
+        return (
+            f"no RosProxy in namespace {pod.id.namespace}, so {lost}: create one there, then "
+            "create the pod anew"
+        )
+    if label not in (_ANY, *there):
+        return (
+            f"label {INJECT}={label} names no RosProxy of namespace {pod.id.namespace}, so {lost}: "
+            f"set it to {' or '.join(there)}, then create the pod anew"
+        )
+    return (
+        f"spec.podSelector of RosProxy {' and '.join(there)} does not fit its labels, so {lost}: "
+        "change either, then create the pod anew"
+    )
+
+
+def on_node(rosproxy: RosProxy, node: ClusterNode) -> bool:
+    """Whether the RosProxy's nodeSelector fits a node."""
+    return matches(Selector(rosproxy.spec.node_selector), node.labels)
+
+
+def selects(rosproxy: RosProxy, pod: Pod) -> bool:
+    """Whether a RosProxy that is not being deleted selects a pod, be it with others."""
+    label, selector = pod.labels.get(INJECT), rosproxy.spec.pod_selector
+    here = rosproxy.id.namespace == pod.id.namespace
+    if not here or rosproxy.deleting or label in OFF or _is_ours(pod.labels):
+        return False
+    if selector is None:
+        return label in own_values(rosproxy.id.name)
+    return matches(selector, pod.labels)
+
+
+def _is_ours(labels: Mapping[str, str]) -> bool:
+    """Whether labels are those of a proxy, or of the operator as its chart labels it."""
+    whole = (labels.get(NAME_LABEL), labels.get(_PART_OF_LABEL))
+    return is_own(labels) or (labels.get(COMPONENT_LABEL) == "operator" and "rosproxy" in whole)
+
+
+def _fits(key: str, operator: str, values: frozenset[str], labels: Mapping[str, str]) -> bool:
+    match operator:
+        case "In":
+            return labels.get(key) in values
+        case "NotIn":
+            return labels.get(key) not in values
+        case "Exists":
+            return key in labels
+        case _:  # DoesNotExist
+            return key not in labels

@@ -1,0 +1,1 @@
+"""What is to be done next: for Services, proxies, ears, NetworkPolicies and unwired pods."""

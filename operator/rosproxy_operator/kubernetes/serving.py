@@ -1,0 +1,184 @@
+"""Running kopf in a thread of its own, again whenever it ends: it serves webhook and liveness.
+
+It watches nothing: for each object it would keep a task and the whole of what the API server says
+of it, and it ends as a whole when one of its watches does (`reflector` watches). Nothing depends on
+it but the admission of pods.
+"""
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from typing import Any, cast
+
+import kopf
+
+from rosproxy_operator.kubernetes.controller import KubernetesController
+from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.settings import KubernetesSettings
+from rosproxy_operator.kubernetes.webhook.injector import Injector
+from rosproxy_operator.kubernetes.webhook.server import WebhookServer
+
+log = logging.getLogger(__name__)
+
+WIRE = "wire"
+"""The id of the handler that wires pods, and so the path of the webhook."""
+BACK_OFF = (1.0, 2.0, 5.0, 10.0)
+"""Seconds until kopf is started again; the last is repeated."""
+WELL = 60.0
+"""Seconds after which a run counts as a good one."""
+STOPPING = 3.0
+"""Seconds that kopf has to end."""
+_BETWEEN_TRIES = (1.0, 1.0, 2.0, 3.0, 5.0)
+
+
+class Endless:
+    """Seconds between the tries of a request, without end: kopf would give up and end otherwise."""
+
+    def __iter__(self) -> Iterator[float]:
+        """Give them one after the other, the last for ever."""
+        yield from _BETWEEN_TRIES
+        while True:
+            yield _BETWEEN_TRIES[-1]
+
+
+def quieten() -> None:
+    """Keep kopf and the libraries below from telling of each request; looks say what is wrong."""
+    debug = logging.getLogger().isEnabledFor(logging.DEBUG)
+    for name in ("kopf", "kubernetes", "urllib3"):
+        logging.getLogger(name).setLevel(logging.INFO if debug else logging.CRITICAL)
+    logging.getLogger("asyncio").setLevel(logging.INFO)
+    logging.getLogger("aiohttp.access").setLevel(logging.WARNING)
+
+
+class ClusterServing:
+    """Serves liveness and, if it is given, the webhook, in a thread."""
+
+    def __init__(
+        self,
+        settings: KubernetesSettings,
+        controller: KubernetesController,
+        webhook: tuple[Injector, WebhookServer] | None,
+    ) -> None:
+        self._settings, self._controller = settings, controller
+        self._webhook = webhook
+        self._ending = threading.Event()
+        self._running: tuple[asyncio.AbstractEventLoop, asyncio.Task[None]] | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True, name="kopf")
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def restart(self) -> None:
+        """Let kopf begin anew."""
+        if self._running is not None:
+            loop, task = self._running
+            with contextlib.suppress(RuntimeError):  # it has just ended by itself
+                loop.call_soon_threadsafe(task.cancel)
+
+    def stop(self) -> None:
+        """End serving; waits for it, but not long."""
+        self._ending.set()
+        self.restart()
+        self._thread.join(STOPPING)
+
+    async def configure(self, settings: kopf.OperatorSettings, **_: Any) -> None:
+        """Set kopf up."""
+        settings.posting.enabled = False
+        settings.scanning.disabled = True
+        settings.peering.standalone = True
+        # It would kill this thread some minutes after kopf was only started again.
+        settings.process.ultimate_exiting_timeout = None
+        settings.networking.error_backoffs = Endless()
+        settings.networking.request_timeout = 30.0
+        settings.networking.connect_timeout = 5.0
+        settings.admission.managed = None
+        settings.admission.server = self._webhook[1] if self._webhook else None
+
+    def _run(self) -> None:
+        failures = 0
+        while not self._ending.is_set():
+            started = time.monotonic()
+            self._once()
+            failures = 1 if time.monotonic() - started > WELL else failures + 1
+            self._ending.wait(BACK_OFF[min(failures, len(BACK_OFF)) - 1])
+
+    def _once(self) -> None:
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                asyncio.run(self._operate())
+        except asyncio.CancelledError:
+            pass
+        except Exception as error:
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            log.warning("serving the webhook has ended (%s); starting it again", reason)
+        finally:
+            self._running = None
+
+    async def _operate(self) -> None:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        loop.set_exception_handler(_forgotten)
+        if task is not None:
+            self._running = loop, task
+        if self._ending.is_set():
+            return
+        namespaces = self._settings.namespaces
+        # kopf's own stop flag would hold it up for seconds when it ends for another reason.
+        await kopf.operator(
+            registry=self._handlers(),
+            standalone=True,
+            # kopf would ask for the user's name otherwise, and an image's user has none.
+            identity=cast(Any, "rosproxy-operator"),
+            liveness_endpoint=f"http://{self._settings.liveness}/healthz",
+            clusterwide=not namespaces,
+            namespaces=namespaces,
+        )
+
+    def _handlers(self) -> kopf.OperatorRegistry:
+        handlers, controller = kopf.OperatorRegistry(), self._controller
+        kopf.on.startup(registry=handlers, id="startup")(self.configure)
+        # As long as there are no credentials, kopf is not to end for it.
+        kopf.on.login(registry=handlers, backoff=5.0)(kopf.login_via_client)
+
+        @kopf.on.probe(registry=handlers, id="alive")
+        async def alive(**_: Any) -> str:
+            if reason := controller.dead():
+                # Anything else would be tried again for a minute before the probe is answered.
+                raise kopf.PermanentError(reason)
+            return "ok"
+
+        if self._webhook:
+            _serve(handlers, self._webhook[0])
+        return handlers
+
+
+def _serve(handlers: kopf.OperatorRegistry, injector: Injector) -> None:
+    @kopf.on.mutate(
+        "",
+        "v1",
+        "pods",
+        id=WIRE,
+        registry=handlers,
+        operations=["CREATE"],
+        labels={INJECT: kopf.PRESENT},
+        ignore_failures=True,
+    )
+    async def wire(
+        body: kopf.Body, patch: kopf.Patch, warnings: list[str], dryrun: bool, **_: Any
+    ) -> None:
+        # As it was sent: kopf's own is a view whose parts are no dictionaries.
+        wiring = await injector.wiring(dict(body), dryrun)
+        warnings.extend(wiring.warnings)
+        if wiring.spec is not None:
+            patch["spec"] = dict(wiring.spec)
+        if wiring.annotations:
+            patch.metadata["annotations"] = dict(wiring.annotations)
+
+
+def _forgotten(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Tasks that kopf leaves behind when it ends; why it does is told where it is started anew."""
+    log.debug("kopf: %s: %r", context.get("message"), context.get("exception"))

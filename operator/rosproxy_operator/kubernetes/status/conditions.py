@@ -1,0 +1,53 @@
+"""What the statuses of all RosProxies say is wrong, for the doctor."""
+
+from collections.abc import Iterable, Iterator
+
+from rosproxy.admin.findings import DoctorFinding, error, ok, warning
+from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.names import INJECT
+from rosproxy_operator.kubernetes.resources.values import number, parts, word
+
+_WRONG = {
+    "MasterReachable": "False",
+    "PortsAllocated": "False",
+    "Ready": "False",
+    "Degraded": "True",
+}
+"""With which status of a condition something is wrong; what others follow from goes first."""
+
+
+def cluster_findings(rosproxies: Iterable[Json]) -> list[DoctorFinding]:
+    """All findings of a cluster, by its RosProxies; each text once, where it is a cause."""
+    found = [one for each in rosproxies for one in _of(each)]
+    if not found:
+        fix = "kubectl apply -f a RosProxy; kubectl get crd rosproxies.rosproxy.io"
+        return [warning("rosproxy", "cluster", "there is no RosProxy", fix)]
+    return found
+
+
+def _of(rosproxy: Json) -> Iterator[DoctorFinding]:
+    metadata, status = rosproxy["metadata"], rosproxy.get("status", {})
+    subject = f"rosproxy {metadata['namespace']}/{metadata['name']}"
+    conditions = {word(one, "type"): one for one in parts(status, "conditions")}
+    if number(status, "observedGeneration") < metadata.get("generation", 0):
+        text = "the operator has not seen it as it is now"
+        fix = (
+            "does the operator run? kubectl get pods -A -l app.kubernetes.io/name=rosproxy-operator"
+        )
+        yield error("operator", subject, text, fix)
+    told: set[str] = set()
+    for kind, bad in _WRONG.items():
+        one = conditions.get(kind, {})
+        message = word(one, "message")
+        if word(one, "status") == bad and message not in told:
+            told.add(message)
+            fix = f"kubectl -n {metadata['namespace']} describe rosproxy {metadata['name']}"
+            yield error("rosproxy", subject, f"{kind} is {bad}: {message}", fix)
+    if told:
+        return
+    if number(status, "nodes"):
+        text = f"proxies {word(status, 'proxies')} ready, {number(status, 'rosNodes')} ROS nodes"
+        yield ok("rosproxy", subject, text)
+    else:
+        text = "it selects no pod that runs"
+        yield warning("rosproxy", subject, text, f"label pods with {INJECT}={metadata['name']}")

@@ -1,0 +1,218 @@
+"""Keeping up with one kind of object: list it, then watch what happens to it, in a thread.
+
+A watch that ends, after a while or because the API server is started anew, goes on from where it
+was; one that can't (410 Gone) begins with a new list. Now and then everything is listed anew in any
+case, to see whether something was missed. Lists come in pages. Whatever goes wrong, it is tried
+again, with pauses that grow and differ, so that not all watches come back at once.
+
+kopf's indices keep whole objects, in a task for each; the Kubernetes client's SharedInformer keeps
+them whole as well, lists them in one piece and can't be stopped while nothing happens. So these few
+lines are the operator's own. What the objects mean is the business of `records`, what has become of
+them that of `store`, which is told in the event loop.
+"""
+
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+from rosproxy_operator.kubernetes.api.client import (
+    Api,
+    ApiAway,
+    ApiError,
+    ApiExpired,
+    ApiLost,
+    Event,
+    Watch,
+)
+from rosproxy_operator.kubernetes.resources.model import Json
+from rosproxy_operator.kubernetes.resources.names import GROUP, PLURAL
+from rosproxy_operator.kubernetes.resources.records import READERS, Record, key_of
+from rosproxy_operator.kubernetes.resources.values import part, word
+
+log = logging.getLogger(__name__)
+
+PAUSES = (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Seconds until the API server is asked again, the last one repeated."""
+WELL = 10.0
+"""Seconds after which a watch that was lost was a good one."""
+CHECKED = 1800.0
+"""Seconds after which everything is listed anew though nothing seems to be missing."""
+DOUBTED = 60.0
+"""Seconds between two lists that are made because something known was not so."""
+SHORT = 1.0
+"""Seconds in which a watch that has told nothing must not end: it would be asked for in a loop."""
+STOPPING = 3.0
+"""Seconds that a thread has to end."""
+
+
+class Told(Protocol):
+    """Who is told, in the event loop. ``place`` is a namespace, empty for all."""
+
+    def changed(self, kind: str, place: str, changes: Mapping[str, Record | None]) -> None:
+        """These objects are so now, by their keys; None: gone."""
+
+    def listed(self, kind: str, place: str, records: Mapping[str, Record]) -> None:
+        """These are all objects."""
+
+    def failed(self, kind: str, place: str, error: ApiError) -> None:
+        """They can't be listed or watched."""
+
+
+class Reflector:
+    """Keeps up with a kind in a namespace. ``soon`` lets a function run in the event loop."""
+
+    def __init__(
+        self,
+        api: Api,
+        what: tuple[str, str],
+        told: Told,
+        soon: Callable[..., object],
+        lost: Callable[[], None],
+    ) -> None:
+        self._api, self._told, self._soon, self._lost = api, told, soon, lost
+        self._kind, self._place = what
+        self._ending = threading.Event()
+        self._watch: Watch | None = None
+        self._listed_at = 0.0
+        self._version = ""
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"watch {self._kind}")
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Let it end. `join` waits for that."""
+        self._ending.set()
+        if self._watch is not None:
+            self._watch.stop()
+
+    def doubt(self) -> None:
+        """List everything anew soon: what is known is not so."""
+        if time.monotonic() - self._listed_at > DOUBTED:
+            self._listed_at = -CHECKED
+            if self._watch is not None:
+                self._watch.stop()
+
+    def join(self) -> None:
+        """Wait until it has ended, but not long."""
+        self._thread.join(STOPPING)
+
+    def _run(self) -> None:
+        failures = 0
+        while not self._ending.is_set():
+            began = time.monotonic()
+            try:
+                if not self._version or began - self._listed_at > CHECKED:
+                    self._version = self._list()
+                self._follow()
+                failures = 0
+            except ApiError as error:
+                failures = 1 if time.monotonic() - began > WELL else failures + 1
+                # A version that the API server does not know is one of before its store was lost.
+                if isinstance(error, ApiExpired) or "resource version" in str(error).lower():
+                    self._version = ""
+                self._complain(error)
+                if not isinstance(error, ApiLost) or failures > 1:
+                    self._pause(failures)
+            except Exception as error:  # a mistake of ours must not blind the operator
+                log.exception("watching %s failed; going on", self._kind)
+                self._version, failures = "", failures + 1
+                self._complain(ApiAway(f"watching {self._kind} failed: {error!r}"))
+                self._pause(failures)
+
+    def _complain(self, error: ApiError) -> None:
+        log.debug("watching %s %s: %s", self._kind, self._place, error)
+        self._lost()
+        if not isinstance(error, ApiExpired | ApiLost):
+            self._tell(self._told.failed, error)
+
+    def _pause(self, failures: int) -> None:
+        longest = PAUSES[min(failures, len(PAUSES)) - 1]
+        self._ending.wait(longest * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
+
+    def _list(self) -> str:
+        """List all of it; the list's version."""
+        found: dict[str, Record] = {}
+        more = ""
+        while True:
+            page = self._api.page(self._kind, self._place, more)
+            for obj in page.items:
+                record = self._read(obj)
+                if record is not None:
+                    found[key_of(obj)] = record
+            more = page.more
+            if not more or self._ending.is_set():
+                break
+        self._listed_at = time.monotonic()
+        self._tell(self._told.listed, found)
+        return page.version
+
+    def _follow(self) -> None:
+        """Pass on what happens, until the watch ends, and keep the version that it has got to.
+
+        Also of a watch that is lost: what it has told would be told again from the beginning, and
+        objects would be again as they were then.
+        """
+        began, heard = time.monotonic(), False
+        self._watch = watch = self._api.watch(self._kind, self._place, self._version)
+        self._tell(self._told.changed, {})  # it works again, if it did not
+        if self._ending.is_set():
+            watch.stop()
+        for events in watch:
+            if self._ending.is_set():
+                break
+            if changes := self._changes(events):
+                self._tell(self._told.changed, changes)
+            self._version, heard = _version(events) or self._version, True
+        if not heard and time.monotonic() - began < SHORT:
+            raise ApiLost("a watch has ended at once")
+
+    def _changes(self, events: Iterable[Event]) -> dict[str, Record | None]:
+        """What objects are now, by their keys. Raises ApiError for an event that is one."""
+        found: dict[str, Record | None] = {}
+        for event in events:
+            if event.type == "ERROR":
+                raise _error(event.object)
+            if event.type == "BOOKMARK":
+                continue
+            gone = event.type == "DELETED"
+            found[key_of(event.object)] = None if gone else self._read(event.object)
+        return found
+
+    def _read(self, obj: Json) -> Record | None:
+        return READERS[self._kind](obj)
+
+    def _tell(self, function: Callable[..., None], what: object) -> None:
+        if not self._ending.is_set():
+            self._soon(function, self._kind, self._place, what)
+
+
+def _version(events: Iterable[Event]) -> str:
+    """The last version that events tell."""
+    told = (word(part(one.object, "metadata"), "resourceVersion") for one in events)
+    return ([one for one in told if one] or [""])[-1]
+
+
+def _error(status: Json) -> ApiError:
+    """What a watch is ended with."""
+    text = word(status, "message") or "a watch has ended"
+    return ApiExpired(text) if status.get("code") == 410 else ApiLost(text)
+
+
+def every_kind(api: Api) -> list[tuple[str, str]]:
+    """What is to be kept up with, and where; RosProxies first."""
+    return [(kind, place) for kind in READERS for place in api.places(kind)]
+
+
+def crd_missing(kind: str) -> str:
+    """What a list says that is not there at all; empty where that can't be."""
+    if kind != PLURAL:
+        return ""
+    return (
+        "the cluster has no RosProxies: install the CustomResourceDefinition "
+        f"{PLURAL}.{GROUP} (it comes with the chart and with manifests/)"
+    )

@@ -1,0 +1,46 @@
+"""The dashboard and the alerts, as people and other tests read them."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+from tests.chart.chart import CHART, ROOT, Json
+
+ALERTS = CHART / "files/alerts.yaml"
+DASHBOARD = CHART / "files/dashboard.json"
+GUIDE = ROOT / "docs/guide/monitoring.md"
+RUNBOOK = ROOT / "docs/guide/alerts.md"
+
+
+def alerts() -> list[Json]:
+    """All alerts."""
+    (group,) = yaml.safe_load(ALERTS.read_text())["groups"]
+    found: list[Json] = group["rules"]
+    return found
+
+
+def panels() -> list[Json]:
+    """The panels that show something, without the rows' titles."""
+    return [one for one in json.loads(DASHBOARD.read_text())["panels"] if one["type"] != "row"]
+
+
+def expressions() -> Iterator[tuple[str, str]]:
+    """Each panel's title with each of its queries, for all proxies and over half a minute."""
+    for panel in panels():
+        for target in panel["targets"]:
+            query = target["expr"].replace("$instance", ".*").replace("$__rate_interval", "30s")
+            yield panel["title"], query
+
+
+def metrics(query: str) -> set[str]:
+    """The metrics of the project and of its processes that a query names."""
+    return set(re.findall(r"\b(?:rosproxy|process)_\w+", query))
+
+
+def scrape_configs() -> list[Any]:
+    """The configurations of Prometheus in the guide."""
+    blocks = re.findall(r"^```yaml\n(.*?)^```$", GUIDE.read_text(), re.M | re.S)
+    return [yaml.safe_load(block) for block in blocks]

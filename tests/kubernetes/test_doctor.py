@@ -1,0 +1,78 @@
+"""``rosproxy-operator kubernetes doctor``, run where kubectl is."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.docker.engine import wait_until
+from tests.kubernetes import release
+from tests.kubernetes.cluster.layout import KUBECONFIG
+from tests.kubernetes.pods import Namespace
+from tests.kubernetes.robot import Robot
+from tests.kubernetes.rosproxies import rosproxy
+from tests.kubernetes.traffic import START, wait_for_service
+
+PROGRAM = Path(sys.executable).with_name("rosproxy-operator")
+
+
+def doctor(namespace: str) -> tuple[int, list[dict[str, Any]]]:
+    """The exit code, and what is found in a namespace."""
+    ended = subprocess.run(
+        [PROGRAM, "kubernetes", "--namespace", namespace, "doctor", "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+        env={**os.environ, "KUBECONFIG": str(KUBECONFIG)},
+    )
+    assert "Traceback" not in ended.stderr
+    found: list[dict[str, Any]] = json.loads(ended.stdout)["findings"]
+    return ended.returncode, found
+
+
+def test_it_asks_the_doctor_in_each_proxys_pod(net: Namespace, robot: Robot) -> None:
+    assert "there is no RosProxy" in doctor(net.name)[1][0]["text"]
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    wait_for_service(net)
+    net.node("roscpp", "pub", "--topic", "/told", "--word", "inside", on="node1")
+    made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted", START)
+
+    def masters() -> list[str]:
+        name = f"proxy {net.name}/{made.the_proxy('node1').name}: master"
+        return [one["text"] for one in doctor(net.name)[1] if one["subject"] == name]
+
+    wait_until(lambda: bool(masters()), 60, lambda: str(doctor(net.name)))
+    assert masters()[0].startswith(f"{robot.master_uri} answers in")
+    (own,) = [one for one in doctor(net.name)[1] if one["check"] == "rosproxy"]
+    assert own["severity"] == "ok"
+
+
+def page() -> dict[str, Any]:
+    """What the operator's live page shows of all proxies, as its pod's loopback sees it."""
+    code = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:11313/graph').read().decode())"
+    found: dict[str, Any] = json.loads(release.operator().run("python3", "-c", code))
+    return found
+
+
+def test_the_operators_page_shows_the_nodes_of_each_pod(net: Namespace, robot: Robot) -> None:
+    made = rosproxy(net.name, master={"uri": robot.master_uri}, ports=8)
+    wait_for_service(net)
+    pod = net.node("roscpp", "pub", "--topic", "/shown", "--word", "inside", on="node1")
+    made.wait_status(lambda s: s.get("rosNodes") == 1, "the ROS node is counted", START)
+    name = f"{net.name}/{made.the_proxy('node1').name}"
+    key = f"{name} /{pod.node}"
+    wait_until(lambda: key in page()["nodes"], 60, lambda: str(page()["nodes"]))
+    assert page()["nodes"][key]["lane"] == "container"
+
+
+def test_a_master_that_is_not_there_is_the_first_cause(net: Namespace) -> None:
+    made = rosproxy(net.name, master={"uri": "http://10.88.0.50:1"}, ports=4)
+    net.idle(on="node1")
+    made.wait_for("MasterReachable", "False")
+    code, found = doctor(net.name)
+    assert code == 1
+    assert found[0]["text"].startswith("MasterReachable is False: ")
+    assert "describe rosproxy" in found[0]["fix"]

@@ -1,0 +1,164 @@
+"""Two operators, of which one leads: killed, stopped, upgraded, with pods made all the while."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from tests.docker.engine import wait_until
+from tests.kubernetes import api, release
+from tests.kubernetes.measured import note
+from tests.kubernetes.pods import INJECT, Namespace, Pod, environment
+from tests.kubernetes.rosproxies import NOWHERE, RosProxy, rosproxy, wait_event
+from tests.kubernetes.test_operator_killed import no_operator
+
+EVERY = 0.2
+"""Seconds between two pods."""
+REMAKE = "rosproxy.io/remake-unwired"
+
+
+@pytest.fixture
+def made(net: Namespace) -> RosProxy:
+    """A RosProxy with a proxy on each node, which wait for their master."""
+    release.wait_operator()
+    found = rosproxy(net.name, master=NOWHERE, ports=4)
+    for node in ("node1", "node2"):
+        net.idle(on=node)
+    wait_until(lambda: len(found.proxies) == 2, 60, found.tell)
+    return found
+
+
+@contextmanager
+def pods_all_the_while(net: Namespace) -> Iterator[list[Pod]]:
+    """Pods are made, five a second, for as long as this lasts.
+
+    No node takes them: what matters is admission, which does not ask where they run.
+    """
+    pods: list[Pod] = []
+    ended = threading.Event()
+
+    def make() -> None:
+        while not ended.wait(EVERY):
+            pods.append(net.idle(nodeSelector={"nowhere": "true"}))
+
+    thread = threading.Thread(target=make)
+    thread.start()
+    try:
+        wait_until(lambda: len(pods) > 5, 30, "pods are made")
+        yield pods
+    finally:
+        ended.set()
+        thread.join()
+
+
+def unwired(net: Namespace) -> list[str]:
+    """The pods of users without the variable of their proxy."""
+    return [
+        body["metadata"]["name"]
+        for body in net.pods(INJECT)
+        if "ROS_MASTER_URI" not in environment(body["spec"]["containers"][0])
+    ]
+
+
+def check_once(made: RosProxy, uids: set[str]) -> None:
+    """Each proxy is the one that it was, and was made once."""
+    assert {proxy.uid_then for proxy in made.proxies} == uids, made.tell()
+    events = [event for event in made.events if event.reason == "ProxyCreated"]
+    assert [event.count for event in events] == [1, 1], made.tell()
+    assert not [event for event in made.events if event.reason == "ProxyDeleted"], made.tell()
+
+
+def wait_other(before: str) -> float:
+    """Wait until another one leads; in how many seconds it did."""
+
+    def other() -> bool:
+        return release.holder() not in ("", before)
+
+    return wait_until(other, 60, lambda: f"another one leads than {before}: {release.holder()}")
+
+
+def serves(net: Namespace, made: RosProxy) -> None:
+    """Wait until a new RosProxy is looked after, by whoever leads."""
+    nobody = {"matchLabels": {"a": "b"}}
+    other = rosproxy(net.name, f"{made.name}-2", master=NOWHERE, ports=4, podSelector=nobody)
+    wait_until(lambda: bool(other.service), 60, other.tell)
+
+
+@pytest.mark.parametrize("turn", [1, 2])
+def test_the_leader_is_killed(turn: int, net: Namespace, made: RosProxy) -> None:
+    """What is made while kube-proxy still leads to the one that is dead may come by unwired."""
+    uids, before = {proxy.uid_then for proxy in made.proxies}, release.holder()
+    with pods_all_the_while(net) as pods:
+        release.kill_operator()
+        took = wait_other(before)
+        serves(net, made)
+        release.wait_operator()
+        since = len(pods)
+        wait_until(lambda: len(pods) > since + 10, 60, "more pods are made")
+    left = unwired(net)
+    note(f"leader killed: another one led after {took:.1f} s; "
+         f"{len(left)} of {len(pods)} pods not wired")  # fmt: skip
+    assert not {pod.name for pod in pods[since:]} & set(left)
+    for name in left:
+        wait_event(net.name, name, "Pod", "NotWired")
+    check_once(made, uids)
+
+
+def test_the_leader_is_stopped(net: Namespace, made: RosProxy) -> None:
+    uids, before = {proxy.uid_then for proxy in made.proxies}, release.holder()
+    with pods_all_the_while(net) as pods:
+        release.operator().remove(wait=False)
+        took = wait_other(before)
+        serves(net, made)
+        release.wait_operator()
+    note(f"leader stopped: another one led after {took:.1f} s; {len(pods)} pods made")
+    assert unwired(net) == []
+    check_once(made, uids)
+
+
+def test_a_rolling_upgrade(net: Namespace, made: RosProxy) -> None:
+    uids = {proxy.uid_then for proxy in made.proxies}
+    former = {pod.name for pod in release.operators()}
+    with pods_all_the_while(net) as pods:
+        release.upgrade(podAnnotations={"upgraded": str(time.time())})
+        release.wait_operator()
+    assert not former & {pod.name for pod in release.operators()}
+    note(f"rolling upgrade: {len(pods)} pods made, all wired")
+    assert unwired(net) == []
+    check_once(made, uids)
+
+
+def test_they_are_on_nodes_of_their_own() -> None:
+    release.wait_operator()
+    nodes = [pod.body["spec"]["nodeName"] for pod in release.operators()]
+    assert sorted(nodes) == ["node1", "node2"]
+
+
+def test_what_came_by_unwired_is_made_anew_on_request(net: Namespace) -> None:
+    made = rosproxy(net.name, master=NOWHERE, ports=4)
+    wait_until(lambda: bool(made.service), 60, made.tell)
+    template = net.pod_body("unused", "sleep", "infinity", on="node1")
+    labels = {**template["metadata"]["labels"], "app": "talker"}
+    spec = {**template["spec"], "terminationGracePeriodSeconds": 0}
+    with no_operator():
+        alone = net.idle(on="node1")
+        api.create({
+            "apiVersion": "apps/v1", "kind": "Deployment",
+            "metadata": {"name": "talker", "namespace": net.name},
+            "spec": {"replicas": 2, "selector": {"matchLabels": {"app": "talker"}},
+                     "template": {"metadata": {"labels": labels}, "spec": spec}},
+        })  # fmt: skip
+        wait_until(lambda: len(net.pods("app=talker")) == 2, 60, "the Deployment has its pods")
+    pods = [body["metadata"]["name"] for body in net.pods("app=talker")]
+    for name in (*pods, alone.name):
+        wait_event(net.name, name, "Pod", "NotWired")
+    assert sorted(unwired(net)) == sorted((*pods, alone.name))
+
+    annotations = {"annotations": {REMAKE: "true"}}
+    api.patch("rosproxies", net.name, made.name, {"metadata": annotations})
+    wait_until(lambda: unwired(net) == [alone.name], 120, lambda: f"{unwired(net)} {made.tell()}")
+    for name in pods:
+        made.wait_event("PodEvicted", name)
+    assert alone.uid, "nobody would make it anew"

@@ -1,0 +1,334 @@
+"""Nodes of ROS 2: in pods of two nodes of the cluster and on a robot, in all directions."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import pytest
+
+from tests.docker.engine import wait_until
+from tests.docker.nodes import UNNOTICED, Log
+from tests.docker.ros2 import wait_for_line
+from tests.kubernetes import api, release
+from tests.kubernetes.cluster.control_plane import kubectl
+from tests.kubernetes.conftest import cluster
+from tests.kubernetes.measured import note
+from tests.kubernetes.pods import Namespace, Pod, namespace
+from tests.kubernetes.ros2 import Robot2, domain, ears, leased, node, robot_with_ros2
+from tests.kubernetes.rosproxies import Proxy, RosProxy, rosproxy, wait_event
+from tests.kubernetes.traffic import wait_for_service
+
+NODES = ("node1", "node2")
+START = 120
+"""Seconds that all nodes get to start and to meet, all at once."""
+
+
+@pytest.fixture(scope="module")
+def robot2(_release: None) -> Iterator[Robot2]:
+    with robot_with_ros2() as found:
+        yield found
+
+
+@dataclass
+class World:
+    """Who hears, by what it ought to hear: the log, the word and the verb."""
+
+    net: Namespace
+    rosproxy: RosProxy
+    heard: dict[str, tuple[Log, str]] = field(default_factory=dict)
+    replies: dict[str, Log] = field(default_factory=dict)
+    results: dict[str, Log] = field(default_factory=dict)
+    pods: list[Pod] = field(default_factory=list)
+
+    def pod(self, vendor: str, kind: str, topic: str, *options: str, on: str) -> Log:
+        self.pods.append(node(self.net, vendor, kind, topic, *options, on=on))
+        return self.pods[-1].log
+
+    @property
+    def flows(self) -> dict[str, tuple[Log, str]]:
+        """Some of what is heard, by its way."""
+        return {
+            "outward": self.heard["the robot hears /one"],
+            "inward": self.heard["jazzy on node1 hears /robot"],
+            "across": self.heard["jazzy on node2 hears /one"],
+        }
+
+    def gaps(self, since: float) -> str:
+        """The longest times without messages, and how many were lost."""
+        return ", ".join(
+            f"{way} {log.longest_gap(word, since, time.time()):.1f}, lost {log.lost(word, since)}"
+            for way, (log, word) in self.flows.items()
+        )
+
+
+@pytest.fixture(scope="module")
+def world(robot2: Robot2) -> Iterator[World]:
+    """Everything at once, so that it is waited for once; outside is found on the LAN."""
+    with namespace() as net:
+        made = World(net, rosproxy(net.name, ros=2, multicast=True, ports=64))
+        wait_for_service(net)
+        _fill(made, robot2)
+        try:
+            yield made
+        finally:
+            robot2.end_all()
+
+
+def _fill(made: World, robot2: Robot2) -> None:
+    pod, robot = made.pod, robot2.node
+    pod("jazzy", "pub", "/one", "--word", "one", on="node1")
+    pod("kilted", "pub", "/two", "--word", "two", on="node2")
+    pod("cyclone", "pub", "/cyclone", "--word", "cyclone", on="node1")
+    robot("jazzy", "pub", "/robot", "--word", "robot")
+    for topic in ("one", "two", "cyclone"):
+        made.heard[f"the robot hears /{topic}"] = (robot("jazzy", "sub", f"/{topic}"), topic)
+    made.heard["Cyclone on the robot hears /one"] = (robot("cyclone", "sub", "/one"), "one")
+    for vendor, on, topic in (
+        ("jazzy", "node1", "robot"), ("cyclone", "node2", "robot"),
+        ("kilted", "node1", "one"), ("jazzy", "node2", "one"), ("jazzy", "node1", "two"),
+        ("jazzy", "node1", "cyclone"),
+    ):  # fmt: skip
+        ear = pod(vendor, "sub", f"/{topic}", on=on)
+        made.heard[f"{vendor} on {on} hears /{topic}"] = (ear, topic)
+    pod("jazzy", "serve", "/add", on="node1")
+    robot("kilted", "serve", "/robot_add")
+    made.replies["the robot calls a pod"] = robot("jazzy", "call", "/add")
+    made.replies["a pod calls the robot"] = pod("jazzy", "call", "/robot_add", on="node2")
+    made.replies["a pod calls one on another node"] = pod("kilted", "call", "/add", on="node2")
+    pod("jazzy", "act", "/fibonacci", on="node2")
+    robot("jazzy", "act", "/robot_fibonacci")
+    made.results["the robot pursues"] = robot("jazzy", "pursue", "/fibonacci")
+    made.results["a pod pursues"] = pod("jazzy", "pursue", "/robot_fibonacci", on="node1")
+
+
+def test_everybody_hears_everybody(world: World) -> None:
+    """Pods of one node, of both, and a robot; Fast DDS of two releases, and Cyclone DDS."""
+    for who, (log, word) in world.heard.items():
+        print(who)
+        log.wait_for(word, seconds=START)
+
+
+def test_services(world: World) -> None:
+    for who, log in world.replies.items():
+        print(who)
+        wait_for_line(log, "^reply ", seconds=START)
+
+
+def test_actions(world: World) -> None:
+    for who, log in world.results.items():
+        print(who)
+        wait_for_line(log, "^feedback ", seconds=START)
+        wait_for_line(log, "^result 0 1 1 2 3 5 8 13 21$", count=1, seconds=START)
+
+
+def test_what_users_are_told(world: World) -> None:
+    of, count = world.rosproxy, len(world.pods)
+
+    of.wait_for("Ready", reason="Serving")
+    status = of.wait_status(lambda told: told.get("participants") == count, "all participants")
+
+    assert (status["domain"], status["proxies"]) == (0, "2/2")
+    assert {"master", "masterURI"}.isdisjoint(status)
+    assert status["staticPeers"] == of.service["spec"]["clusterIP"]
+    assert {one["type"] for one in status["conditions"]} == {"Ready", "PortsAllocated", "Degraded"}
+    assert "participants of domain 0" in of.condition("Ready")["message"]
+    assert sum(line["participants"] for line in status["perNode"]) == count
+    assert "Domain" in kubectl("-n", of.namespace, "describe", "rosproxy", of.name)
+    (one, *_), port = world.pods, of.service["spec"]["ports"][0]
+    assert one.environment["ROS_STATIC_PEERS"] == status["staticPeers"]
+    assert (port["protocol"], port["port"]) == ("UDP", 7410)
+    assert len(ears(of)) == len(NODES)
+
+
+def test_seconds_to_the_first_message(world: World, robot2: Robot2) -> None:
+    """Of a pod that comes where its proxy is, to a robot that waits for it."""
+    ear = robot2.node("jazzy", "sub", "/late", name="ear")
+    world.heard["the robot hears /one"][0].wait_for("one", since=time.time())
+    late = node(world.net, "jazzy", "pub", "/late", "--word", "late", on="node1")
+    late.wait_ready()
+    ready = time.time()
+    wait_for_line(late.log, "^sent 0$", count=1)
+    sent = time.time()
+    first = ear.wait_for("late")
+    note(f"ROS 2: the first message outside {first - ready:.1f} s after its pod was seen Ready, "
+         f"{first - sent:.1f} s after it was seen to be sent")  # fmt: skip
+    late.remove()
+    robot2.end("ear")
+
+
+def test_a_pod_that_is_gone_takes_its_participant_with_it(world: World, robot2: Robot2) -> None:
+    """Without word of it the robot would believe in it for the 20 s of its lease."""
+    watcher = robot2.node("jazzy", "names", "/any", name="watcher")
+    pod = node(world.net, "jazzy", "pub", "/any", on="node2")
+    wait_for_line(watcher, rf"^nodes .*\b{pod.node}\b")
+
+    pod.crash()  # it can't say so itself
+    pod.remove(grace=0)
+
+    def gone() -> bool:
+        line = re.findall("^nodes .* end$", watcher.read(), re.MULTILINE)[-1]
+        return pod.node not in line.split()
+
+    took = wait_until(gone, 15, watcher.read)
+    robot2.end("watcher")
+    note(f"ROS 2: outside has forgotten a pod's node {took:.1f} s after the pod was gone")
+
+
+def _ear_of(of: RosProxy) -> Pod:
+    (name,) = (e["metadata"]["name"] for e in ears(of) if e["spec"]["nodeName"] == "node1")
+    return Pod(of.namespace, name)
+
+
+LOSSES: dict[str, Callable[[RosProxy, Proxy], object]] = {
+    "operator killed": lambda _of, _proxy: release.kill_operator(),
+    "proxy crashes": lambda _of, proxy: proxy.crash(),
+    "proxy's pod deleted": lambda _of, proxy: proxy.remove(),
+    "proxy's pod deleted by force": lambda _of, proxy: proxy.remove(grace=0),
+    "API server killed": lambda _of, _proxy: cluster("restart-apiserver"),
+    "ear crashes": lambda of, _proxy: _ear_of(of).crash(),
+    "ear's pod deleted": lambda of, _proxy: _ear_of(of).remove(),
+}
+
+
+@pytest.mark.parametrize("how", LOSSES)
+def test_what_is_lost_comes_back(how: str, world: World, robot2: Robot2) -> None:
+    """On the same ports, for the same participants; outside and inside hear on."""
+    of, flows = world.rosproxy, world.flows
+    proxy = of.the_proxy("node1")
+    for log, word in flows.values():
+        log.wait_for(word, since=time.time())
+    wait_until(lambda: all(one.kept for one in domain(proxy).inside), 30, "ports are kept")
+    before, lost = leased(proxy), time.time()
+
+    LOSSES[how](of, proxy)
+
+    now = of.the_proxy("node1", seconds=60)
+    wait_until(lambda: leased(now) == before, 60, lambda: f"{leased(now)} is not {before}")
+    wait_until(lambda: len(ears(of)) == len(NODES), 60, of.tell)
+    _ear_of(of).wait_ready(60)
+    release.wait_operator()
+    end = time.time()
+    for log, word in flows.values():
+        log.wait_for(word, count=10, since=end)
+    note(f"ROS 2, {how}: seconds without messages {world.gaps(lost)}")
+    assert (now.ports, now.name) == (proxy.ports, proxy.name)
+    late = robot2.node("jazzy", "sub", "/one", name="late")
+    late.wait_for("one", since=end)
+    robot2.end("late")  # or each test begins with one node more than the one before
+
+
+def test_on_other_ports_participants_meet_anew(world: World) -> None:
+    """Of a RosProxy that forbids the former ones."""
+    of, changed = world.rosproxy, time.time()
+
+    of.change(portWindow={"first": 13000, "last": 13199})
+
+    wait_until(lambda: all(of.the_proxy(on).first_port >= 13000 for on in NODES), 60, of.tell)
+    end = time.time()
+    for log, word in world.flows.values():
+        log.wait_for(word, count=10, since=end)
+    note(f"ROS 2, other ports: seconds without messages {world.gaps(changed)}")
+
+
+def _all_leased(of: RosProxy) -> list[dict[str, list[int]]]:
+    return [leased(of.the_proxy(on)) for on in NODES]
+
+
+def test_another_image_of_the_proxies(world: World) -> None:
+    """It is changed in place: the same pods, the same ports; one proxy after the other."""
+    of = world.rosproxy
+    wait_until(lambda: all(one.kept for one in domain(of.the_proxy()).inside), 30, "kept ports")
+    before, started = _all_leased(of), time.time()
+
+    release.upgrade(proxy={"image": {"tag": release.other_image()}})
+    wait_until(lambda: all(of.the_proxy(on).restarts > 0 for on in NODES), 90, of.tell)
+
+    wait_until(lambda: _all_leased(of) == before, 60, of.tell)
+    end = time.time()
+    for log, word in world.flows.values():
+        log.wait_for(word, count=10, since=end)
+    note(f"ROS 2, another image: seconds without messages {world.gaps(started)}")
+    release.upgrade()
+    release.wait_operator()
+
+
+def test_a_node_is_stopped_and_comes_back(world: World) -> None:
+    """The robot and the other node's pods hear each other meanwhile; then all do again."""
+    of, lost_node = world.rosproxy, "node2"
+    ports = of.the_proxy(lost_node).ports
+    back = world.heard["the robot hears /two"], world.heard["jazzy on node2 hears /one"]
+    lost = time.time()
+    cluster("stop-node", lost_node)
+    try:
+        of.wait_status(lambda told: not of.on(lost_node).get("ready"), "it is told", 60)
+        outward, inward = world.flows["outward"], world.flows["inward"]
+        outside = max(log.longest_gap(word, lost, time.time()) for log, word in (outward, inward))
+        assert outside < UNNOTICED, outside
+    finally:
+        cluster("start-node", lost_node)
+    up = time.time()
+    took = [log.wait_for(word, since=up, seconds=120) - up for log, word in back]
+    assert of.the_proxy(lost_node, seconds=60).ports == ports
+    note(f"ROS 2, node stopped: messages of its pods again {took[0]:.1f} s, and for them "
+         f"{took[1]:.1f} s after it is ready")  # fmt: skip
+    release.wait_operator()
+
+
+def test_helm_test(robot2: Robot2) -> None:
+    """Through a proxy on either node: the test's two pods keep away from each other."""
+    release.upgrade(tests={"ros": 2})
+    told = release.helm("test", release.NAME, "--namespace", release.NAMESPACE, seconds=300)
+    assert re.search("PASSED: a message went to the pod on node node[12] and back", told), told
+    assert "both pods are on node" not in told
+    release.upgrade()
+
+
+def test_two_rosproxies_two_domains_without_multicast(robot2: Robot2) -> None:
+    """By peers; the domain goes into the pods. Somebody holds ports in their window."""
+    with namespace() as net:
+        taken = net.idle(on="node1", ports=(12000, 12008), protocol="UDP", labels={})
+        taken.wait_ready()
+        window = {"first": 12000, "last": 12063}
+        peers = ["10.88.0.51"]
+        found = [
+            rosproxy(net.name, f"domain-{number}", ros=2, domain=number, peers=peers,
+                     portWindow=window, ports=10)
+            for number in (5, 6)
+        ]  # fmt: skip
+        wait_for_service(net)
+        robot_ears = {n: robot2.node("jazzy", "sub", "/word", domain=n) for n in (5, 6)}
+        for number in (5, 6):
+            robot2.node("kilted", "pub", "/back", "--word", f"robot{number}", domain=number)
+        pods = {}
+        for number in (5, 6):
+            label = {"rosproxy.io/inject": f"domain-{number}"}
+            node(net, "jazzy", "pub", "/word", "--word", f"pod{number}", on="node1", labels=label)
+            pods[number] = node(net, "jazzy", "sub", "/back", on="node1", labels=label)
+        for number in (5, 6):
+            robot_ears[number].wait_for(f"pod{number}", count=10, seconds=START)
+            pods[number].log.wait_for(f"robot{number}", count=10, seconds=START)
+            other = 11 - number
+            assert robot_ears[number].got(f"pod{other}") == []
+            assert pods[number].log.got(f"robot{other}") == []
+            assert pods[number].environment["ROS_DOMAIN_ID"] == str(number)
+        ranges = [of.the_proxy("node1").ports for of in found]
+        assert ranges == ["12009-12018", "12019-12028"]
+        assert all(of.status["domain"] == n for of, n in zip(found, (5, 6), strict=True))
+        robot2.end_all()
+
+
+def test_what_a_pod_cannot_have_is_told(net: Namespace) -> None:
+    of = rosproxy(net.name, ros=2, domain=3, peers=["10.88.0.51"])
+    wait_for_service(net)
+
+    for reason, variables in {
+        "NoDds": {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"},
+        "TooOld": {"ROS_DISTRO": "humble"},
+        "NotWired": {"ROS_STATIC_PEERS": "192.0.2.9"},
+        "OtherDomain": {"ROS_DOMAIN_ID": "4"},
+        "Alone": {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"},
+    }.items():
+        pod = net.idle(on="node1", env=variables)
+        wait_event(net.name, pod.name, "Pod", reason)
+    assert api.get("networkpolicies", net.name, f"rosproxy-{of.name}")

@@ -1,0 +1,18 @@
+"""What is known of a cluster whose watches have told everything."""
+
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.records import READERS, key_of
+from rosproxy_operator.kubernetes.watch.store import ClusterStore
+from tests.unit.operator.kubernetes.api_server import ApiServer
+
+
+def known(server: ApiServer, key: bytes = b"") -> ClusterSnapshot:
+    store = ClusterStore([(kind, "") for kind in READERS], ("",), _nothing, _nothing)
+    for kind, read in READERS.items():
+        found = {key_of(obj): read(obj) for obj in server.all(kind)}
+        store.listed(kind, "", {uid: one for uid, one in found.items() if one is not None})
+    return store.snapshot(key)
+
+
+def _nothing() -> None:
+    return None

@@ -1,0 +1,211 @@
+"""Never two operators act at once, whatever is slow, stands still or gets lost."""
+
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosproxy_operator.kubernetes.planner.leadership import (
+    DEADLINE,
+    DURATION,
+    NOBODY,
+    Candidate,
+    LeaseRecord,
+    observe,
+    released,
+    resigned,
+    wanted,
+    wrote,
+)
+
+OTHER = LeaseRecord("7", "b", transitions=3, acquired="then")
+
+
+MINE = LeaseRecord("", "a")
+
+
+def test_one_that_is_missing_is_made_and_has_to_run_out() -> None:
+    """Whoever held it before it was taken away may still act."""
+    one = observe(Candidate("a"), None, 5.0)
+    made = wanted(one, 5.0)
+    assert made == LeaseRecord("", NOBODY)
+    assert not wrote(one, made, 5.0, 5.0).leads(5.0)
+    one = observe(one, LeaseRecord("1", NOBODY), 6.0)
+    assert wanted(one, 6.0 + DURATION - 0.1) is None
+    assert wanted(one, 6.0 + DURATION) == LeaseRecord("1", "a", transitions=1)
+
+
+def test_one_acts_for_a_time_that_begins_before_its_write() -> None:
+    one = wrote(Candidate("a"), MINE, 15.0, 16.0)
+    assert (one.leads(15.0 + DEADLINE - 0.1), one.leads(15.0 + DEADLINE)) == (True, False)
+
+
+def test_one_that_nobody_holds_is_taken_at_once() -> None:
+    assert wanted(observe(Candidate("a"), LeaseRecord("1"), 5.0), 5.0) is not None
+
+
+def test_one_that_is_held_is_taken_once_it_has_been_the_same_for_long() -> None:
+    one = observe(Candidate("a"), OTHER, 100.0)
+    one = observe(one, OTHER, 105.0)
+    assert wanted(one, 100.0 + DURATION - 0.1) is None
+    assert wanted(one, 100.0 + DURATION) == LeaseRecord("7", "a", transitions=4)
+
+
+def test_a_renewal_begins_the_time_anew() -> None:
+    one = observe(Candidate("a"), OTHER, 100.0)
+    one = observe(one, LeaseRecord("8", "b"), 109.0)
+    assert wanted(one, 109.0 + DURATION - 0.1) is None
+
+
+def test_a_holder_that_promises_longer_is_waited_for() -> None:
+    """Another release may have other times."""
+    one = observe(Candidate("a"), LeaseRecord("7", "b", duration=30.0), 100.0)
+    assert wanted(one, 129.0) is None
+    assert wanted(one, 130.0) is not None
+
+
+def test_one_that_was_released_is_taken_at_once() -> None:
+    record = released(LeaseRecord("7", "b"), "b")
+    assert record is not None
+    assert record.holder == ""
+    assert wanted(observe(Candidate("a"), record, 100.0), 100.0) is not None
+
+
+def test_only_the_holder_releases() -> None:
+    assert released(OTHER, "a") is None
+    assert released(None, "a") is None
+
+
+def test_who_sees_another_holder_leads_no_more() -> None:
+    one = wrote(observe(Candidate("a"), LeaseRecord("6"), 99.0), MINE, 100.0, 100.0)
+    assert observe(one, LeaseRecord("8", "a"), 101.0).leads(101.0)
+    assert not observe(one, OTHER, 101.0).leads(101.0)
+    assert not observe(one, None, 101.0).leads(101.0)
+
+
+def test_terms_are_counted() -> None:
+    one = wrote(Candidate("a"), MINE, 100.0, 100.0)
+    one = wrote(one, MINE, 102.0, 102.0)
+    assert one.terms == 1
+    assert wrote(one, MINE, 120.0, 120.0).terms == 2
+    assert resigned(one).terms == 1
+
+
+@dataclass
+class Store:
+    """The API server's: one Lease, written only over the version that was read."""
+
+    record: LeaseRecord | None
+    version: int = 0
+
+    def write(self, record: LeaseRecord) -> bool:
+        if record.version != (self.record.version if self.record else ""):
+            return False
+        self.version += 1
+        self.record = LeaseRecord(
+            str(self.version), record.holder, record.duration, record.transitions
+        )
+        return True
+
+
+@dataclass
+class Operator:
+    """One candidate with a clock of its own, and a request that may be under way."""
+
+    one: Candidate
+    ahead: float
+    read: LeaseRecord | None = None
+    writing: tuple[LeaseRecord, float] | None = None
+    answered: bool | None = None
+    step: int = field(default=0)
+
+    def go(self, store: Store, now: float, lost: bool) -> None:
+        """Do the next part of a round; between two of them any time may pass."""
+        own = now + self.ahead
+        self.step = (self.step + 1) % 4
+        if self.step == 1:
+            self.read = store.record
+        elif self.step == 2:
+            self.one = observe(self.one, self.read, own)
+            record = wanted(self.one, own)
+            self.writing = (record, own) if record is not None else None
+        elif self.step == 3:
+            self.answered = None
+            if self.writing is not None:
+                done = store.write(self.writing[0])
+                self.answered = done and not lost  # it was written, and the answer is lost
+        elif self.writing is not None and self.answered:
+            self.one = wrote(self.one, *self.writing, own)
+
+    def round(self, store: Store, now: float) -> None:
+        """End what is under way, then do a whole round at once."""
+        for _ in range(4 + -self.step % 4):
+            self.go(store, now, lost=False)
+
+    def stop(self, store: Store) -> None:
+        """Act no more, then release what it holds."""
+        self.one = resigned(self.one)
+        if record := released(store.record, self.one.name):
+            store.write(record)
+        self.one, self.step = Candidate(f"{self.one.name}'"), 0  # it is started again
+
+
+STEPS = st.lists(
+    st.tuples(
+        st.integers(0, 2),
+        st.sampled_from([0.0, 0.0, 0.0, 1.0, 3.0, 5.0, 10.0, 10.1]),
+        st.sampled_from(["round"] * 16 + ["go"] * 8 + ["lost", "stop", "delete"]),
+    ),
+    min_size=20,
+    max_size=60,
+)
+AHEAD = st.lists(st.floats(-1000.0, 1000.0), min_size=3, max_size=3)
+
+
+@given(STEPS, AHEAD, st.booleans())
+def test_never_two_at_once(
+    steps: list[tuple[int, float, str]], ahead: list[float], made: bool
+) -> None:
+    """Requests take any time, operators stand still, answers get lost, clocks differ.
+
+    And somebody takes the Lease away.
+    """
+    store, now = Store(LeaseRecord("0") if made else None), 0.0
+    operators = [Operator(Candidate(name), own) for name, own in zip("abc", ahead, strict=True)]
+    for who, passed, what in steps:
+        now += passed
+        leading(operators, now)
+        if what == "stop":
+            operators[who].stop(store)
+        elif what == "delete":
+            store.record = None
+        elif what == "round":
+            operators[who].round(store, now)
+        else:
+            operators[who].go(store, now, lost=what == "lost")
+        leading(operators, now)
+
+
+def leading(operators: list[Operator], now: float) -> list[str]:
+    """Who leads; never more than one does."""
+    found = [each.one.name for each in operators if each.one.leads(now + each.ahead)]
+    assert len(found) <= 1, found
+    return found
+
+
+@pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "killed"])
+def test_another_one_takes_over(stopped: bool) -> None:
+    """Of those that look each second, one leads a second after a stop, 12 after a kill."""
+    store, now = Store(LeaseRecord("0")), 0.0
+    first, second = Operator(Candidate("a"), 0.0), Operator(Candidate("b"), 50.0)
+    for each in (first, second):
+        each.round(store, now)
+    assert leading([first, second], now) == ["a"]
+    if stopped:
+        first.stop(store)
+    end = now + (1.0 if stopped else 12.0)
+    while now < end:
+        now += 1.0
+        second.round(store, now)
+    assert leading([first, second], now) == ["b"]

@@ -1,0 +1,161 @@
+"""Planning a cluster part by part decides what planning all of it at once does."""
+
+import copy
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from rosproxy_operator.kubernetes.planner.actions import Action
+from rosproxy_operator.kubernetes.planner.parts import Part, cut, cut_state, joined, part_of, parts
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan, plan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from tests.unit.operator.kubernetes.clusters import Clusters
+from tests.unit.operator.kubernetes.simulation import SETTINGS, STAMP
+from tests.unit.operator.kubernetes.test_plan_convergence import MEDDLING, NODES, PODS, ROSPROXIES
+
+ALIKE = {"one": "192.0.2.1", "two": "192.0.2.2", "three": "192.0.2.3"}
+APART = {"four": "192.0.2.4", "five": "192.0.2.5", "six": "192.0.2.6"}
+
+
+HAPPENINGS = (PODS, PODS, NODES, ROSPROXIES, MEDDLING, (Clusters.step, Clusters.step, Clusters.lag))
+EVENTS = st.tuples(
+    st.booleans(),
+    st.one_of(*map(st.sampled_from, HAPPENINGS)),
+    st.integers(0, 59),
+    st.integers(0, 59),
+)
+
+
+class Together:
+    """Two clusters as one, in namespaces of their own; on the same nodes, or on others."""
+
+    def __init__(self, shared: bool) -> None:
+        nodes = ALIKE if shared else APART
+        self.worlds = Clusters("ros", ALIKE), Clusters("arms", nodes)
+        self.state, self.now = ClusterState(), 1000.0
+
+    def observe(self) -> ClusterSnapshot:
+        first, second = (each.observe() for each in self.worlds)
+        return replace(
+            first,
+            rosproxies=first.rosproxies + second.rosproxies,
+            nodes={**second.nodes, **first.nodes},
+            pods=first.pods + second.pods,
+            proxies=first.proxies + second.proxies,
+            ears=first.ears + second.ears,
+            services={**first.services, **second.services},
+            masters={**second.masters, **first.masters},
+            selected=first.selected | second.selected,
+            policies={**first.policies, **second.policies},
+            reports={**first.reports, **second.reports},
+            failures={**first.failures, **second.failures},
+        )
+
+    def carry_out(self, found: ClusterPlan) -> None:
+        for world in self.worlds:
+            mine = [one for one in found.actions if one.of.namespace == world.namespace]
+            world.controller.carry_out(replace(found, actions=tuple(mine)))
+            for uid, addresses in found.gone.items():
+                if uid in world.cluster.ros:
+                    world.cluster.ros[uid] -= set(addresses)
+
+
+def by_rosproxy(actions: tuple[Action, ...]) -> dict[Any, list[Action]]:
+    """The actions of each RosProxy, in their order."""
+    found: dict[Any, list[Action]] = {}
+    for one in actions:
+        found.setdefault(one.of, []).append(one)
+    return found
+
+
+def all_of(observed: ClusterSnapshot) -> Part:
+    """All parts as one. What is remembered of others is forgotten with the next look at all."""
+    every = [*parts(observed)]
+    return Part(
+        frozenset(one for part in every for one in part.namespaces),
+        frozenset(one for part in every for one in part.nodes),
+    )
+
+
+def check(
+    whole: ClusterPlan, pieces: list[tuple[Part, ClusterPlan]], state: ClusterState, union: Part
+) -> None:
+    merged: dict[Any, list[Action]] = {}
+    for _, one in pieces:
+        for of, actions in by_rosproxy(one.actions).items():
+            assert of not in merged, "two parts have it"
+            merged[of] = actions
+    assert merged == by_rosproxy(whole.actions)
+    for name in ("gone", "callers", "policies", "peers", "former"):
+        both = {uid: told for _, one in pieces for uid, told in getattr(one, name).items()}
+        assert both == dict(getattr(whole, name)), name
+    assert {one for _, each in pieces for one in each.problems} == {*whole.problems}
+    waits = [one.again_in for _, one in pieces if one.again_in is not None]
+    assert min(waits, default=None) == whole.again_in
+    remembered = cut_state(whole.state, union)
+    for name in state.__struct_fields__:
+        assert getattr(state, name) == getattr(remembered, name), name
+
+
+@given(st.booleans(), st.lists(EVENTS, min_size=5, max_size=25))
+def test_planning_by_parts_is_planning_it_all(shared: bool, events: list) -> None:
+    both = Together(shared)
+    for which, happen, n, m in events:
+        happen(both.worlds[which], n, m)
+        if m % 2:
+            continue  # several things happen between two looks
+        observed = both.observe()
+        union = all_of(observed)
+        both.state = cut_state(both.state, union)
+        whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
+        pieces, state = [], ClusterState(begun=both.state.begun)
+        for part in parts(observed):
+            before = cut_state(both.state, part)
+            one = plan(cut(observed, part), SETTINGS, before, both.now, STAMP)
+            state = joined(state, part, one.state)
+            pieces.append((part, one))
+        check(whole, pieces, replace(state, begun=True), union)
+        both.state = whole.state
+        both.carry_out(whole)
+        both.now += 1.0 + n % 7
+
+
+@given(st.booleans(), st.lists(EVENTS, min_size=5, max_size=25))
+def test_what_is_not_touched_stays_as_it_is(shared: bool, events: list) -> None:
+    """After a whole plan a part can be planned again, and leaves what others have remembered."""
+    both = Together(shared)
+    for which, happen, n, m in events:
+        happen(both.worlds[which], n, m)
+    observed = both.observe()
+    whole = plan(observed, SETTINGS, both.state, both.now, STAMP)
+    for part in parts(observed):
+        before = copy.copy(whole.state)
+        one = plan(cut(observed, part), SETTINGS, cut_state(before, part), both.now, STAMP)
+        after = joined(before, part, one.state)
+        others = [other for other in parts(observed) if other != part]
+        for other in others:
+            assert cut_state(after, other) == cut_state(whole.state, other)
+
+
+def test_who_shares_a_node_is_one_part() -> None:
+    both = Together(shared=True)
+    for world in both.worlds:
+        world.run(0, 0)
+    observed = both.observe()
+    (part,) = [one for one in parts(observed) if one.nodes]
+    assert part.namespaces == {"ros", "arms"}
+    assert part_of(observed, ["arms"]) == part
+    assert part_of(observed, [], part.nodes) == part
+
+
+def test_who_shares_no_node_is_apart() -> None:
+    both = Together(shared=False)
+    for world in both.worlds:
+        world.run(0, 0)
+    observed = both.observe()
+    assert [one.namespaces for one in parts(observed)] == [{"arms"}, {"ros"}]
+    assert part_of(observed, ["ros"]).namespaces == {"ros"}
+    assert part_of(observed, [], ["nowhere"]) == Part()

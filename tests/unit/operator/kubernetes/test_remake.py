@@ -1,0 +1,129 @@
+"""Pods that came by unwired are made anew, where their RosProxy asks for that."""
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy_operator.kubernetes.planner.actions import Emit, EvictPod
+from rosproxy_operator.kubernetes.planner.plan import ClusterPlan
+from rosproxy_operator.kubernetes.planner.state import ClusterState
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.cluster import ClusterSnapshot
+from rosproxy_operator.kubernetes.resources.model import Pod
+from rosproxy_operator.kubernetes.resources.names import master_uri
+from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
+from tests.unit.operator.kubernetes.builders_api import pod_obj, rosproxy_obj
+from tests.unit.operator.kubernetes.objects import (
+    ROBOT,
+    look,
+    node,
+    observed,
+    pod,
+    proxy,
+    rosproxy,
+    service,
+)
+
+WIRED = master_uri(service().cluster_ip)
+
+
+def of_set(name: str = "a", **more: Any) -> Pod:
+    return replace(pod(name), **{"controller": "ReplicaSet", "wired": "", **more})
+
+
+def cluster(*pods: Pod, remakes: bool = True) -> ClusterSnapshot:
+    of = replace(rosproxy(), remakes=remakes)
+    return observed(of, service(), node(), proxy(), *pods)
+
+
+def evicted(found: ClusterPlan) -> list[str]:
+    return [one.id.name for one in found.actions if isinstance(one, EvictPod)]
+
+
+def test_one_that_was_not_wired_is_evicted() -> None:
+    found = look(cluster(of_set()))
+    (action,) = [one for one in found.actions if isinstance(one, EvictPod)]
+    assert (action.of, action.uid) == (ROBOT, of_set().uid)
+    (event,) = [one for one in found.actions if isinstance(one, Emit)
+                and one.reason == "PodEvicted"]  # fmt: skip
+    assert event.type == "Normal"
+    assert event.message.startswith("evicted pod a: it is not wired to its proxy")
+
+
+def test_one_that_was_wired_to_a_former_address_is_evicted() -> None:
+    assert evicted(look(cluster(of_set(wired="http://10.96.0.200:11311")))) == ["a"]
+
+
+@pytest.mark.parametrize("kind", ["ReplicationController", "StatefulSet", "DaemonSet"])
+def test_whoever_makes_pods_anew(kind: str) -> None:
+    assert evicted(look(cluster(of_set(controller=kind)))) == ["a"]
+
+
+@pytest.mark.parametrize(
+    "left",
+    [
+        of_set(wired=WIRED),
+        of_set(controller="Job"),
+        of_set(controller=""),
+        of_set(own_masters=("http://elsewhere:11311",)),
+        of_set(phase="Succeeded"),
+        of_set(phase="Pending"),
+        of_set(deleting=True),
+        of_set(labels={names.INJECT: "false"}),
+    ],
+)
+def test_all_others_are_left_alone(left: Pod) -> None:
+    assert evicted(look(cluster(left))) == []
+
+
+def test_nobody_is_evicted_who_did_not_ask_for_it() -> None:
+    assert evicted(look(cluster(of_set(), remakes=False))) == []
+
+
+def test_nobody_is_evicted_while_there_is_no_service() -> None:
+    """The next one could not be wired either."""
+    of = replace(rosproxy(), remakes=True)
+    assert evicted(look(observed(of, node(), of_set()))) == []
+
+
+def test_one_goes_at_a_time() -> None:
+    a, b = of_set("a"), of_set("b")
+    found = look(cluster(b, a), now=100.0)
+    assert evicted(found) == ["a"]
+    going = look(cluster(replace(a, deleting=True), b), found.state, 110.0)
+    assert evicted(going) == []
+    coming = look(cluster(of_set("c", wired=WIRED, phase="Pending"), b), going.state, 120.0)
+    assert evicted(coming) == []
+    there = look(cluster(of_set("c", wired=WIRED), b), coming.state, 130.0)
+    assert evicted(there) == ["b"]
+
+
+def test_a_webhook_that_does_not_work_costs_a_pod_a_minute() -> None:
+    """And also where nothing is left between one pod and the next."""
+    state, gone = ClusterState(), list[float]()
+    for second in range(3600):
+        there = cluster(of_set(f"pod-{second}")) if second % 2 else cluster()
+        found = look(there, state, 100.0 + second)
+        state = found.state
+        if evicted(found):
+            gone.append(100.0 + second)
+    assert len(gone) < 75
+    pauses = [after - before for before, after in pairwise(gone)]
+    assert min(pauses[20:]) >= 60.0
+
+
+def test_what_is_read_of_a_rosproxy_and_of_a_pod() -> None:
+    obj = rosproxy_obj()
+    assert not read(obj).remakes
+    obj["metadata"]["annotations"] = {names.REMAKE: "true"}
+    assert read(obj).remakes
+    obj["metadata"]["annotations"] = {names.REMAKE: "yes"}
+    assert not read(obj).remakes
+    made = pod_obj()
+    assert objects.pod(made).controller == ""
+    made["metadata"]["ownerReferences"] = [
+        {"kind": "Thing"}, {"kind": "ReplicaSet", "controller": True},
+    ]  # fmt: skip
+    assert objects.pod(made).controller == "ReplicaSet"

@@ -1,0 +1,385 @@
+"""ROS 2 in a RosProxy: what is read, allocated, made, and told to pods, proxies and users."""
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from rosproxy.leases.ports import PortRange
+from rosproxy.net.addresses import HostPort
+from rosproxy_operator.kubernetes.planner import manifests
+from rosproxy_operator.kubernetes.planner.access.bounds import objection
+from rosproxy_operator.kubernetes.planner.actions import CreateEar, CreateProxy, DeleteEar
+from rosproxy_operator.kubernetes.planner.pods.injection import Target, target_of, wire
+from rosproxy_operator.kubernetes.planner.pods.ros2_pods import unmet
+from rosproxy_operator.kubernetes.planner.steps.ear import ear_pod
+from rosproxy_operator.kubernetes.planner.steps.network_policy import policy
+from rosproxy_operator.kubernetes.resources import names, objects
+from rosproxy_operator.kubernetes.resources.cluster import EarPod, ProxyReport
+from rosproxy_operator.kubernetes.resources.fields import InvalidField
+from rosproxy_operator.kubernetes.resources.model import (
+    Json,
+    MasterSpec,
+    Pod,
+    PodContainer,
+    Ros2Spec,
+    RosProxy,
+)
+from rosproxy_operator.kubernetes.resources.pod_failures import stuck
+from rosproxy_operator.kubernetes.resources.spec import rosproxy as read
+from rosproxy_operator.kubernetes.settings import Bounds, ClusterSettings
+from rosproxy_operator.kubernetes.status.status import participants
+from tests.run_options import settings_of
+from tests.unit.operator.kubernetes import objects as some
+from tests.unit.operator.kubernetes.builders_api import rosproxy_obj
+from tests.unit.operator.kubernetes.objects import (
+    RANGE,
+    ROBOT,
+    SETTINGS,
+    creation,
+    done,
+    look,
+    node,
+    observed,
+    proxy,
+    service,
+    site,
+    status,
+    told,
+)
+
+ADDRESS = "10.96.1.1"
+HEARING = Ros2Spec(multicast=True)
+GOOD = {"master": {"uri": "http://robot:11311"}}
+
+
+def of2(ros2: Ros2Spec | None = None, **changes: Any) -> RosProxy:
+    """One for ROS 2 alone."""
+    spec: dict[str, Any] = {"ros1": False, "ros2": ros2 or Ros2Spec(), "master": MasterSpec()}
+    return some.rosproxy(**spec | changes)
+
+
+def pod(*containers: PodContainer, **changes: Any) -> Pod:
+    words: dict[str, Any] = {"wired": "", "static_peers": ADDRESS, "containers": containers}
+    return some.pod(**words | changes)
+
+
+def env_of(body: Json) -> dict[str, str]:
+    return {one["name"]: one["value"] for one in body["spec"]["containers"][0]["env"]}
+
+
+def specified(**spec: Any) -> Any:
+    obj = rosproxy_obj()
+    return read({**obj, "spec": spec}).spec
+
+
+def test_what_is_read():
+    found = specified(ros=2, domain=7, peers=["Robot", "192.0.2.9:11400"], multicast=True)
+
+    assert (found.ros1, found.master) == (False, MasterSpec())
+    assert found.ros2 == Ros2Spec(7, ("192.0.2.9:11400", "robot"), True)
+    both = specified(ros="1, 2", **GOOD)
+    assert (both.ros1, both.ros2) == (True, Ros2Spec())
+    assert specified(**GOOD).ros2 is None
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ({"ros": 3}, "spec.ros: 3 is unknown"),
+        ({"ros": True}, "spec.ros: True is unknown"),
+        ({"ros": 2, **GOOD}, "spec.master"),
+        ({"ros": 2, "domain": 233}, "spec.domain"),
+        ({"ros": 2, "peers": ["a b"]}, "spec.peers[0]: 'a b' is no peer"),
+        ({"ros": 2, "peers": ["a"] * 33}, "are too many"),
+        ({"ros": 2, "multicast": "yes"}, "spec.multicast"),
+        ({"ros": 2, "ports": 3}, "ask for 4 at least"),
+        ({"ros": 2, "ports": 4, "multicast": True}, "ask for 5 at least"),
+        ({"domain": 1, **GOOD}, "spec.domain: 1 is for ROS 2"),
+        ({"ros": "1,2"}, "give either uri"),
+    ],
+)
+def test_what_is_refused(spec: Any, words: str):
+    with pytest.raises(InvalidField) as refused:
+        specified(**spec)
+    assert words in str(refused.value)
+
+
+def test_a_proxy_understands_its_variables_and_takes_ports_of_udp():
+    of = of2(Ros2Spec(3, ("robot",), True), ports=8)
+    ports = PortRange(11400, 11407)
+    place = replace(site(of, node(), ports), peers=("192.0.2.2:11400", "robot"))
+
+    body = manifests.proxy_pod(place, SETTINGS)
+
+    settings = settings_of(env_of(body))
+    assert (settings.ros, settings.domains, settings.master_uri) == (("2",), (3,), "")
+    assert settings.ros2_peer == (HostPort("192.0.2.2", 11400), HostPort("robot", 0))
+    assert settings.ros2_ear == HostPort("192.0.2.1", 11407)
+    assert settings.ports.listen == PortRange(11400, 11406)
+    taken = body["spec"]["containers"][0]["ports"]
+    assert {one["protocol"] for one in taken} == {"UDP"}
+    assert [one["hostPort"] for one in taken] == list(range(11400, 11407))
+
+
+def test_one_for_both_versions_has_both_kinds_of_ports():
+    found = proxy(some.rosproxy(ros2=Ros2Spec()))
+    assert found.pod.host_ports == found.pod.udp_ports == set(RANGE.ports())
+
+
+def test_peers_come_and_go_without_a_proxy_being_made_anew():
+    place = site(of2(), node())
+    other = replace(place, peers=("192.0.2.2:11400",))
+    one, two = (manifests.proxy_pod(each, SETTINGS) for each in (place, other))
+    assert manifests.fingerprint_of(one) == manifests.fingerprint_of(two)
+    assert one != two
+
+
+def test_the_service_leads_to_the_well_known_port():
+    (port,) = manifests.service(of2(Ros2Spec(2)))["spec"]["ports"]
+    assert (port["port"], port["protocol"]) == (7410 + 500, "UDP")
+    both = manifests.service(some.rosproxy(ros2=Ros2Spec()))["spec"]["ports"]
+    assert [one["protocol"] for one in both] == ["TCP", "UDP"]
+
+
+def test_proxies_of_several_nodes_are_each_others_peers():
+    of, far = of2(Ros2Spec(peers=("robot",))), node("two", addresses={"InternalIP": "192.0.2.2"})
+    there = (pod(), pod(name="b", on="two"), proxy(of), proxy(of, far, PortRange(11410, 11413)))
+
+    found = look(observed(of, service(of), node(), far, *there))
+
+    here = ("192.0.2.1:11400", "robot"), ("192.0.2.2:11410", "robot")
+    assert set(found.peers.values()) == set(here)
+
+
+def test_ports_of_udp_are_kept_clear_of_others():
+    of = of2()
+    tcp, udp = pod(name="tcp", ports=()), pod(name="udp", labels={}, udp_ports=frozenset({11402}))
+    tcp = replace(tcp, labels={}, host_ports=frozenset({11400}))
+    found = creation(look(observed(of, service(of), pod(), tcp, udp)))
+    assert some.ports_of(found) == "11403-11406"
+
+
+def test_the_well_known_ports_are_none_of_a_range():
+    window = PortRange(7409, 7420)
+    of = of2(window=window)
+    found = creation(look(observed(of, service(of), pod())))
+    assert some.ports_of(found) == "7411-7414"
+
+
+def hearing(**changes: Any) -> tuple[RosProxy, Any]:
+    of = of2(HEARING, ports=5)
+    return of, proxy(of, ports=PortRange(11400, 11404), **changes)
+
+
+def ear(of: RosProxy, address: str = "10.244.1.200", **changes: Any) -> EarPod:
+    place = site(of, node(), PortRange(11400, 11404))
+    assert place.ear is not None
+    body = ear_pod(place, place.ear, address, SETTINGS)
+    found = objects.ear_pod({**body, "status": {"phase": "Running"}})
+    assert found is not None
+    own = replace(found.pod, uid="uid-ear", node="one")
+    return replace(found, **{"pod": own, "ready": True, **changes})
+
+
+def test_an_ear_is_made_once_its_proxy_has_an_address():
+    of, there = hearing()
+    seen = observed(of, service(of), pod(), there)
+
+    (action,) = done(look(seen))
+
+    assert isinstance(action, CreateEar)
+    body = action.body
+    assert env_of(body)["ROSPROXY_EAR_PROXY"] == "10.244.1.200:11400"
+    assert env_of(body)["ROSPROXY_EAR_BIND"] == "192.0.2.1:11404"
+    assert body["spec"]["hostNetwork"] is True
+    assert body["spec"]["containers"][0]["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+    assert not names.own_labels("robot").items() <= body["metadata"]["labels"].items()
+    assert done(look(replace(seen, ears=(ear(of),)))) == []
+    starting = replace(there, pod=replace(there.pod, ip=""), ready=False)
+    assert done(look(observed(of, service(of), pod(), starting))) == []
+
+
+@pytest.mark.parametrize("why", ["address", "not asked for"])
+def test_an_ear_that_is_not_right_goes(why: str):
+    of, there = hearing()
+    found = ear(of, "10.244.1.9" if why == "address" else "10.244.1.200")
+    if why == "not asked for":
+        of = of2(ports=5)
+        there = proxy(of, ports=PortRange(11400, 11404))
+    (action,) = done(look(observed(of, service(of), pod(), there, ears=(found,))))
+    assert isinstance(action, DeleteEar)
+
+
+def test_an_ear_stays_while_its_proxy_is_made_anew():
+    of, _ = hearing()
+    (action,) = done(look(observed(of, service(of), pod(), ears=(ear(of),))))
+    assert isinstance(action, CreateProxy)
+
+
+def test_an_ear_that_does_not_run_is_told():
+    of, there = hearing()
+    deaf = stuck({"phase": "Failed", "reason": "Evicted", "message": "so it is"})
+    found = ear(of, stuck=deaf[0], message=deaf[1])
+    plan = look(observed(of, service(of), pod(), there, ears=(found,)))
+    assert "so that the LAN is not heard" in told(plan, "EarStuck")[0]
+
+
+def test_a_node_without_a_lan_address_is_told():
+    of = of2(HEARING, ports=5)
+    lost = node(addresses={"InternalIP": "fd00::1"}, advertise_host="192.0.2.1")
+    plan = look(observed(of, service(of), lost, pod()))
+    assert "spec.peers" in told(plan, "NoLanAddress")[0]
+
+
+def test_an_address_of_ipv6_is_not_advertised():
+    of = of2()
+    lost = node(addresses={"InternalIP": "fd00::1"})
+    plan = look(observed(of, service(of), lost, pod()))
+    assert "IPv4 alone" in told(plan, "NoAdvertiseHost")[0]
+
+
+def admitted(*env: Any) -> dict[str, Any]:
+    containers = [{"name": "ros", **({"env": list(env)} if env else {})}]
+    return {"metadata": {"labels": {names.INJECT: "true"}}, "spec": {"containers": containers}}
+
+
+def test_what_the_webhook_sets():
+    to = target_of(of2(Ros2Spec(5)), ADDRESS)
+    assert to == Target("", ADDRESS, 5)
+
+    found = wire(admitted(), to)
+
+    assert found.spec is not None
+    peers = {"name": "ROS_STATIC_PEERS", "value": ADDRESS}
+    domain = {"name": "ROS_DOMAIN_ID", "value": "5"}
+    assert found.spec["containers"][0]["env"] == [domain, peers][::-1]
+    assert found.annotations == {names.STATIC_PEERS: ADDRESS}
+    own = ({"name": "ROS_STATIC_PEERS", "value": "a"}, {"name": "ROS_DOMAIN_ID", "value": "4"})
+    assert wire(admitted(*own), to).spec is None
+    both = wire(admitted(), target_of(some.rosproxy(ros2=Ros2Spec()), ADDRESS))
+    assert both.spec is not None
+    set_ = [one["name"] for one in both.spec["containers"][0]["env"]]
+    assert set_ == ["ROS_MASTER_URI", "ROS_STATIC_PEERS", "ROS_IP"]
+
+
+def test_a_copy_of_a_wired_pod_is_wired_anew():
+    old = admitted({"name": "ROS_STATIC_PEERS", "value": "10.96.9.9"})
+    old["metadata"]["annotations"] = {names.STATIC_PEERS: "10.96.9.9"}
+    found = wire(old, Target(static_peers=ADDRESS))
+    assert found.spec is not None
+    assert found.spec["containers"][0]["env"][0]["value"] == ADDRESS
+
+
+@pytest.mark.parametrize(
+    ("reason", "container"),
+    [
+        ("NoDds", PodContainer(variables={"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"})),
+        ("TooOld", PodContainer("docker.io/osrf/ros:humble-desktop")),
+        ("TooOld", PodContainer(variables={"ROS_DISTRO": "foxy"})),
+        ("NotWired", PodContainer(variables={"ROS_STATIC_PEERS": "192.0.2.7"})),
+        ("OtherDomain", PodContainer(variables={"ROS_DOMAIN_ID": "9"})),
+        ("Alone", PodContainer(variables={"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"})),
+        ("Alone", PodContainer(variables={"ROS_LOCALHOST_ONLY": "1"})),
+    ],
+)
+def test_what_a_pod_cannot_have_is_told(reason: str, container: PodContainer):
+    (found,) = unmet(pod(container), of2(), ADDRESS)
+    assert (found.reason, found.fatal) == (reason, False)
+    assert found.about is not None
+    assert found.about.kind == "Pod"
+    assert list(unmet(pod(container), some.rosproxy(), ADDRESS)) == []
+
+
+@pytest.mark.parametrize(
+    "container",
+    [
+        PodContainer("ros:jazzy", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}),
+        PodContainer("registry/exhumble-thing:1", {"ROS_DISTRO": "kilted"}),
+        PodContainer(variables={"ROS_STATIC_PEERS": f"192.0.2.7;{ADDRESS}"}),
+        PodContainer(variables={"ROS_STATIC_PEERS": "rosproxy-robot.ros.svc.cluster.local"}),
+        PodContainer(variables={"ROS_DOMAIN_ID": "0"}),
+    ],
+)
+def test_what_is_well_is_not_told(container: PodContainer):
+    assert list(unmet(pod(container), of2(), ADDRESS)) == []
+
+
+def test_a_pod_that_no_webhook_has_seen_is_told():
+    (found,) = unmet(pod(static_peers=""), of2(), ADDRESS)
+    assert (found.reason, "create the pod anew" in found.text) == ("NotWired", True)
+    (found,) = unmet(pod(static_peers="10.96.9.9"), of2(), ADDRESS)
+    assert "its proxy is at 10.96.1.1 now" in found.text
+
+
+@pytest.mark.parametrize(
+    ("bounds", "field"),
+    [
+        (Bounds(peers=("192.0.2.*",)), "spec.peers"),
+        (Bounds(peers=("*.example",)), "spec.peers"),
+        (Bounds(multicast=False), "spec.multicast"),
+        (Bounds(peers=("rob*",), masters=("http://nobody:1",)), ""),
+    ],
+)
+def test_what_the_administrator_allows(bounds: Bounds, field: str):
+    of = of2(Ros2Spec(peers=("robot",), multicast=True), ports=5)
+    found = objection(of, {}, ClusterSettings(bounds=bounds))
+    assert found.startswith(field)
+    assert bool(found) == bool(field)
+
+
+def test_a_network_policy_lets_udp_in():
+    opened, pods, _ = policy(of2(window=PortRange(11400, 11499)), SETTINGS)["spec"]["ingress"]
+    assert opened["ports"] == [{"protocol": "UDP", "port": 11400, "endPort": 11499}]
+    assert pods["ports"] == [
+        {"protocol": "UDP", "port": 7410},
+        {"protocol": "UDP", "port": 20000, "endPort": 32767},
+    ]
+    assert "from" in pods
+
+
+def test_a_participant_of_a_pod_that_is_gone_is_told_to_the_proxy():
+    of = of2()
+    there = proxy(of)
+    seen = observed(of, service(of), pod(ip="10.244.1.5"), there)
+    known = look(seen).state
+    report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)})
+    gone = observed(of, service(of), there, reports={there.pod.uid: report})
+    assert look(gone, known, 101.0).gone == {there.pod.uid: ("10.244.1.5",)}
+
+
+def test_what_users_are_told():
+    of = of2(Ros2Spec(7))
+    there = proxy(of)
+    report = ProxyReport(True, True, participants={"10.244.1.5": ("01", "02")})
+    seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
+
+    found = status(look(seen), ROBOT)
+
+    assert (found["domain"], found["participants"], found["staticPeers"]) == (7, 2, ADDRESS)
+    assert "master" not in found
+    assert found["perNode"][0]["participants"] == 2
+    kinds = [one["type"] for one in found["conditions"]]
+    assert kinds == ["Ready", "PortsAllocated", "Degraded"]
+    assert "2 participants of domain 7" in found["conditions"][0]["message"]
+    assert participants(seen) == {7: 2}
+    again = read({**rosproxy_obj(), "status": found})
+    assert again.cluster_ip == ADDRESS
+
+
+def test_a_proxy_made_anew_is_told_the_ports_that_participants_had():
+    """Until it has participants itself; one that was started again in its pod is not told."""
+    of = of2()
+    there = proxy(of)
+    leases = {"01": (11401, 11402)}
+    report = ProxyReport(True, True, participants={"10.244.1.5": ("01",)}, leases=leases)
+    seen = observed(of, service(of), pod(), there, reports={there.pod.uid: report})
+    known = look(seen).state
+    assert look(seen, known).former == {}
+
+    new = replace(there, pod=replace(there.pod, uid="uid-new"))
+    starting = observed(of, service(of), pod(), new, reports={"uid-new": ProxyReport(True, True)})
+    found = look(starting, known)
+    assert found.former == {"uid-new": leases}
+    complete = replace(starting, reports={"uid-new": report})
+    assert look(complete, found.state).former == {}
