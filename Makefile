@@ -17,6 +17,12 @@ OPERATOR_IMAGE := $(REGISTRY:%=%/)rosproxy-operator
 LAYERS ?=
 # Options of `make bench`, for example: make bench BENCH="--sections streams --rounds 3"
 BENCH ?=
+# What the images are built on instead of what the Dockerfile names, for example BASE_IMAGE=debian:bookworm-slim
+BASE_IMAGE ?=
+# Where the repository can be read, for the links in a release
+REPOSITORY ?=
+# The tag of a release that `make release-check` is to hold in order
+RELEASE ?=
 SOURCES := proxy operator examples tests scripts
 
 $(VENV)/.runtime: pyproject.toml constraints.txt scripts/venv.sh scripts/pins.py
@@ -31,12 +37,16 @@ $(VENV)/.bench: $(VENV)/.dev
 	@scripts/venv.sh $(VENV) dev,uvloop,operator,bench
 	@touch $@
 
+$(VENV)/.docs $(VENV)/.release: $(VENV)/.dev
+	@scripts/venv.sh $(VENV) dev,uvloop,operator,docs,release
+	@touch $(VENV)/.docs $(VENV)/.release
+
 .PHONY: help
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' Makefile
 
 .PHONY: demo
-demo: $(VENV)/.runtime ## messages through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
+demo: $(VENV)/.runtime ## messages of ROS 1 and ROS 2 through the proxy, both ways, in 15 seconds; needs neither ROS nor Docker nor root
 	@$(BIN)/python -m examples.demo
 
 .PHONY: test
@@ -48,9 +58,15 @@ test-all: $(VENV)/.dev ## every test of every layer that this machine can run; b
 	@$(BIN)/python scripts/test_layers.py $(LAYERS)
 
 .PHONY: bench
-bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in twelve minutes (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS
+bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in half an hour (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS
 	@scripts/install-bench.sh
 	@$(BIN)/python -m tests.bench $(BENCH)
+
+.PHONY: screenshot
+screenshot: $(VENV)/.dev ## paint docs/live-page.png anew: the live page with real nodes and a broken link; as root on Debian, installs ROS and Chromium
+	@scripts/install-ros.sh
+	@scripts/install-browser.sh
+	@$(BIN)/python -m tests.browser.screenshot docs/live-page.png
 
 .PHONY: check
 check: $(VENV)/.dev ## format, lint, types, import rules, unit tests
@@ -76,10 +92,19 @@ lock: ## pin what is installed anew, into constraints.txt
 manifests: $(VENV)/.dev ## write manifests/install.yaml, the chart's README and the tables of the RosProxy's fields from the chart
 	@PYTHON=$(BIN)/python scripts/manifests.sh
 
+.PHONY: docs
+docs: $(VENV)/.docs ## the documentation as a site, in build/site
+	@$(BIN)/python scripts/docs_site.py
+	@$(BIN)/mkdocs build --strict
+
+.PHONY: release-check
+release-check: $(VENV)/.release ## build and try all that a release has: packages, SBOM, chart, images; publishes nothing (RELEASE=v1.2.3)
+	@$(BIN)/python scripts/release_check.py $(RELEASE:%=--tag %) $(BASE_IMAGE:%=--base-image %) $(REGISTRY:%=--registry %) $(REPOSITORY:%=--repository %)
+
 .PHONY: image
 image: ## build the images rosproxy and rosproxy-operator, tagged with the version and latest (REGISTRY, TAG)
-	docker build --target proxy --tag $(IMAGE):$(TAG) --tag $(IMAGE):latest .
-	docker build --target operator --tag $(OPERATOR_IMAGE):$(TAG) --tag $(OPERATOR_IMAGE):latest .
+	docker build $(BASE_IMAGE:%=--build-arg BASE_IMAGE=%) --target proxy --tag $(IMAGE):$(TAG) --tag $(IMAGE):latest .
+	docker build $(BASE_IMAGE:%=--build-arg BASE_IMAGE=%) --target operator --tag $(OPERATOR_IMAGE):$(TAG) --tag $(OPERATOR_IMAGE):latest .
 
 .PHONY: push
 push: ## push both to REGISTRY, with the version as tag

@@ -59,7 +59,7 @@ def _default(field: Mapping[str, Any]) -> str:
 def _type(field: Mapping[str, Any]) -> str:
     if "enum" in field:
         return ", ".join(f"`{value}`" for value in field["enum"])
-    kind = str(field["type"])
+    kind = str(field.get("type", "integer or string"))
     if kind == "integer" and "minimum" in field:
         return f"{field['minimum']} to {field['maximum']}"
     if kind == "array":

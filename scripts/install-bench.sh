@@ -1,12 +1,14 @@
 #!/bin/sh
-# Installs what `make bench` measures and compares with, on Debian or Ubuntu, as root: ROS 1 as the
-# real-ROS tests have it, image messages, the peers, and the tools of the kernel's packet filter.
-# Does nothing when all of it is there.
+# Installs what `make bench` measures and compares with, on Debian or Ubuntu, as root: ROS 1 and
+# ROS 2 as their tests have them, image messages, the peers, the tools of the kernel's packet filter,
+# and the programs of a Kubernetes cluster. Does nothing when all of it is there.
 set -eu
 cd "$(dirname "$0")/.."
 . scripts/debian.sh
 
 scripts/install-ros.sh
+scripts/install-ros2.sh
+scripts/install-kubernetes.sh
 need install-bench \
     socat haproxy nginx libnginx-mod-stream nftables conntrack iproute2 procps \
     libsensor-msgs-dev python3-sensor-msgs

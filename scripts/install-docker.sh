@@ -5,7 +5,7 @@ set -euo pipefail
 
 declare -A package_of=(
   [dockerd]=docker.io [docker]=docker.io [iptables]=iptables [ip]=iproute2
-  [nsenter]=util-linux [debootstrap]=debootstrap
+  [nsenter]=util-linux [debootstrap]=debootstrap [conntrack]=conntrack
 )
 missing=()
 for command in "${!package_of[@]}"; do

@@ -4,13 +4,17 @@
     python scripts/test_layers.py                  what `make test-all` runs
     python scripts/test_layers.py unit ros         these layers only
 
-How it works. A layer is a directory under tests/. Up to three layers run side by side:
+How it works. A layer is a directory under tests/, or some tests of one in other surroundings. Two
+layers run side by side; three, beside each other's nodes and engines, were at a load of 30 to 55 on
+two processors, where what takes a second takes a minute:
 
   1. The integration tests have a processor for themselves. Beside them what other layers need is
      prepared: packages, programs and images, by scripts that do nothing where their work is done
-     already. After that docker and kubernetes begin, which are the longest and mostly wait.
-  2. After the integration tests, whenever one of the three has ended, the next of the others: the
-     long ones first, so that on two processors all end at about the same time.
+     already. After that docker begins, and then kubernetes, which are the longest and mostly wait.
+  2. After the integration tests the others, the long ones first, in the lane that is free.
+  3. At the end, alone: those with bad neighbours, which hold how long an answer may take, and ROS 2
+     in a cluster. There two dozen participants meet anew each time when a proxy's pod is replaced,
+     for which Fast DDS takes all of two processors for seconds, and minutes beside others.
 
 No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
 machine that is busy with compiling.
@@ -46,15 +50,22 @@ CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
 ALL, MARKED, NONE = "all", "marked", "none"
 
-ROS, NODES, ENGINE, COMPOSE, KUBERNETES, IMAGES = PREPARATIONS = (
+ROS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
+    PREPARATIONS
+) = (
     "install-ros",
+    "install-browser",
+    "install-jazzy",
+    "install-ros2",
     "compile-nodes",
     "install-docker",
     "install-compose",
+    "install-prometheus",
     "install-kubernetes",
     "build-images",
 )
 COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
+    JAZZY: ["scripts/install-ros2.sh", "jazzy"],
     NODES: [sys.executable, "-m", "tests.ros.cpp"],
     IMAGES: [sys.executable, "-m", "tests.docker.images"],
 }
@@ -62,12 +73,12 @@ COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
 
 @dataclass(frozen=True)
 class Layer:
-    """A directory of tests, and how it is run.
+    """A directory of tests, or some ``tests`` of another one, and how they are run.
 
     ``setup``: what prepares this machine for it; ``smoke_setup``: those of them that its smoke
     needs. ``smoke``: ALL of its tests are in the smoke, those that are MARKED, or NONE.
     ``workers``: how many processes of pytest share the tests, one file each at a time.
-    ``obstacle`` says why it can't run here, if so.
+    ``environment``: variables that they are told. ``obstacle`` says why it can't run here, if so.
     """
 
     name: str
@@ -76,10 +87,13 @@ class Layer:
     smoke_setup: tuple[str, ...] = ()
     workers: int = 0
     obstacle: Callable[[], str | None] = lambda: None
+    tests: tuple[str, ...] = ()
+    environment: tuple[str, ...] = ()
 
     def command(self, report: Path, smoke: bool) -> list[str]:
-        words = [sys.executable, "-m", "pytest", f"tests/{self.name}", f"--junitxml={report}"]
-        words += ["--durations=15", "-o", f"cache_dir={LOGS}/{self.name}-cache"]
+        words = ["env", *self.environment, sys.executable, "-m", "pytest"]
+        words += [*(self.tests or (f"tests/{self.name}",)), f"--junitxml={report}"]
+        words += ["--tb=short", "--durations=15", "-o", f"cache_dir={LOGS}/{self.name}-cache"]
         if self.workers:
             words += ["-n", str(self.workers), "--dist=loadfile"]
         return words + (["-m", "smoke"] if smoke and self.smoke == MARKED else [])
@@ -140,14 +154,62 @@ def effective_capabilities() -> int:
 UNIT = Layer("unit", smoke=ALL, workers=2)
 INTEGRATION = Layer("integration", smoke=ALL, workers=2)
 ABUSE = Layer("abuse", obstacle=abuse_obstacle)
-CHART = Layer("chart", setup=(KUBERNETES,), obstacle=debian_root_obstacle)
+CHART = Layer("chart", setup=(PROMETHEUS, KUBERNETES), obstacle=debian_root_obstacle)
 IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
 ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
-DOCKER_ENGINE = Layer(
-    "docker", MARKED, (ENGINE, COMPOSE, IMAGES), (ENGINE, IMAGES), 0, debian_root_obstacle
+ALIKE = (
+    *("inside-to-inside", "inside-to-outside"),
+    *("inside-about-inside", "inside-about-itself", "outside-about-inside"),
 )
-CLUSTER = Layer("kubernetes", setup=(ENGINE, KUBERNETES, IMAGES), obstacle=debian_root_obstacle)
-LAYERS = (UNIT, INTEGRATION, ABUSE, CHART, IMAGE, ROS_NODES, DOCKER_ENGINE, CLUSTER)
+"""Cases of `ros` in which nobody inside wants anything of outside, by their names."""
+ISOLATED = Layer(
+    "isolated",
+    setup=(ROS, NODES),
+    workers=2,
+    obstacle=debian_root_obstacle,
+    tests=(
+        *(
+            f"tests/ros/test_{name}.py"
+            for name in (
+                *("recovery", "topics", "services", "actionlib"),
+                *("networks", "rosnode", "rostopic"),
+            )
+        ),
+        *("-k", " and ".join(f"not {name}" for name in ALIKE)),
+    ),
+    environment=("ROS_TESTS_ISOLATED=1",),
+)
+"""Inside has no way out but the proxy: what goes inwards, is asked from inside, or is recovered.
+
+All of tests/ros may run so, which takes as long again. What is left out is the same in `ros`, or
+rests on what runs here.
+"""
+ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
+BROWSER = Layer("browser", setup=(ROS, NODES, CHROMIUM), obstacle=debian_root_obstacle)
+DOCKER_ENGINE = Layer(
+    "docker",
+    MARKED,
+    (ENGINE, COMPOSE, PROMETHEUS, IMAGES),
+    (ENGINE, IMAGES),
+    obstacle=debian_root_obstacle,
+)
+_ROS2_PODS = "tests/kubernetes/test_ros2.py"
+CLUSTER = Layer(
+    "kubernetes",
+    setup=(ENGINE, KUBERNETES, IMAGES),
+    obstacle=debian_root_obstacle,
+    tests=("tests/kubernetes", f"--ignore={_ROS2_PODS}"),
+)
+ROS2_CLUSTER = Layer(
+    "kubernetes-ros2",
+    setup=CLUSTER.setup,
+    obstacle=debian_root_obstacle,
+    tests=(_ROS2_PODS,),
+)
+LAYERS = (
+    *(UNIT, INTEGRATION, ABUSE, CHART, IMAGE),
+    *(ROS_NODES, ISOLATED, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
+)
 
 
 class Run:
@@ -166,12 +228,12 @@ class Run:
         with ThreadPoolExecutor() as pool:
             integration = pool.submit(self._some, deque([INTEGRATION]))
             self._prepare()
-            early = [pool.submit(self._some, deque([one])) for one in (DOCKER_ENGINE, CLUSTER)]
-            lanes = [integration, *early]
+            lanes = [integration, pool.submit(self._some, deque([DOCKER_ENGINE, CLUSTER]))]
             integration.result()
-            late = deque([ROS_NODES, IMAGE, CHART, ABUSE, UNIT])
+            late = deque([ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, BROWSER, CHART, UNIT])
             lanes += [pool.submit(self._then, lane, late) for lane in lanes]
         outcomes = [outcome for lane in lanes for outcome in lane.result()]
+        outcomes += self._some(deque([ABUSE, ROS2_CLUSTER]))
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
     def _prepare(self) -> None:

@@ -19,7 +19,8 @@ from typing import NamedTuple
 
 from tests.bench import machine, report
 from tests.bench.book import Book
-from tests.bench.world import DESCRIPTORS, remove_leftovers
+from tests.bench.world import DESCRIPTORS, PREFIX
+from tests.ros.topology import remove_leftovers
 
 FOLDER = Path("build/bench")
 
@@ -36,6 +37,9 @@ SECTIONS = {
     "control": Section("nodes", 5),
     "nodes": Section("nodes", 1),
     "ros": Section("bytes", 3),
+    "ros2": Section("participants", 5),
+    "cluster": Section("nodes", 1),
+    "docker": Section("containers", 1),
 }
 """Each is a module beside with a ``run(book, rounds, quick)``."""
 
@@ -46,7 +50,7 @@ def main() -> None:
     if os.geteuid() != 0:
         sys.exit("make bench lays out network namespaces: run it as root")
     raise_limits()
-    remove_leftovers()
+    remove_leftovers(PREFIX)
     book = Book(machine.described())
     print(*(f"{name + ':':<10}{text}" for name, text in book.machine.items()), sep="\n", flush=True)
     whole = [measured(book, name, options) for name in options.sections]

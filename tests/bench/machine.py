@@ -11,12 +11,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from subprocess import getoutput
 
+from tests.ros2.lab import ENVIRONMENTS
+
 _VERSIONS = {
     "socat": "socat -V | sed -n 's/^socat version \\([^ ]*\\).*/\\1/p'",
     "haproxy": "haproxy -v | sed -n '1s/HAProxy version \\([^ ]*\\).*/\\1/p'",
     "nginx": "nginx -v 2>&1 | sed 's/.*nginx.//'",
     "nft": "nft --version | cut -d' ' -f2",
 }
+
+_PINS = (("jazzy", "ros-jazzy-rclpy"), ("jazzy", "ros-fastrtps"), ("cyclone", "cyclonedds"))
+"""Packages of the ROS 2 layer's environments."""
 
 
 def described() -> dict[str, str]:
@@ -31,6 +36,7 @@ def described() -> dict[str, str]:
         "ROS": getoutput(
             "dpkg-query -W -f '${Package} ${Version}, ' python3-rospy libroscpp4d"
         ).rstrip(", "),
+        "ROS 2": ", ".join(pinned(*words) for words in _PINS),
         "peers": ", ".join(f"{name} {version(name)}" for name in _VERSIONS),
     }
 
@@ -42,6 +48,14 @@ def processor() -> str:
 def memory() -> str:
     kib = int(Path("/proc/meminfo").read_text().split()[1])
     return f"{kib / 2**20:.0f} GiB"
+
+
+def pinned(environment: str, package: str) -> str:
+    """A package with its version, as an environment of the ROS 2 layer has it."""
+    pins = ENVIRONMENTS / environment / "pins"
+    lines = pins.read_text().splitlines() if pins.exists() else []
+    found = (line.split()[0] for line in lines if line.startswith(f"{package}=="))
+    return next(found, f"{package} (not installed)").replace("==", " ")
 
 
 def version(name: str) -> str:

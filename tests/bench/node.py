@@ -1,4 +1,4 @@
-"""The inside node of the streams: ``python -m tests.bench.node MASTER WIRE``.
+"""The node of the streams: ``python -m tests.bench.node MASTER WIRE ADDRESS``.
 
 A slave API in Python in front of a TCPROS server in C++, which is the source of the bytes. It
 publishes /stream (without end) and /echo (what comes goes back), prints the port of the server
@@ -13,8 +13,6 @@ from typing import Any
 from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
-from tests.bench.world import INSIDE
-
 NAME = "/bench_inside"
 TOPICS = ("/stream", "/echo")
 NO_MASTER = "none"
@@ -23,23 +21,23 @@ NO_MASTER = "none"
 class SlaveApi:
     """What master and subscribers call."""
 
-    def __init__(self, port: int) -> None:
-        self._port = port
+    def __init__(self, address: str, port: int) -> None:
+        self._address, self._port = address, port
 
     def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> list[Any]:
-        tcpros = ["TCPROS", INSIDE, self._port]
+        tcpros = ["TCPROS", self._address, self._port]
         values = {"requestTopic": tcpros, "getPid": 1, "getBusInfo": [], "getPublications": []}
         return [1, "", values.get(method, 0)]
 
 
-def main(master: str, wire: str) -> None:
+def main(master: str, wire: str, address: str) -> None:
     with subprocess.Popen([wire, "source"], stdout=subprocess.PIPE, text=True) as source:
         assert source.stdout
         port = int(source.stdout.readline())
-        server = SimpleXMLRPCServer((INSIDE, 0), logRequests=False, allow_none=True)
-        server.register_instance(SlaveApi(port))
+        server = SimpleXMLRPCServer((address, 0), logRequests=False, allow_none=True)
+        server.register_instance(SlaveApi(address, port))
         if master != NO_MASTER:
-            register(master, f"http://{INSIDE}:{server.server_address[1]}/")
+            register(master, f"http://{address}:{server.server_address[1]}/")
         print("port", port, flush=True)
         server.serve_forever()
 

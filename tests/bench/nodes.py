@@ -19,6 +19,9 @@ SIZES, QUICK_SIZES = (1, 10, 100, 1000), (1, 10, 100)
 OPTIONS = ("--port-range", "41000-43999", "--log-level", "info", "--cleanup-after", "5")
 FIRST_SLAVE = 50000
 IDLE_SECONDS, QUICK_IDLE_SECONDS = 10.0, 6.0  # probes come every 5 s
+SETTLE_SECONDS = 12.0
+"""What registering has left to do: the first two probes of each node make the connection that is
+kept, and what the master knows is read once more."""
 LEAST_NODES = 100
 """Of fewer, what the process takes and gives back by itself is more than what they take."""
 PATIENCE = 120.0
@@ -77,7 +80,7 @@ def seconds_of(process: Process) -> float:
 
 def busy(pid: int, seconds: float) -> float:
     """CPU seconds per second of a process that is left alone."""
-    time.sleep(2)  # what registering has left to do
+    time.sleep(SETTLE_SECONDS)
     before, started = cpu_seconds(pid), time.perf_counter()
     time.sleep(seconds)
     return (cpu_seconds(pid) - before) / (time.perf_counter() - started)

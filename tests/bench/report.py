@@ -1,9 +1,10 @@
 """What has been measured, for readers: a table, Markdown, and plots of what grows.
 
-    python -m tests.bench.report [--folder build/bench] [--page docs/performance.md]
+    python -m tests.bench.report [--folder build/bench] [--page docs/performance.md [--part ros2]]
 
 writes them from ``results.json``; with a page, what stands between its two marks is written anew
-and the plots are put beside it, so that no number of it is typed by hand.
+and the plots are put beside it, so that no number of it is typed by hand. A part of a page, which
+was measured by itself, has marks of its own.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ TITLES = {
     "control": "Calls of the master and slave API",
     "nodes": "Many nodes",
     "ros": "Real ROS nodes",
+    "ros2": "ROS 2",
+    "cluster": "The operator in a growing cluster",
+    "docker": "The operator on a Docker host",
 }
 
 
@@ -145,32 +149,37 @@ def table(head: list[str], body: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(words) + " |" for words in lines)
 
 
-def paste(page: Path, folder: Path) -> None:
-    """Write the results into a page, between its marks. SystemExit if it has none."""
+def paste(page: Path, folder: Path, part: str = "") -> None:
+    """Write the results into a page, between the marks of a part. SystemExit if it has none."""
     text = page.read_text()
-    pattern = re.compile(f"{re.escape(BEGIN)}.*?{re.escape(END)}", re.S)
+    begin, end = (
+        mark.replace("results", f"results of {part}" if part else "results")
+        for mark in (BEGIN, END)
+    )
+    pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.S)
     if not pattern.search(text):
-        raise SystemExit(f"{page} has no {BEGIN} … {END}")
+        raise SystemExit(f"{page} has no {begin} … {end}")
     results = (folder / "performance.md").read_text()
     plots = page.with_suffix("")
     plots.mkdir(exist_ok=True)
     for plot in folder.glob("*.svg"):
         shutil.copy(plot, plots)
     results = results.replace("![Growth](", f"![Growth]({plots.name}/")
-    page.write_text(pattern.sub(lambda _: f"{BEGIN}\n\n{results}\n{END}", text))
+    page.write_text(pattern.sub(lambda _: f"{begin}\n\n{results}\n{end}", text))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.report")
     parser.add_argument("--folder", type=Path, default=Path("build/bench"))
     parser.add_argument("--page", type=Path)
+    parser.add_argument("--part", default="")
     options = parser.parse_args()
     book = Book.load(options.folder / "results.json")
     for section in book.axes:
         print_table(book, section)
     write(book, options.folder)
     if options.page:
-        paste(options.page, options.folder)
+        paste(options.page, options.folder, options.part)
 
 
 if __name__ == "__main__":

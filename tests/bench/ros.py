@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -162,7 +162,14 @@ def ros_node(place: World, library: str, role: str, master: str) -> Iterator[Ros
     }
     command = place.command(role, *programs[library], f"__name:={library}_{role}")
     env = place.ros_environment(role) | {"ROS_MASTER_URI": master}
-    log, pipe = place.folder / f"{library}-{role}.log", subprocess.PIPE
+    with running_node(command, env, place.folder / f"{library}-{role}.log") as node:
+        yield node
+
+
+@contextmanager
+def running_node(command: Sequence[str], env: Mapping[str, str], log: Path) -> Iterator[RosNode]:
+    """A program that is asked by its standard input, when it is ready; it is killed at the end."""
+    pipe = subprocess.PIPE
     with (
         log.open("w") as errors,
         subprocess.Popen(

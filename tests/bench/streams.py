@@ -1,4 +1,4 @@
-"""Bytes: rate, CPU, fairness, latency and memory of every way from outside to a node inside."""
+"""Bytes: rate, CPU, fairness, latency and memory of every way to a node on the other side."""
 
 from __future__ import annotations
 
@@ -159,10 +159,10 @@ def connections(book: Book, way: Way, sizes: tuple[int, ...]) -> None:
 
 @contextmanager
 def wire(way: Way, role: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """The outside end; RuntimeError with its words if it fails."""
+    """The end that connects; RuntimeError with its words if it fails."""
     address, port = way.address
     words = [str(word) for word in (role, address, port, *arguments)]
-    command = way.world.command("outside", str(compiled("wire")), *words)
+    command = way.world.command(way.end, str(compiled("wire")), *words)
     pipe: Any = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         try:

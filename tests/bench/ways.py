@@ -1,5 +1,8 @@
 """The ways from outside to a node inside: directly, through rosproxy, through its peers.
 
+And from inside to a node outside, through rosproxy with ``--direction both``: *inwards* is where
+the bytes of that node go.
+
 The kernel's ways have worlds of their own, so that their rules cost the others nothing. Each peer
 is set up in its own favour: large buffers, splicing where it can.
 """
@@ -17,12 +20,13 @@ from xmlrpc.client import ServerProxy
 from tests.bench.book import DIRECT, Book
 from tests.bench.compiled import compiled
 from tests.bench.node import NAME, NO_MASTER
-from tests.bench.world import HOST, INSIDE, MASTER, World, world
+from tests.bench.world import ADDRESSES, HOST, MASTER, World, world
 
 PORT = 46000
 """Where the peers listen on the host; not in rosproxy's default range."""
 BY_HAND, KERNEL, SPLICE, COPY = "nft by hand", "rosproxy kernel", "rosproxy splice", "rosproxy copy"
 PLANES = {KERNEL: "kernel", SPLICE: "splice", COPY: "copy"}
+INWARDS = {"rosproxy kernel, inwards": "kernel", "rosproxy splice, inwards": "splice"}
 PEERS = ("socat", "haproxy", "nginx")
 _RULES = """
 table ip by-hand {{
@@ -74,18 +78,22 @@ stream {{
 
 
 class Way(NamedTuple):
-    """Where outside connects to reach the node, and the process in between if there is one."""
+    """Where one end connects to reach the node, and the process in between if there is one.
+
+    ``end`` is the machine that connects.
+    """
 
     name: str
     world: World
     address: tuple[str, int]
     pid: int | None = None
+    end: str = "outside"
 
 
 @contextmanager
 def all_ways(book: Book, only: tuple[str, ...] = ()) -> Iterator[list[Way]]:
     """Every way that there is, or ``only`` these; the book is told what is missing."""
-    wanted = only or (DIRECT, BY_HAND, *PLANES, *PEERS)
+    wanted = only or (DIRECT, BY_HAND, *PLANES, *INWARDS, *PEERS)
     with ExitStack() as stack:
         plain = stack.enter_context(world(apart=True))
         target = stack.enter_context(node(plain, NO_MASTER))
@@ -93,6 +101,7 @@ def all_ways(book: Book, only: tuple[str, ...] = ()) -> Iterator[list[Way]]:
         if BY_HAND in wanted:
             ways.append(stack.enter_context(by_hand()))
         ways += [stack.enter_context(proxied(name)) for name in PLANES if name in wanted]
+        ways += [stack.enter_context(proxied_inwards(name)) for name in INWARDS if name in wanted]
         for offset, name in enumerate(PEERS):
             if name in wanted and shutil.which(name):
                 ways.append(stack.enter_context(peer(plain, name, PORT + offset, target)))
@@ -107,13 +116,13 @@ def _note_missing(book: Book, wanted: tuple[str, ...], ways: list[Way]) -> None:
 
 
 @contextmanager
-def node(place: World, master: str) -> Iterator[tuple[str, int]]:
-    """An inside node, registered; the address of its TCPROS server."""
-    wire = str(compiled("wire"))
-    argv = (sys.executable, "-m", "tests.bench.node", master, wire)
-    with place.running("inside", *argv) as process:
+def node(place: World, master: str, role: str = "inside") -> Iterator[tuple[str, int]]:
+    """A node on a machine, registered; the address of its TCPROS server."""
+    wire, address = str(compiled("wire")), ADDRESSES[role]
+    argv = (sys.executable, "-m", "tests.bench.node", master, wire, address)
+    with place.running(role, *argv) as process:
         port = int(process.wait_for(r"^port (\d+)")[1])
-        yield INSIDE, port
+        yield address, port
 
 
 @contextmanager
@@ -138,13 +147,34 @@ def proxied(name: str) -> Iterator[Way]:
         yield Way(name, place, address, proxy.pid)
 
 
-def tcpros_address(place: World, node_name: str, topic: str, must_be_fast: bool) -> tuple[str, int]:
-    """What a subscriber outside is told when it asks the master and then the node.
+@contextmanager
+def proxied_inwards(name: str) -> Iterator[Way]:
+    """The proxy with one of its planes, and a node outside that is heard inside."""
+    plane = INWARDS[name]
+    with (
+        world(apart=True) as place,
+        place.master(),
+        place.proxy(plane, "--direction", "both", "--inside-network", "172.31.0.0/24") as proxy,
+        node(place, MASTER, "outside"),
+    ):
+        address = tcpros_address(place, NAME, "/stream", plane == "kernel", "inside", proxy.master)
+        yield Way(name, place, address, proxy.pid, "inside")
+
+
+def tcpros_address(
+    place: World,
+    node_name: str,
+    topic: str,
+    must_be_fast: bool,
+    end: str = "outside",
+    master: str = MASTER,
+) -> tuple[str, int]:
+    """What a subscriber on a machine is told when it asks its master and then the node.
 
     RuntimeError if the kernel was to forward and the port is the one that the proxy serves.
     """
-    with place.entered("outside"):
-        uri = call(MASTER, "lookupNode", node_name)
+    with place.entered(end):
+        uri = call(master, "lookupNode", node_name)
         _, host, port = call(uri, "requestTopic", topic, [["TCPROS"]])
     if must_be_fast and port == urlsplit(uri).port:
         raise RuntimeError("the kernel does not forward: see `rosproxy status` for the reason")

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,7 +21,7 @@ from typing import NamedTuple
 
 from examples.demo.proxy_process import clean_environment
 from tests.ros.processes import Process, descendants, stop_all
-from tests.ros.topology import Place
+from tests.ros.topology import Place, run_command
 
 OUTSIDE, HOST = "10.78.0.2", "10.78.0.1"
 """The outside machine, and what it knows the host by."""
@@ -37,10 +35,11 @@ DESCRIPTORS = 65536
 """The limit of open files for this process and all that it starts."""
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 """ROS's programs are the system Python's: no other Python may come first."""
-_PREFIX = "rosb"
+PREFIX = "rosb"
+"""Of the names of the namespaces; the process that has made them follows."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 _NUMBERS = itertools.count(1)
-_ADDRESSES = {"outside": OUTSIDE, "host": HOST, "inside": INSIDE}
+ADDRESSES = {"outside": OUTSIDE, "host": HOST, "inside": INSIDE}
 _SETTINGS = """
 net.ipv4.ip_forward=1
 net.ipv4.ip_local_port_range=10000 40000
@@ -65,10 +64,10 @@ class World:
     """
 
     def __init__(self, apart: bool = False) -> None:
-        name = f"{_PREFIX}{os.getpid()}-{next(_NUMBERS)}"
+        name = f"{PREFIX}{os.getpid()}-{next(_NUMBERS)}"
         self.places = {
             role: Place(role, f"{name}-{role}", role, [address])
-            for role, address in _ADDRESSES.items()
+            for role, address in ADDRESSES.items()
         }
         self.folder = Path(tempfile.mkdtemp(prefix="rosproxy-bench-"))
         self.processes: list[Process] = []
@@ -77,8 +76,8 @@ class World:
     def build(self) -> None:
         """Lays out namespaces, links and routes."""
         for place in self.places.values():
-            _run("ip", "netns", "add", place.namespace)
-            _run("ip", "-n", place.namespace, "link", "set", "lo", "up")
+            run_command("ip", "netns", "add", place.namespace)
+            run_command("ip", "-n", place.namespace, "link", "set", "lo", "up")
         self._link("outside", "out0", HOST)
         self._link("inside", "in0", GATEWAY)
         for role in self.places:
@@ -87,18 +86,18 @@ class World:
     def _link(self, role: str, device: str, gateway: str) -> None:
         place, host = self.places[role].namespace, self.places["host"].namespace
         peer = ("peer", "name", "eth0", "netns", place)
-        _run("ip", "-n", host, "link", "add", device, "type", "veth", *peer)
+        run_command("ip", "-n", host, "link", "add", device, "type", "veth", *peer)
         ends = (host, device, gateway), (place, "eth0", self.places[role].address)
         for namespace, end, address in ends:
-            _run("ip", "-n", namespace, "addr", "add", f"{address}/24", "dev", end)
-            _run("ip", "-n", namespace, "link", "set", end, "up")
-        _run("ip", "-n", place, "route", "add", "default", "via", gateway)
+            run_command("ip", "-n", namespace, "addr", "add", f"{address}/24", "dev", end)
+            run_command("ip", "-n", namespace, "link", "set", end, "up")
+        run_command("ip", "-n", place, "route", "add", "default", "via", gateway)
 
     def remove(self) -> None:
         """Ends all programs and takes the machines away."""
         stop_all(self.processes, patience=2)
         for place in self.places.values():
-            _run("ip", "netns", "del", place.namespace)
+            run_command("ip", "netns", "del", place.namespace)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def command(self, role: str, *argv: str) -> list[str]:
@@ -112,7 +111,7 @@ class World:
 
     def run(self, role: str, *argv: str, text: str | None = None) -> str:
         """Runs a program on a machine to its end; what it printed. RuntimeError if it fails."""
-        return _run("ip", "netns", "exec", self.places[role].namespace, *argv, text=text)
+        return run_command("ip", "netns", "exec", self.places[role].namespace, *argv, text=text)
 
     def start(self, role: str, *argv: str, env: dict[str, str] | None = None) -> Process:
         """Starts a program on a machine; `stop`, or the end of the world, ends it."""
@@ -258,19 +257,3 @@ def _proportional(pid: int) -> int:
     except OSError:
         return 0
     return next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
-
-
-def remove_leftovers() -> None:
-    """Takes away the namespaces of runs whose process is gone, killed before it could."""
-    for name, pid in re.findall(rf"^({_PREFIX}(\d+)-\S+)", _run("ip", "netns", "list"), re.M):
-        if not Path(f"/proc/{pid}").exists():
-            for process in _run("ip", "netns", "pids", name).split():
-                os.kill(int(process), 9)
-            _run("ip", "netns", "del", name)
-
-
-def _run(*argv: str, text: str | None = None) -> str:
-    done = subprocess.run(argv, input=text, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"{' '.join(argv)}: {done.stderr.strip()[:500]}")
-    return done.stdout

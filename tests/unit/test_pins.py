@@ -5,7 +5,10 @@ import re
 import pytest
 from scripts.pins import ROOT, pins
 
-EXTRAS = ("uvloop", "docker", "kubernetes", "operator", "bench", "dev", "build-system")
+EXTRAS = (
+    *("uvloop", "docker", "kubernetes", "operator"),
+    *("bench", "dev", "docs", "release", "build-system"),
+)
 
 
 def names(*extras: str) -> set[str]:

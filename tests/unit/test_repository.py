@@ -155,7 +155,7 @@ def test_reference_names_every_option_label_and_metric_of_kubernetes() -> None:
 
     options = [opt for option in main.commands["kubernetes"].params for opt in option.opts]
     labels = [names.INJECT, names.PROXY_OF, names.NODE, names.PORT_RANGE, names.FINGERPRINT]
-    annotations = [names.ADVERTISE_HOST, names.MASTER_URI]
+    annotations = [names.ADVERTISE_HOST, names.MASTER_URI, names.STATIC_PEERS]
     metrics = [family.name for family in ClusterMetrics().registry.collect()]
     own = [name for name in metrics if not name.startswith("process_")]
     text = reference()
@@ -173,9 +173,9 @@ def test_reference_names_every_metric_of_the_proxy() -> None:
 
 def rules() -> dict[str, set[str]]:
     """What the controller's service account has to be allowed, by resource, as its code says."""
-    from rosproxy_operator.kubernetes import api
+    from rosproxy_operator.kubernetes.api import client
 
-    lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", api.__doc__ or "", re.M)
+    lines = re.findall(r"^    ([a-z/]+) {2,}([a-z ]+)$", client.__doc__ or "", re.M)
     return {resource: set(verbs.split()) for resource, verbs in lines}
 
 

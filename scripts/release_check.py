@@ -1,0 +1,383 @@
+"""Build all that a release consists of into dist/, and try it as users would.
+
+    python scripts/release_check.py              what stands here: `make release-check`
+    python scripts/release_check.py --tag v1.2.3 a release of that name, which has to be in order
+    … --registry ghcr.io/me                      with the images' names in chart and manifest
+    … --repository https://github.com/me/rosproxy    with links there in chart and alerts
+    … --only packages                            some steps only
+
+Steps: versions (one everywhere), packages (wheel and sdist, the same bytes whoever builds them;
+installed from them alone), sbom (CycloneDX, of what was installed), chart (linted, packed), images
+(built, and asked for their version), registry (images and chart pushed to one on this machine, and
+pulled from there). A step that can't be done fails. Nothing is published.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml  # type: ignore[import-untyped]
+
+ROOT = Path(__file__).resolve().parents[1]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+from scripts.pins import pins  # noqa: E402
+
+DIST = ROOT / "dist"
+CHART = ROOT / "charts/rosproxy-operator"
+BIN = Path(sys.executable).parent
+PROGRAMS = {"rosproxy": "", "rosproxy-operator": "operator"}
+"""What is installed, and with which extra of the wheel."""
+SETTINGS = ("--master-uri", "http://127.0.0.1:11311", "--advertise-host", "127.0.0.1")
+
+
+class Wrong(Exception):
+    """What is wrong, and what to do."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """``tag`` is its name in git, empty if there is none; ``base_image`` what images are built on.
+
+    ``registry`` stands before the images' names in chart and manifest, ``repository`` is where
+    chart and alerts link to, if they are given.
+    """
+
+    version: str
+    tag: str
+    base_image: str
+    registry: str
+    repository: str
+
+    @property
+    def runbook(self) -> str:
+        """Where one who is on call reads of alerts."""
+        at = f"{self.repository}/blob/v{self.version}/" if self.repository else ""
+        return f"{at}docs/guide/alerts.md"
+
+    def image(self, program: str) -> str:
+        """The whole name of an image."""
+        return f"{self.registry}/{program}:{self.version}".lstrip("/")
+
+
+def run(*words: str | Path, **more: str) -> str:
+    """Run a program; what it prints. Raises Wrong with that if it fails."""
+    done = subprocess.run(
+        [str(word) for word in words], cwd=ROOT, env={**os.environ, **more}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise Wrong(f"{' '.join(map(str, words))}: exit {done.returncode}\n{done.stdout}")
+    return done.stdout
+
+
+def project_version() -> str:
+    """The version that the code has."""
+    text = (ROOT / "proxy/rosproxy/__init__.py").read_text()
+    found = re.search(r'^__version__ = "(\d+\.\d+\.\d+)"$', text, re.M)
+    if found is None:
+        raise Wrong("proxy/rosproxy/__init__.py has no __version__ of three numbers")
+    return found[1]
+
+
+# == versions ======================================================================================
+
+
+def check_versions(release: Release) -> None:
+    """One version everywhere; with a tag it is the tag's, and the changelog has it."""
+    chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
+    told = {"Chart.yaml, version": chart["version"], "Chart.yaml, appVersion": chart["appVersion"]}
+    manifest = (ROOT / "manifests/install.yaml").read_text()
+    images = re.findall(r"\b(rosproxy(?:-operator)?):([\w.+-]+)\"?$", manifest, re.M)
+    labels = set(re.findall(r"app\.kubernetes\.io/version: \"(.*)\"", manifest))
+    told |= {f"manifests/install.yaml, image {name}": tag for name, tag in images}
+    told["manifests/install.yaml, labels"] = " ".join(sorted(labels))
+    if len(told) != 5:
+        raise Wrong(f"manifests/install.yaml has not both images: {sorted(told)}")
+    if release.tag:
+        told["tag"] = release.tag.removeprefix("v")
+        told["CHANGELOG.md, newest heading"] = newest(ROOT / "CHANGELOG.md")
+    differing = {where: version for where, version in told.items() if version != release.version}
+    if differing:
+        text = f"the code has {release.version}, and others another version: {differing}"
+        raise Wrong(f"{text}; docs/releasing.md says what is to be changed")
+
+
+def newest(changelog: Path) -> str:
+    """The version of the newest entry. Raises Wrong while there are changes above it."""
+    headings = re.findall(r"^## \[(.*?)\](?: - \d{4}-\d{2}-\d{2})?$", changelog.read_text(), re.M)
+    unreleased = changelog.read_text().partition("## [Unreleased]")[2].partition("\n## ")[0]
+    if unreleased.strip():
+        raise Wrong("CHANGELOG.md has changes under [Unreleased]: give them the version's heading")
+    return next((one for one in headings if one != "Unreleased"), "none")
+
+
+# == packages ======================================================================================
+
+
+def check_packages(release: Release) -> None:
+    """Wheel and sdist, twice alike, and installed."""
+    for path in DIST.glob("rosproxy-*"):
+        path.unlink()
+    with tempfile.TemporaryDirectory() as again:
+        for target in (DIST, Path(again)):
+            run(BIN / "python", "-m", "build", "--no-isolation", "--outdir", target, ROOT)
+        built = sorted(path.name for path in DIST.glob("rosproxy-*"))
+        expected = [f"rosproxy-{release.version}-py3-none-any.whl",
+                    f"rosproxy-{release.version}.tar.gz"]  # fmt: skip
+        if built != expected:
+            raise Wrong(f"dist has {built}, and not {expected}")
+        differing = [name for name in built if digest(DIST / name) != digest(Path(again) / name)]
+        if differing:
+            raise Wrong(f"built twice, these differ: {differing}")
+    wheel, sdist = (DIST / name for name in expected)
+    check_contents(wheel, sdist)
+    # As `python -m build` has made it of the sdist, so that one suffices here.
+    for program, extra in PROGRAMS.items():
+        environment = install(wheel, extra)
+        for words in (("--version",), ("--help",)):
+            said = run(environment / "bin" / program, *words)
+            if words == ("--version",) and release.version not in said:
+                raise Wrong(f"{program} of {wheel.name} says it is {said}")
+    run(ROOT / "build/release/rosproxy/bin/rosproxy", "run", "--check", *SETTINGS)
+
+
+def check_contents(wheel: Path, sdist: Path) -> None:
+    """What has to be in them, and what has not."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    needed = {"rosproxy/py.typed", "rosproxy_operator/py.typed", "rosproxy/cli/main.py"}
+    tops = {name.partition("/")[0].partition("-")[0] for name in names}
+    if not needed <= names or tops != {"rosproxy", "rosproxy_operator"}:
+        raise Wrong(f"{wheel.name} has {sorted(tops)}, and lacks {sorted(needed - names)}")
+    if not [name for name in names if name.endswith("licenses/LICENSE")]:
+        raise Wrong(f"{wheel.name} has no LICENSE")
+    with tarfile.open(sdist) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    lacking = {"LICENSE", "README.md", "pyproject.toml", "proxy/rosproxy/py.typed"} - inside
+    extra = [name for name in inside if name.startswith((".venv", "build/", "dist/", ".git/"))]
+    if lacking or extra:
+        raise Wrong(f"{sdist.name} lacks {sorted(lacking)}, and has {sorted(extra)[:5]} besides")
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def install(wheel: Path, extra: str) -> Path:
+    """A fresh environment with the wheel, and of all else only what is pinned."""
+    target = ROOT / "build/release" / ("rosproxy-operator" if extra else "rosproxy")
+    shutil.rmtree(target, ignore_errors=True)
+    run(BIN / "python", "-m", "venv", "--without-pip", target)
+    pinned = target / "pins.txt"
+    pinned.write_text("\n".join(pin.text for pin in pins([extra] if extra else [])) + "\n")
+    pip = (BIN / "python", "-m", "pip", "--disable-pip-version-check", "--quiet",
+           "--python", target / "bin/python", "install")  # fmt: skip
+    run(*pip, "--only-binary", ":all:", "--require-hashes", "--requirement", pinned)
+    run(*pip, "--no-deps", wheel)
+    return target
+
+
+# == SBOM, chart, images ===========================================================================
+
+
+def check_sbom(release: Release) -> None:
+    """Of each program, from what was installed: all that is pinned is in it."""
+    for program in PROGRAMS:
+        python = ROOT / "build/release" / program / "bin/python"
+        if not python.exists():
+            raise Wrong(f"{python} is not there: run the step packages first")
+        path = DIST / f"{program}-{release.version}.cdx.json"
+        options = ("--pyproject", "pyproject.toml", "--output-reproducible", "--validate")
+        run(BIN / "cyclonedx-py", "environment", *options, "-o", path, python)
+        found = {one["name"].lower() for one in json.loads(path.read_text())["components"]}
+        lines = run(BIN / "python", "-m", "pip", "--python", python, "freeze", "--all")
+        there = {line.partition("==")[0].lower() for line in lines.splitlines() if "==" in line}
+        if len(there) < 10 or there - found:
+            raise Wrong(f"{path.name} lacks {sorted(there - found)}")
+        print(f"  {path.name}: {len(found)} components")
+
+
+def check_chart(release: Release) -> None:
+    """Linted, packed with the images' names; what it makes pulls them, and the manifest does."""
+    helm = shutil.which("helm") or cluster_program("helm")
+    with tempfile.TemporaryDirectory() as directory:
+        chart = Path(directory) / CHART.name
+        shutil.copytree(CHART, chart)
+        adapt(chart, release)
+        run(helm, "lint", "--strict", "--kube-version", "1.30.0", chart)
+        run(helm, "package", chart, "--destination", DIST)
+    package = DIST / f"rosproxy-operator-{release.version}.tgz"
+    rules = ("--set", "prometheusRule.enabled=true")
+    made = run(helm, "template", "r", package, "--kube-version", "1.30.0", *rules)
+    text = (ROOT / "manifests/install.yaml").read_text()
+    named = rf"\b(rosproxy(?:-operator)?:{re.escape(release.version)})(?=\"?$)"
+    manifest = re.sub(named, rf"{release.registry}/\1".lstrip("/"), text, flags=re.M)
+    (DIST / "install.yaml").write_text(manifest)
+    for where, objects in ((package.name, made), ("install.yaml", manifest)):
+        for image in (f'image: "{release.image("rosproxy-operator")}"',
+                      f"--proxy-image={release.image('rosproxy')}"):  # fmt: skip
+            if f"{image}\n" not in objects:
+                raise Wrong(f"{where} does not pull {image}")
+    alerts = (CHART / "files/alerts.yaml").read_text()
+    alerts = alerts.replace("runbook_url: docs/guide/alerts.md", f"runbook_url: {release.runbook}")
+    (DIST / "alerts.yaml").write_text(alerts)
+    shutil.copy(CHART / "files/dashboard.json", DIST)
+    if f"runbook_url: {release.runbook}#" not in made or release.runbook not in alerts:
+        raise Wrong(f"the alerts of {package.name} do not link to {release.runbook}")
+
+
+def adapt(chart: Path, release: Release) -> None:
+    """Write into a chart where its images and its pages are."""
+    values, about = chart / "values.yaml", chart / "Chart.yaml"
+    text = values.read_text()
+    if release.registry:
+        to = rf"\1{release.registry}/\2"
+        text = re.sub(r"(?m)^( +repository: )(rosproxy.*)$", to, text)
+    if release.repository:
+        text = text.replace('  runbook: ""', f"  runbook: {release.runbook}")
+        links = f"home: {release.repository}\nsources: [{release.repository}]\n"
+        about.write_text(about.read_text() + links)
+    values.write_text(text)
+
+
+def cluster_program(name: str) -> Path:
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    path = Path(os.environ.get("CLUSTER_BIN") or Path(cache) / "rosproxy/cluster") / name
+    if not path.exists():
+        raise Wrong(f"{name} is not here: scripts/install-kubernetes.sh builds it")
+    return path
+
+
+def check_images(release: Release) -> None:
+    """Built, and both are of this version."""
+    told = {"TAG": release.version, "REGISTRY": release.registry, "BASE_IMAGE": release.base_image}
+    run("make", "image", *(f"{name}={value}" for name, value in told.items()))
+    for program in PROGRAMS:
+        image = release.image(program)
+        said = run("docker", "run", "--rm", "--network", "none", image, "--version")
+        if release.version not in said:
+            raise Wrong(f"the image {image} says it is {said}")
+        size = int(run("docker", "image", "inspect", "--format", "{{.Size}}", image))
+        print(f"  {image}: {size / 1e6:.0f} MB")
+
+
+# == registry ======================================================================================
+
+
+def check_registry(release: Release) -> None:
+    """What was pushed is what comes back: both images, and the chart by oci://."""
+    with tempfile.TemporaryDirectory() as directory, running_registry(Path(directory)) as where:
+        for program in PROGRAMS:
+            check_pulled(release.image(program), f"{where}/{program}:{release.version}")
+        helm = shutil.which("helm") or cluster_program("helm")
+        package = DIST / f"rosproxy-operator-{release.version}.tgz"
+        run(helm, "push", package, f"oci://{where}/charts", "--plain-http")
+        wanted = (f"oci://{where}/charts/rosproxy-operator", "--version", release.version)
+        pulled = run(helm, "template", "r", *wanted, "--plain-http", "--kube-version", "1.30.0")
+        made = run(helm, "template", "r", package, "--kube-version", "1.30.0")
+        if not pulled.endswith(made):  # before it stands where it was pulled from
+            raise Wrong(f"the chart of {wanted[0]} makes other objects than {package.name}")
+
+
+def check_pulled(image: str, pushed: str) -> None:
+    """Push an image under a name, and use it from there."""
+    identity = ("docker", "image", "inspect", "--format", "{{.Id}}")
+    before = run(*identity, image)
+    try:
+        run("docker", "tag", image, pushed)
+        run("docker", "push", pushed)
+        run("docker", "rmi", pushed)
+        run("docker", "pull", pushed)
+        if run(*identity, pushed) != before:
+            raise Wrong(f"{image} is another one when it is pulled again")
+        run("docker", "run", "--rm", "--network", "none", pushed, "--version")
+    finally:
+        subprocess.run(["docker", "rmi", pushed], capture_output=True, check=False)
+
+
+@contextmanager
+def running_registry(directory: Path) -> Iterator[str]:
+    """A registry on loopback, which Docker takes without TLS; where it is."""
+    program = run(ROOT / "scripts/install-registry.sh").splitlines()[-1]
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        where = f"127.0.0.1:{free.getsockname()[1]}"
+    storage = {"filesystem": {"rootdirectory": str(directory / "data")}}
+    config = {"version": 0.1, "storage": storage, "http": {"addr": where}, "log": {"level": "warn"}}
+    (directory / "config.yml").write_text(json.dumps(config))
+    log = directory / "log"
+    with log.open("wb") as output:
+        process = subprocess.Popen([program, "serve", str(directory / "config.yml")],
+                                   stdout=output, stderr=output)  # fmt: skip
+    try:
+        end = time.monotonic() + 30
+        while not answers(where):
+            if process.poll() is not None or time.monotonic() > end:
+                raise Wrong(f"the registry does not start:\n{log.read_text()}")
+            time.sleep(0.1)
+        yield where
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def answers(where: str) -> bool:
+    try:
+        with urllib.request.urlopen(f"http://{where}/v2/", timeout=5):
+            return True
+    except OSError:
+        return False
+
+
+STEPS: dict[str, Callable[[Release], None]] = {
+    "versions": check_versions,
+    "packages": check_packages,
+    "sbom": check_sbom,
+    "chart": check_chart,
+    "images": check_images,
+    "registry": check_registry,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--tag", default="", help="the release's tag in git: v and the version")
+    parser.add_argument("--base-image", default="", help="what the images are built on")
+    parser.add_argument("--registry", default="", help="what stands before the images' names")
+    parser.add_argument("--repository", default="", help="where chart and alerts link to")
+    parser.add_argument("--only", nargs="+", choices=STEPS, default=list(STEPS), metavar="STEP")
+    options = parser.parse_args()
+    DIST.mkdir(exist_ok=True)
+    try:
+        registry, repository = options.registry.strip("/"), options.repository.strip("/")
+        release = Release(project_version(), options.tag, options.base_image, registry, repository)
+        for name in options.only:
+            print(f"{name} …", flush=True)
+            STEPS[name](release)
+    except Wrong as error:
+        print(f"release-check: {error}", file=sys.stderr)
+        return 1
+    print(f"rosproxy {release.version} is in {DIST.relative_to(ROOT)}:")
+    for path in sorted(DIST.iterdir()):
+        print(f"  {digest(path)[:16]}  {path.name}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

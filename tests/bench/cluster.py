@@ -1,0 +1,189 @@
+"""The Kubernetes operator in a cluster that grows: a labelled pod on each node, and others' pods.
+
+etcd and API server are real; nodes, kubelets and proxies are made up (`crowded_cluster`), so that
+all of it is the operator's and the API server's own. Each size has a network namespace of its own,
+where ``python -m tests.bench.cluster NODES SECONDS`` measures it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import aiohttp
+
+from tests.bench.book import Book
+from tests.bench.control_plane import ControlPlane, free_port, is_there
+from tests.bench.crowded_cluster import CrowdedCluster
+from tests.bench.world import cpu_seconds, resident
+
+PATH = "rosproxy-operator"
+SIZES, QUICK_SIZES = (10, 100, 1000), (10,)
+PODS_A_NODE = 30
+SECONDS, QUICK_SECONDS = 60.0, 10.0
+"""How long it is watched when nothing happens, and while others' pods come and go."""
+CHURN = 20.0
+"""Others' pods that come and go in a second."""
+TRIES = 5
+PATIENCE = 600.0
+
+
+class Operator:
+    """The operator as a process, with the rights that the manifests give it."""
+
+    def __init__(self, plane: ControlPlane) -> None:
+        self._admin = f"127.0.0.1:{free_port()}"
+        log = (plane.folder / "operator.log").open("wb")
+        command = [
+            str(Path(sys.executable).parent / "rosproxy-operator"), "kubernetes",
+            "--admin-bind", self._admin, "--liveness-bind", f"127.0.0.1:{free_port()}",
+            "--key-secret", "rosproxy-system/rosproxy-operator-key",
+        ]  # fmt: skip
+        environment = {**os.environ, "KUBECONFIG": str(plane.folder / "operator")}
+        self._process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        log.close()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def stop(self) -> None:
+        self._process.terminate()
+        self._process.wait()
+
+    async def looks(self) -> tuple[float, float]:
+        """Seconds that all looks have taken, and their number."""
+        async with (
+            aiohttp.ClientSession() as session,
+            session.get(f"http://{self._admin}/metrics") as reply,
+        ):
+            text = await reply.text()
+        found = dict(re.findall(r"^rosproxy_operator_look_seconds_(sum|count) (\S+)$", text, re.M))
+        return float(found["sum"]), float(found["count"])
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    if not is_there():
+        raise RuntimeError("etcd and kube-apiserver are missing: scripts/install-kubernetes.sh")
+    for _ in range(rounds):
+        for size in QUICK_SIZES if quick else SIZES:
+            _apart(book, size, QUICK_SECONDS if quick else SECONDS)
+    book.note(f"{PODS_A_NODE} pods a node, one of them labelled; nodes and proxies are made up")
+
+
+def _apart(book: Book, size: int, seconds: float) -> None:
+    """Measure in a network where nobody else has the proxies' port."""
+    words = [sys.executable, "-m", "tests.bench.cluster", str(size), str(seconds)]
+    inside = f"ip link set lo up && exec {shlex.join(words)}"
+    done = subprocess.run(
+        ["unshare", "--net", "sh", "-c", inside], stdout=subprocess.PIPE, text=True, check=True
+    )
+    found = json.loads(done.stdout.splitlines()[-1])
+    for row, value in found["rows"]:
+        book.add(row, PATH, value, size)
+    for note in found["notes"]:
+        book.note(note)
+
+
+async def _one(book: Book, size: int, seconds: float) -> None:
+    folder = Path(tempfile.mkdtemp(prefix="rosproxy-bench-cluster-"))
+    try:
+        async with ControlPlane(folder) as plane, CrowdedCluster(plane) as cluster:
+            await cluster.fill(size, size * PODS_A_NODE)
+            started = time.monotonic()
+            operator = Operator(plane)
+            try:
+                await _measure(book, size, seconds, Bench(plane, cluster, operator, started))
+            finally:
+                operator.stop()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class Bench:
+    """What is measured, and since when the operator runs."""
+
+    def __init__(
+        self, plane: ControlPlane, cluster: CrowdedCluster, operator: Operator, started: float
+    ) -> None:
+        self.plane, self.cluster, self.operator, self.started = plane, cluster, operator, started
+
+    async def rest(self, quiet: float = 5.0) -> None:
+        """Wait until the operator has asked nothing but what it asks by the clock for a while."""
+        end, before = time.monotonic() + PATIENCE, -1
+        while True:
+            asked = self.plane.asked()
+            written = sum(n for what, n in asked.items() if what.split()[0] in ("create", "patch"))
+            if written == before:
+                return
+            assert time.monotonic() < end, f"the operator does not come to rest: {asked}"
+            before = written
+            await asyncio.sleep(quiet)
+
+    async def over(self, seconds: float) -> tuple[float, float, dict[str, int]]:
+        """Shares of a core of the operator and the API server meanwhile, and the requests."""
+        pids = self.operator.pid, self.plane.api_server
+        before, asked, since = [*map(cpu_seconds, pids)], self.plane.asked(), time.monotonic()
+        await asyncio.sleep(seconds)
+        took = time.monotonic() - since
+        own, api = ((cpu_seconds(p) - b) / took for p, b in zip(pids, before, strict=True))
+        return own, api, dict(self.plane.asked() - asked)
+
+    async def reaction(self, node: str) -> float:
+        """Seconds from a labelled pod that is bound to a new node until its proxy's pod is made."""
+        await self.cluster.add_node(node)
+        bound = await self.cluster.add_robot(node)
+        return await self.cluster.made_on(node, 120.0) - bound
+
+
+async def _measure(book: Book, size: int, seconds: float, bench: Bench) -> None:
+    def add(row: str, value: float) -> None:
+        book.add(row, PATH, value, size)
+
+    await bench.cluster.all_made(size, PATIENCE)
+    add("all proxies made, s", time.monotonic() - bench.started)
+    add("CPU of the operator until then, s", cpu_seconds(bench.operator.pid))
+    await bench.rest()
+    took, count = await bench.operator.looks()
+    add("one look, s", took / count)
+    own, api, asked = await bench.over(seconds)
+    add("nothing happens: operator, % of a core", own * 100)
+    add("nothing happens: API server, % of a core", api * 100)
+    add("nothing happens: operator, MiB", resident(bench.operator.pid) / 1024)
+    add("nothing happens: requests a minute", sum(asked.values()) * 60 / seconds)
+    book.note(f"{size} nodes, requests when nothing happens: {asked}")
+    tries = [await bench.reaction(f"new{number}") for number in range(TRIES)]
+    add("labelled pod bound, proxy's pod made: median, s", median(tries))
+    add("labelled pod bound, proxy's pod made: longest, s", max(tries))
+    churning = asyncio.create_task(bench.cluster.churn(size, CHURN))
+    try:
+        own, _, asked = await bench.over(seconds)
+        add("others' pods come and go: operator, % of a core", own * 100)
+        tries = [await bench.reaction(f"newer{number}") for number in range(TRIES)]
+        add("the same while others' pods come and go: median, s", median(tries))
+        add("the same while others' pods come and go: longest, s", max(tries))
+    finally:
+        churning.cancel()
+
+
+def main() -> None:
+    """Measure one size, and print what was found as JSON."""
+    book = Book()
+    asyncio.run(_one(book, int(sys.argv[1]), float(sys.argv[2])))
+    rows = [(line.row, line.middle) for line in book.lines()]
+    notes = [note.partition(": ")[2] for note in book.notes]
+    print(json.dumps({"rows": rows, "notes": notes}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""The Docker operator on a host with more and more labelled containers.
+
+Engine, proxies and masters are real. The labelled containers do nothing, so that what is measured
+is the operator's work and the engine's own; ten of them share a network and a master, so there is
+a proxy for ten. The second half of them is started at once, as ``docker compose up`` does.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from tests.bench.book import Book
+from tests.bench.world import cpu_seconds, resident
+from tests.docker.controller import Process, proxies, remove_proxies
+from tests.docker.engine import docker, running_engine, wait_until
+from tests.docker.images import PROXY, ROS, build_image
+
+PATH = "rosproxy-operator"
+SIZES, QUICK_SIZES = (20, 100, 200), (20,)
+SHARE = 10
+"""Containers of one master and network."""
+PORTS = 12
+SECONDS, QUICK_SECONDS = 30.0, 5.0
+"""How long it is watched when nothing happens."""
+AT_ONCE = 8
+FIRST_MASTER = 21400
+PATIENCE = 600.0
+_LOOK = re.compile(r"looked in ([\d.]+) s: (\d+) actions")
+
+
+class Look(NamedTuple):
+    seconds: float
+    actions: int
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    folder = Path(tempfile.mkdtemp(prefix="rosproxy-bench-docker-"))
+    with running_engine(folder / "dockerd.log"):
+        build_image(PROXY)
+        build_image(ROS)
+        for number in range(rounds):
+            for size in QUICK_SIZES if quick else SIZES:
+                place = folder / f"{number}-{size}"
+                place.mkdir()
+                _one(book, size, QUICK_SECONDS if quick else SECONDS, place)
+    shutil.rmtree(folder)
+    book.note(f"{SHARE} containers share a network, a master and a proxy with {PORTS} ports")
+
+
+def _one(book: Book, size: int, seconds: float, folder: Path) -> None:
+    def add(row: str, value: float) -> None:
+        book.add(row, PATH, value, size)
+
+    with ExitStack() as stack:
+        stack.callback(remove_proxies)
+        stack.enter_context(_masters(size // SHARE))
+        names = stack.enter_context(_containers(size))
+        early, late = names[::2], names[1::2]
+        _each("start", early)
+        options = ("--proxy-image", PROXY, "--ports", str(PORTS), "--log-level", "debug")
+        operator = Process(folder, *options)
+        stack.callback(operator.stop)
+        started = time.monotonic()
+        operator.start()
+        assert operator.process is not None
+        pid = operator.process.pid
+        wait_until(lambda: _serving() == size // SHARE, PATIENCE, lambda: operator.logs()[-3000:])
+        add("all proxies run, s", time.monotonic() - started)
+        _rest(operator)
+        add("CPU of the operator until then, s", cpu_seconds(pid))
+
+        seen, cpu, since = len(_looks(operator)), cpu_seconds(pid), time.monotonic()
+        _each("start", late)
+        add("half of the containers started, s", time.monotonic() - since)
+        _rest(operator)
+        looks = [look.seconds for look in _looks(operator)[seen:]]
+        add("that: CPU of the operator, s", cpu_seconds(pid) - cpu)
+        add("that: looks", len(looks))
+        add("that: one look, median, s", median(looks))
+        add("that: one look, longest, s", max(looks))
+
+        seen, cpu, since = len(_looks(operator)), cpu_seconds(pid), time.monotonic()
+        time.sleep(seconds)
+        looks = [look.seconds for look in _looks(operator)[seen:]]
+        took = time.monotonic() - since
+        add("nothing happens: operator, % of a core", (cpu_seconds(pid) - cpu) / took * 100)
+        add("nothing happens: operator, MiB", resident(pid) / 1024)
+        add("nothing happens: one look, longest, s", max(looks))
+
+
+def _serving() -> int:
+    return sum(proxy.running for proxy in proxies())
+
+
+def _looks(operator: Process) -> list[Look]:
+    return [Look(float(one[1]), int(one[2])) for one in _LOOK.finditer(operator.logs())]
+
+
+def _rest(operator: Process, quiet: float = 6.0) -> None:
+    """Wait until the operator has had nothing to do for a while."""
+
+    def done() -> int:
+        return sum(look.actions > 0 for look in _looks(operator))
+
+    end, before = time.monotonic() + PATIENCE, -1
+    while (now := done()) != before:
+        assert time.monotonic() < end, f"it does not come to rest: {operator.logs()[-3000:]}"
+        before = now
+        time.sleep(quiet)
+
+
+@contextmanager
+def _masters(count: int) -> Iterator[None]:
+    """Masters on this host, one for each network."""
+    found = []
+    try:
+        for number in range(count):
+            port = str(FIRST_MASTER + number)
+            argv = ("/usr/bin/python3", "/usr/bin/rosmaster", "--core", "-p", port)
+            found.append(
+                subprocess.Popen(
+                    argv,
+                    env={"PATH": "/usr/bin:/bin"},
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+            )
+        yield
+    finally:
+        for master in found:
+            master.kill()
+            master.wait()
+
+
+@contextmanager
+def _containers(count: int) -> Iterator[list[str]]:
+    """Labelled containers that are not started yet, spread over networks."""
+    names = [f"rosproxy-bench-{number}" for number in range(count)]
+    networks = [f"rosproxy-bench-net-{number}" for number in range(count // SHARE)]
+    host = docker("network", "inspect", "bridge", "--format", "{{(index .IPAM.Config 0).Gateway}}")
+
+    def create(number: int) -> None:
+        network = number // SHARE
+        uri = f"http://{host}:{FIRST_MASTER + network}"
+        docker("create", "--init", "--name", names[number], "--network", networks[network],
+               "--label", "rosproxy.enable=true", "--label", f"rosproxy.master-uri={uri}",
+               ROS, "sleep", "infinity")  # fmt: skip
+
+    try:
+        for network in networks:
+            docker("network", "create", network)
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            list(pool.map(create, range(count)))
+        yield names
+    finally:
+        docker("rm", "--force", *names, check=False, seconds=PATIENCE)
+        remove_proxies()
+        docker("network", "rm", *networks, check=False)
+
+
+def _each(verb: str, names: list[str]) -> None:
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        list(pool.map(lambda name: docker(verb, name, seconds=PATIENCE), names))

@@ -1,0 +1,224 @@
+"""ROS 2: nodes of rclpy that talk directly, by the kernel and by the proxy; many participants.
+
+What outside sends to inside passes the proxy or its kernel plane; what inside sends to outside does
+not, with any of the ways. So a ping passes one way only.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from rosproxy.ros2.registry.ports import REMEMBERED
+from tests.bench.book import DIRECT, Book, in_turn, loss, percentile
+from tests.bench.nodes import busy
+from tests.bench.ros import RosNode, running_node, wait_for_rest
+from tests.bench.ways import COPY, KERNEL, PLANES
+from tests.bench.world import (
+    ADDRESSES,
+    HOST,
+    INSIDE,
+    OUTSIDE,
+    SYSTEM_PATH,
+    World,
+    cpu_seconds,
+    resident,
+    world,
+)
+from tests.ros.processes import Process
+from tests.ros2.lab import ENVIRONMENTS
+from tests.ros2.machines import wait_for_links
+
+FIRST_PORT = 41000
+NETWORK = "172.31.0.0/24"
+SECOND = "172.31.0.3"
+"""Another address of the inside machine: the proxy serves at most 64 participants at one."""
+SECONDS, QUICK_SECONDS = 2.0, 1.0
+SIZES, QUICK_SIZES = (1, 10, 100), (1, 10)
+IDLE_SECONDS, QUICK_IDLE_SECONDS = 10.0, 5.0
+MOST_ROUNDS = 3
+"""Rounds of the crowds, each of which waits until the proxy has been up for a while."""
+PATIENCE = 120.0
+PATH = "rosproxy"
+
+
+class Stream(NamedTuple):
+    """Messages of a size, at a rate."""
+
+    title: str
+    size: int
+    rate: float
+
+
+PINGS = {"100 B ping": 100, "100 kB ping": 100_000}
+STREAMS = (Stream("1 KiB at 200 Hz", 1024, 200), Stream("1 MB at 20 Hz", 1_000_000, 20))
+
+
+class Site(NamedTuple):
+    """A way with a node at either end, and the process of the proxy if there is one."""
+
+    name: str
+    nodes: dict[str, RosNode]
+    pid: int | None
+
+
+def run(book: Book, rounds: int, quick: bool) -> None:
+    with ExitStack() as stack:
+        sites = [stack.enter_context(site(name)) for name in (DIRECT, KERNEL, COPY)]
+        seconds = QUICK_SECONDS if quick else SECONDS
+        for number in range(rounds):
+            for title, size in PINGS.items():
+                for one in in_turn(sites, number):
+                    measure_ping(book, one, title, size, seconds)
+            for stream in STREAMS:
+                for one in in_turn(sites, number):
+                    measure_stream(book, one, stream, seconds)
+    for _ in range(min(rounds, MOST_ROUNDS)):
+        for size in QUICK_SIZES if quick else SIZES:
+            book.add("discovery, s", DIRECT, discovered(size), size)
+            measure_crowd(book, size, QUICK_IDLE_SECONDS if quick else IDLE_SECONDS)
+    book.note(
+        "discovery is from the making of the first participant until a reader outside has found a "
+        "writer of each; the proxy has been up for half a minute; participants are of Cyclone DDS, "
+        "up to fifty in one process"
+    )
+
+
+def measure_ping(book: Book, where: Site, title: str, size: int, seconds: float) -> None:
+    times = [float(one) for one in where.nodes["outside"].ask("ping", size, seconds)[1:]]
+    enter(book, where, f"{title}, round trip", times)
+
+
+def measure_stream(book: Book, where: Site, stream: Stream, seconds: float) -> None:
+    before = cpu_seconds(where.pid) if where.pid else 0.0
+    sent = int(where.nodes["outside"].ask("go", stream.size, stream.rate, seconds)[1])
+    wait_for_rest(where.nodes["inside"], sent)
+    ages = [float(one) for one in where.nodes["inside"].ask("off")[1:]]
+    enter(book, where, f"{stream.title}, one way", ages)
+    book.add(f"{stream.title}, one way: loss, %", where.name, 100 * loss(sent, len(ages)))
+    if where.pid:
+        spent = (cpu_seconds(where.pid) - before) / sent
+        row = f"{stream.title}, one way: CPU of the proxy, us a message"
+        book.add(row, where.name, spent * 1e6)
+
+
+def enter(book: Book, where: Site, title: str, times: list[float]) -> None:
+    if len(times) < 2:
+        book.note(f"{where.name}, {title}: {len(times)} messages arrived")
+        return
+    for percent in (50, 99):
+        row = f"{title}: latency p{percent}, us"
+        book.add(row, where.name, percentile(times, percent))
+
+
+@contextmanager
+def site(name: str) -> Iterator[Site]:
+    """A world with its proxy if there is one, and two nodes that have found each other."""
+    with world(apart=True) as place, ExitStack() as stack:
+        wait_for_links(place)
+        pid = None if name == DIRECT else stack.enter_context(proxy(place, PLANES[name]))
+        nodes = {
+            role: stack.enter_context(talker(place, role, peer, name == DIRECT))
+            for role, peer in (("inside", "outside"), ("outside", "inside"))
+        }
+        for node in nodes.values():
+            node.ask("met")
+        if name == KERNEL:
+            wait_forwarded(place)
+        yield Site(name, nodes, pid)
+
+
+@contextmanager
+def proxy(place: World, plane: str) -> Iterator[int]:
+    """The proxy on the host, when it is ready; its process id."""
+    argv = [sys.executable, "-m", "rosproxy", "run", "--ros", "2", "--data-plane", plane]
+    argv += ["--advertise-host", HOST, "--port-range", f"{FIRST_PORT}-{FIRST_PORT + 999}"]
+    argv += ["--inside-network", NETWORK, "--ros2-peer", OUTSIDE]
+    with place.running("host", *argv) as process:
+        process.wait_for("ready: ", timeout=60)
+        yield process.pid
+
+
+def wait_forwarded(place: World) -> None:
+    """Wait until the kernel forwards both ports of a participant's user data."""
+    words = "nft", "-j", "list", "map", "inet", f"rosproxy-udp-{FIRST_PORT}", "ports"
+    end = time.monotonic() + PATIENCE
+    while True:
+        listed = json.loads(place.run("host", *words))["nftables"]
+        if any(len(one["map"].get("elem", [])) == 2 for one in listed if "map" in one):
+            return
+        if time.monotonic() > end:
+            raise RuntimeError("the kernel does not forward: see `rosproxy status` for the reason")
+        time.sleep(0.1)
+
+
+@contextmanager
+def talker(place: World, role: str, peer: str, direct: bool) -> Iterator[RosNode]:
+    """A node of rclpy on a machine, when it is ready; a direct one knows where the other is."""
+    program = str(Path(__file__).with_name("ros2_node.py"))
+    command = place.command(role, python("jazzy"), program, role, peer)
+    # Shared memory is what these machines have in common.
+    env = environment(place) | {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+    if direct:
+        env["ROS_STATIC_PEERS"] = ADDRESSES[peer]
+    with running_node(command, env, place.folder / f"talker-{role}.log") as node:
+        yield node
+
+
+def environment(place: World) -> dict[str, str]:
+    return {"PATH": SYSTEM_PATH, "HOME": str(place.folder), "PYTHONUNBUFFERED": "1"}
+
+
+def python(name: str) -> str:
+    """That of an environment of the ROS 2 layer's."""
+    return str(ENVIRONMENTS / name / "bin/python")
+
+
+def discovered(size: int) -> float:
+    """Seconds in which so many participants are found that know where the others are."""
+    with world() as place:
+        return crowded(place, size, OUTSIDE)
+
+
+def measure_crowd(book: Book, size: int, idle: float) -> None:
+    """The same through the proxy, and what they cost it."""
+    with world() as place, proxy(place, "auto") as pid:
+        time.sleep(REMEMBERED)  # it waits no more for who had ports before it started
+        before = resident(pid)
+        book.add("discovery, s", PATH, crowded(place, size), size)
+        book.add("CPU when idle, ms/s", PATH, busy(pid, idle) * 1000, size)
+        if size == max(SIZES):
+            book.add("memory per participant, KiB", PATH, (resident(pid) - before) / size, size)
+
+
+def crowded(place: World, size: int, peer: str = "") -> float:
+    """Seconds from the first participant's making until outside has found a writer of each."""
+    wait_for_links(place)
+    place.run("inside", "ip", "addr", "add", f"{SECOND}/24", "dev", "eth0")
+    index = "<ParticipantIndex>0</ParticipantIndex>"
+    watch = cyclone(place, "outside", OUTSIDE, index, "watch")
+    watch.wait_for("^ready", timeout=PATIENCE)
+    peers = f'<Peers><Peer address="{peer}"/></Peers>' if peer else ""
+    parts = {INSIDE: size - size // 2, SECOND: size // 2}
+    crowds = [
+        cyclone(place, "inside", address, peers, "crowd", str(count))
+        for address, count in parts.items()
+        if count
+    ]
+    found = float(watch.wait_for(rf"^found {size} (\S+)", timeout=PATIENCE)[1])
+    return found - min(float(one.wait_for(r"^began (\S+)")[1]) for one in crowds)
+
+
+def cyclone(place: World, role: str, address: str, discovery: str, *words: str) -> Process:
+    """A program with participants of Cyclone DDS at an address of a machine."""
+    interface = f'<Interfaces><NetworkInterface address="{address}"/></Interfaces>'
+    config = f"<General>{interface}</General><Discovery>{discovery}</Discovery>"
+    uri = f"<CycloneDDS><Domain>{config}</Domain></CycloneDDS>"
+    program = str(Path(__file__).with_name("ros2_crowd.py"))
+    env = environment(place) | {"CYCLONEDDS_URI": uri}
+    return place.start(role, python("cyclone"), program, *words, env=env)

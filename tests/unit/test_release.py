@@ -1,0 +1,56 @@
+"""What a release is made of says one version, and its workflow what the tests were run with."""
+
+import re
+from pathlib import Path
+
+import pytest
+from scripts.release_check import Release, Wrong, check_versions, newest, project_version
+
+ROOT = Path(__file__).resolve().parents[2]
+WORKFLOWS = ROOT / ".github/workflows"
+RELEASE = (WORKFLOWS / "release.yaml").read_text()
+
+
+def release(version: str = "", tag: str = "") -> Release:
+    return Release(version or project_version(), tag, "", "", "")
+
+
+def test_one_version_everywhere() -> None:
+    check_versions(release())
+
+
+def test_another_version_is_named_with_its_place() -> None:
+    with pytest.raises(Wrong, match=r"Chart\.yaml, appVersion"):
+        check_versions(release("9.9.9"))
+
+
+def test_a_release_has_its_entry_in_the_changelog(tmp_path: Path) -> None:
+    changelog = tmp_path / "CHANGELOG.md"
+    changelog.write_text("# Changelog\n\n## [Unreleased]\n\n## [1.2.3] - 2030-01-31\n\n- x\n")
+    assert newest(changelog) == "1.2.3"
+    changelog.write_text("# Changelog\n\n## [Unreleased]\n\n- new\n\n## [1.2.3] - 2030-01-31\n")
+    with pytest.raises(Wrong, match="Unreleased"):
+        newest(changelog)
+
+
+def test_workflows_have_the_tests_helm() -> None:
+    module = (ROOT / "tests/kubernetes/tools/helm/go.mod").read_text()
+    (version,) = re.findall(r"^\thelm\.sh/helm/v3 (v\S+)", module, re.M)
+    text = RELEASE + (WORKFLOWS / "check.yaml").read_text()
+    assert set(re.findall(r"setup-helm@.*\n +with:\n +version: (\S+)", text)) == {version}
+
+
+def test_what_signs_and_publishes_is_pinned() -> None:
+    """A tag can be moved to other code, which would run with the right to publish."""
+    uses = set(re.findall(r"uses: ([\w./-]+)@(\S+)", RELEASE))
+    own = {name for name, _ in uses if name.startswith("actions/") and "attest" not in name}
+    others = {at for name, at in uses if name not in own}
+    assert len(others) > 5
+    # PyPI's own: it asks for this branch, and runs an image of the same name.
+    assert {at for at in others if not re.fullmatch("[0-9a-f]{40}", at)} == {"release/v1"}
+
+
+def test_nothing_that_others_choose_becomes_a_command() -> None:
+    """Expressions are put into scripts as text: what a tag or a branch is called would be run."""
+    for script in re.findall(r"^ +(?:- )?run: (.*(?:\n {10,}.*)*)", RELEASE, re.M):
+        assert "${{" not in script.partition("\n        env:")[0], script
