@@ -51,11 +51,11 @@ demo: $(VENV)/.runtime ## messages of ROS 1 and ROS 2 through the proxy, both wa
 
 .PHONY: test
 test: $(VENV)/.dev ## unit and integration tests; and a smoke test with real ROS and Docker, which it installs, as root on Debian or Ubuntu
-	@$(BIN)/python scripts/test_layers.py --smoke
+	@$(BIN)/python -m scripts.test_layers --smoke
 
 .PHONY: test-all
 test-all: $(VENV)/.dev ## every test of every layer that this machine can run; builds a Kubernetes cluster's programs, too
-	@$(BIN)/python scripts/test_layers.py $(LAYERS)
+	@$(BIN)/python -m scripts.test_layers $(LAYERS)
 
 .PHONY: bench
 bench: $(VENV)/.bench ## speed and memory next to a direct connection, socat, HAProxy and nginx, in half an hour (BENCH="--quick"); as root on Debian or Ubuntu, installs those and ROS

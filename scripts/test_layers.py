@@ -1,23 +1,22 @@
-"""Run layers of tests, side by side as far as they allow it, and say what ran and how long it took.
+"""Run layers of tests, and say what ran and how long it took.
 
-    python scripts/test_layers.py --smoke          what `make test` runs
-    python scripts/test_layers.py                  what `make test-all` runs
-    python scripts/test_layers.py unit ros         these layers only
+    python -m scripts.test_layers --smoke          what `make test` runs
+    python -m scripts.test_layers                  what `make test-all` runs
+    python -m scripts.test_layers unit ros         these layers only
 
-How it works. A layer is a directory under tests/, or some tests of one in other surroundings. Two
-layers run side by side; three, beside each other's nodes and engines, were at a load of 30 to 55 on
-two processors, where what takes a second takes a minute:
+How it works (`layers` says which there are):
 
-  1. The integration tests have a processor for themselves. Beside them what other layers need is
-     prepared: packages, programs and images, by scripts that do nothing where their work is done
-     already. After that docker begins, and then kubernetes, which are the longest and mostly wait.
-  2. After the integration tests the others, the long ones first, in the lane that is free.
-  3. At the end, alone: those with bad neighbours, which hold how long an answer may take, and ROS 2
-     in a cluster. There two dozen participants meet anew each time when a proxy's pod is replaced,
-     for which Fast DDS takes all of two processors for seconds, and minutes beside others.
-
-No layer with real nodes, engines or clusters starts before everything is prepared: they mind a
-machine that is busy with compiling.
+  1. What layers need is prepared: packages, programs and images, by scripts that do nothing where
+     their work is done already. Beside it the unit tests, which mind nobody.
+  2. The integration tests, alone: they count in tenths of seconds.
+  3. Layers with real nodes, engines and browsers, two side by side; three were at a load of 30 to
+     55 on two processors, where what takes a second takes a minute. Docker begins and is followed
+     by Kubernetes: they are the longest, and mostly wait.
+  4. Alone: those with bad neighbours, which hold how long an answer may take, and ROS 2 in a
+     cluster. There two dozen participants meet anew each time when a proxy's pod is replaced, for
+     which Fast DDS takes all of two processors for seconds, and minutes beside others.
+  5. What failed, once more and alone (`second_look` says why). Not of layers that have no second
+     look: what fails there once is wrong.
 
 With --smoke, only tests marked `smoke` run of the layers that have such, and layers without are
 left to `make test-all`. So all that `make test` runs is part of `make test-all`.
@@ -25,12 +24,11 @@ left to `make test-all`. So all that `make test` runs is part of `make test-all`
 What a step prints goes to build/test-logs. A layer's is shown whole when it ends, a preparation's
 when it fails. A layer that this machine cannot run is named together with the reason; with CI=true
 in the environment that counts as a failure, so a pipeline never turns green by leaving a layer out.
-No test is tried twice.
+Flaky tests stand at the end and in build/test-logs/flaky.txt; with STRICT=1 they are failures.
 """
 
 import argparse
 import os
-import platform
 import shutil
 import signal
 import subprocess
@@ -38,185 +36,48 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
-ROOT = Path(__file__).resolve().parent.parent
-LOGS = ROOT / "build/test-logs"
-CAP_NET_ADMIN = 1 << 12
-CAP_SYS_ADMIN = 1 << 21
-ALL, MARKED, NONE = "all", "marked", "none"
+from scripts import layers
+from scripts.layers import COMMANDS, LAYERS, LOGS, MARKED, NONE, ROOT, Layer
+from scripts.second_look import Case, Flake, flakes, read_cases, too_many, worth_a_look
 
-ROS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
-    PREPARATIONS
-) = (
-    "install-ros",
-    "install-browser",
-    "install-jazzy",
-    "install-ros2",
-    "compile-nodes",
-    "install-docker",
-    "install-compose",
-    "install-prometheus",
-    "install-kubernetes",
-    "build-images",
-)
-COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
-    JAZZY: ["scripts/install-ros2.sh", "jazzy"],
-    NODES: [sys.executable, "-m", "tests.ros.cpp"],
-    IMAGES: [sys.executable, "-m", "tests.docker.images"],
-}
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A directory of tests, or some ``tests`` of another one, and how they are run.
-
-    ``setup``: what prepares this machine for it; ``smoke_setup``: those of them that its smoke
-    needs. ``smoke``: ALL of its tests are in the smoke, those that are MARKED, or NONE.
-    ``workers``: how many processes of pytest share the tests, one file each at a time.
-    ``environment``: variables that they are told. ``obstacle`` says why it can't run here, if so.
-    """
-
-    name: str
-    smoke: str = NONE
-    setup: tuple[str, ...] = ()
-    smoke_setup: tuple[str, ...] = ()
-    workers: int = 0
-    obstacle: Callable[[], str | None] = lambda: None
-    tests: tuple[str, ...] = ()
-    environment: tuple[str, ...] = ()
-
-    def command(self, report: Path, smoke: bool) -> list[str]:
-        words = ["env", *self.environment, sys.executable, "-m", "pytest"]
-        words += [*(self.tests or (f"tests/{self.name}",)), f"--junitxml={report}"]
-        words += ["--tb=short", "--durations=15", "-o", f"cache_dir={LOGS}/{self.name}-cache"]
-        if self.workers:
-            words += ["-n", str(self.workers), "--dist=loadfile"]
-        return words + (["-m", "smoke"] if smoke and self.smoke == MARKED else [])
+TESTS_FAILED = 1
+"""With this pytest ends where all was run and some of it failed, and not something of its own."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a layer: whether it ran, whether that is good, and numbers or a reason."""
+    """What became of a layer: whether it ran, whether that is good, and numbers or a reason.
+
+    ``cases``: its tests, where some have failed and all have been run. ``flaky``: those that
+    failed and passed at the second look, and are good.
+    """
 
     layer: Layer
     ran: bool
     good: bool
     text: str
+    cases: Mapping[str, Case] = field(default_factory=dict)
+    flaky: tuple[Flake, ...] = ()
 
-
-def debian_root_obstacle() -> str | None:
-    """Say what keeps this machine from making namespaces and installing packages."""
-    if platform.system() != "Linux" or not is_debian():
-        return "it needs Debian or Ubuntu"
-    if os.geteuid() != 0:
-        return "it needs root"
-    wanted = CAP_NET_ADMIN | CAP_SYS_ADMIN
-    if effective_capabilities() & wanted != wanted:
-        return "root lacks CAP_NET_ADMIN or CAP_SYS_ADMIN here (a container?)"
-    return None
-
-
-def abuse_obstacle() -> str | None:
-    """Say what keeps this machine from bounding a process's memory, and from making namespaces."""
-    if platform.system() != "Linux":
-        return "it needs Linux"
-    if os.geteuid() != 0:
-        return "it needs root"
-    if not shutil.which("ip"):
-        return "it needs ip (iproute2)"
-    groups = Path("/sys/fs/cgroup")
-    if not any(os.access(groups / name, os.W_OK) for name in ("memory", "cgroup.subtree_control")):
-        return f"{groups} can't be written here (a container?)"
-    return None
-
-
-def is_debian() -> bool:
-    try:
-        release = platform.freedesktop_os_release()
-    except OSError:
-        return False
-    family = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
-    return bool(family & {"debian", "ubuntu"})
-
-
-def effective_capabilities() -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("CapEff:"):
-            return int(line.split()[1], 16)
-    return 0
-
-
-UNIT = Layer("unit", smoke=ALL, workers=2)
-INTEGRATION = Layer("integration", smoke=ALL, workers=2)
-ABUSE = Layer("abuse", obstacle=abuse_obstacle)
-CHART = Layer("chart", setup=(PROMETHEUS, KUBERNETES), obstacle=debian_root_obstacle)
-IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
-ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
-ALIKE = (
-    *("inside-to-inside", "inside-to-outside"),
-    *("inside-about-inside", "inside-about-itself", "outside-about-inside"),
-)
-"""Cases of `ros` in which nobody inside wants anything of outside, by their names."""
-ISOLATED = Layer(
-    "isolated",
-    setup=(ROS, NODES),
-    workers=2,
-    obstacle=debian_root_obstacle,
-    tests=(
-        *(
-            f"tests/ros/test_{name}.py"
-            for name in (
-                *("recovery", "topics", "services", "actionlib"),
-                *("networks", "rosnode", "rostopic"),
-            )
-        ),
-        *("-k", " and ".join(f"not {name}" for name in ALIKE)),
-    ),
-    environment=("ROS_TESTS_ISOLATED=1",),
-)
-"""Inside has no way out but the proxy: what goes inwards, is asked from inside, or is recovered.
-
-All of tests/ros may run so, which takes as long again. What is left out is the same in `ros`, or
-rests on what runs here.
-"""
-ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
-BROWSER = Layer("browser", setup=(ROS, NODES, CHROMIUM), obstacle=debian_root_obstacle)
-DOCKER_ENGINE = Layer(
-    "docker",
-    MARKED,
-    (ENGINE, COMPOSE, PROMETHEUS, IMAGES),
-    (ENGINE, IMAGES),
-    obstacle=debian_root_obstacle,
-)
-_ROS2_PODS = "tests/kubernetes/test_ros2.py"
-CLUSTER = Layer(
-    "kubernetes",
-    setup=(ENGINE, KUBERNETES, IMAGES),
-    obstacle=debian_root_obstacle,
-    tests=("tests/kubernetes", f"--ignore={_ROS2_PODS}"),
-)
-ROS2_CLUSTER = Layer(
-    "kubernetes-ros2",
-    setup=CLUSTER.setup,
-    obstacle=debian_root_obstacle,
-    tests=(_ROS2_PODS,),
-)
-LAYERS = (
-    *(UNIT, INTEGRATION, ABUSE, CHART, IMAGE),
-    *(ROS_NODES, ISOLATED, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
-)
+    @property
+    def mark(self) -> str:
+        """One word for a table."""
+        if not self.good:
+            return "FAILED"
+        return "flaky" if self.flaky else "ok" if self.ran else "--"
 
 
 class Run:
     """One run of some layers."""
 
-    def __init__(self, layers: Iterable[Layer], smoke: bool) -> None:
-        self.layers = list(layers)
+    def __init__(self, wanted: Iterable[Layer], smoke: bool) -> None:
+        self.layers = list(wanted)
         self.smoke = smoke
         self._started = time.monotonic()
         self._failed: set[str] = set()
@@ -226,14 +87,19 @@ class Run:
         """Prepare and run; the outcomes in the order of the layers."""
         LOGS.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor() as pool:
-            integration = pool.submit(self._some, deque([INTEGRATION]))
+            unit = pool.submit(self._some, deque(layers.BESIDE_PREPARATION))
             self._prepare()
-            lanes = [integration, pool.submit(self._some, deque([DOCKER_ENGINE, CLUSTER]))]
-            integration.result()
-            late = deque([ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, BROWSER, CHART, UNIT])
-            lanes += [pool.submit(self._then, lane, late) for lane in lanes]
-        outcomes = [outcome for lane in lanes for outcome in lane.result()]
-        outcomes += self._some(deque([ABUSE, ROS2_CLUSTER]))
+        outcomes = unit.result() + self._some(deque(layers.ALONE_FIRST))
+        rest = deque(layers.SIDE_BY_SIDE)
+        with ThreadPoolExecutor() as pool:
+            lanes = [
+                pool.submit(self._some, deque(layers.LONGEST), rest),
+                pool.submit(self._some, rest),
+            ]
+        outcomes += [outcome for lane in lanes for outcome in lane.result()]
+        outcomes += self._some(deque(layers.ALONE_LAST))
+        if worth_a_look(case for outcome in outcomes for case in outcome.cases.values()):
+            outcomes = [self._look_again(outcome) for outcome in outcomes]
         return sorted(outcomes, key=lambda outcome: LAYERS.index(outcome.layer))
 
     def _prepare(self) -> None:
@@ -247,20 +113,17 @@ class Run:
     def _steps(self, layer: Layer) -> tuple[str, ...]:
         return layer.smoke_setup if self.smoke else layer.setup
 
-    def _then(self, before: Future[list[Outcome]], left: deque[Layer]) -> list[Outcome]:
-        before.result()
-        return self._some(left)
-
-    def _some(self, left: deque[Layer]) -> list[Outcome]:
+    def _some(self, *queues: deque[Layer]) -> list[Outcome]:
         """Run layers one after another, until none is left: others may take from them, too."""
         outcomes = []
-        while left:
-            try:
-                layer = left.popleft()
-            except IndexError:  # another was faster
-                break
-            if layer in self.layers:
-                outcomes.append(self._layer(layer))
+        for left in queues:
+            while left:
+                try:
+                    layer = left.popleft()
+                except IndexError:  # another was faster
+                    break
+                if layer in self.layers:
+                    outcomes.append(self._layer(layer))
         return outcomes
 
     def _layer(self, layer: Layer) -> Outcome:
@@ -270,16 +133,33 @@ class Run:
         missing = [step for step in self._steps(layer) if step in self._failed]
         if missing:
             return Outcome(layer, False, False, f"did not run: {missing[0]} failed")
-        report, began = LOGS / f"{layer.name}.xml", time.monotonic()
-        report.unlink(missing_ok=True)
-        code, text = self._run(f"tests/{layer.name}", layer.command(report, self.smoke))
+        began = time.monotonic()
+        for again in (False, True):
+            layer.report(again).unlink(missing_ok=True)
+        shutil.rmtree(layer.cache, ignore_errors=True)
+        code, text = self._run(f"tests/{layer.name}", layer.command(self.smoke))
         self._say(f"=== {layer.name} ===\n{text}")
+        report = layer.report()
         numbers = count(report) if report.exists() else "no report"
-        return Outcome(layer, True, code == 0, f"{numbers} in {time.monotonic() - began:.0f} s")
+        text = f"{numbers} in {time.monotonic() - began:.0f} s"
+        cases = read_cases(report) if code == TESTS_FAILED else {}
+        return Outcome(layer, True, code == 0, text, cases)
+
+    def _look_again(self, outcome: Outcome) -> Outcome:
+        """Run once more what failed of a layer, if it is of those that have a second look."""
+        layer = outcome.layer
+        if not outcome.cases or not layer.second_look:
+            return outcome
+        code, text = self._run(f"tests/{layer.name} again", layer.command(self.smoke, again=True))
+        self._say(f"=== {layer.name}, what failed, alone ===\n{text}")
+        if code != 0:
+            return outcome
+        flaky = flakes(outcome.cases, read_cases(layer.report(again=True)))
+        return replace(outcome, good=bool(flaky), flaky=flaky)
 
     def _run(self, title: str, command: list[str]) -> tuple[int, str]:
         """Run a step; its exit code and what it has printed."""
-        log, began = LOGS / f"{title.replace('/', '-')}.log", time.monotonic()
+        log, began = LOGS / f"{title.replace('/', '-').replace(' ', '-')}.log", time.monotonic()
         self._say(f"{title} …")
         with log.open("wb") as output:
             code = subprocess.run(
@@ -292,18 +172,29 @@ class Run:
         with self._printing:
             print(f"[{time.monotonic() - self._started:4.0f} s] {text}", flush=True)
 
-    def summary(self, outcomes: list[Outcome]) -> str:
+    def summary(self, outcomes: list[Outcome], refusal: str | None) -> str:
+        """What ran, for the end; ``refusal``: why flaky tests refuse the run."""
         minutes, seconds = divmod(round(time.monotonic() - self._started), 60)
         lines = ["", f"Test layers, {minutes} min {seconds} s in all:"]
         for outcome in outcomes:
-            mark = "ok" if outcome.good and outcome.ran else "--" if outcome.good else "FAILED"
             only = " (smoke)" if self.smoke and outcome.layer.smoke == MARKED else ""
-            lines.append(f"  {outcome.layer.name + only:<16} {mark:<7} {outcome.text}")
+            lines.append(f"  {outcome.layer.name + only:<16} {outcome.mark:<7} {outcome.text}")
         if self.smoke:
             lines.append(
                 "The whole of each layer, the chart and a Kubernetes cluster: make test-all"
             )
-        return "\n".join(lines)
+        flaky = [flake for outcome in outcomes for flake in outcome.flaky]
+        if flaky:
+            lines.append("A flaky test is a bug, of the product or of the test (CONTRIBUTING.md):")
+        lines += [f"  FLAKY {flake}" for flake in flaky]
+        return "\n".join([*lines, *([f"Refused: {refusal}"] if refusal else [])])
+
+
+def note_flaky(outcomes: Iterable[Outcome]) -> int:
+    """Write the flaky tests to a file, one a line; how many there are."""
+    flaky = [flake for outcome in outcomes for flake in outcome.flaky]
+    (LOGS / "flaky.txt").write_text("".join(f"{flake}\n" for flake in flaky))
+    return len(flaky)
 
 
 def count(report: Path) -> str:
@@ -336,8 +227,9 @@ def main() -> int:
         wanted = [layer for layer in wanted if layer.smoke != NONE]
     run = Run(wanted, options.smoke)
     outcomes = run.all()
-    print(run.summary(outcomes))
-    return 0 if all(outcome.good for outcome in outcomes) else 1
+    refusal = too_many(note_flaky(outcomes), os.environ.get("STRICT") == "1")
+    print(run.summary(outcomes, refusal))
+    return 0 if refusal is None and all(outcome.good for outcome in outcomes) else 1
 
 
 if __name__ == "__main__":

@@ -1,0 +1,193 @@
+"""Which layers of tests there are: what each needs, and how it is run.
+
+A layer is a directory under tests/, or some tests of one in other surroundings. `test_layers` runs
+them.
+"""
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+LOGS = ROOT / "build/test-logs"
+CAP_NET_ADMIN = 1 << 12
+CAP_SYS_ADMIN = 1 << 21
+ALL, MARKED, NONE = "all", "marked", "none"
+
+ROS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
+    PREPARATIONS
+) = (
+    "install-ros",
+    "install-browser",
+    "install-jazzy",
+    "install-ros2",
+    "compile-nodes",
+    "install-docker",
+    "install-compose",
+    "install-prometheus",
+    "install-kubernetes",
+    "build-images",
+)
+COMMANDS = {name: [f"scripts/{name}.sh"] for name in PREPARATIONS} | {
+    JAZZY: ["scripts/install-ros2.sh", "jazzy"],
+    NODES: [sys.executable, "-m", "tests.ros.cpp"],
+    IMAGES: [sys.executable, "-m", "tests.docker.images"],
+}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A directory of tests, or some ``tests`` of another one, and how they are run.
+
+    ``setup``: what prepares this machine for it; ``smoke_setup``: those of them that its smoke
+    needs. ``smoke``: ALL of its tests are in the smoke, those that are MARKED, or NONE.
+    ``workers``: how many processes of pytest share the tests, one file each at a time.
+    ``environment``: variables that they are told. ``obstacle`` says why it can't run here, if so.
+    ``second_look``: whether what failed among others is run once more.
+    """
+
+    name: str
+    smoke: str = NONE
+    setup: tuple[str, ...] = ()
+    smoke_setup: tuple[str, ...] = ()
+    workers: int = 0
+    obstacle: Callable[[], str | None] = lambda: None
+    tests: tuple[str, ...] = ()
+    environment: tuple[str, ...] = ()
+    second_look: bool = True
+
+    @property
+    def cache(self) -> Path:
+        """Where pytest notes which tests failed."""
+        return LOGS / f"{self.name}-cache"
+
+    def report(self, again: bool = False) -> Path:
+        """The JUnit report of the first try, or of the second."""
+        return LOGS / f"{self.name}{'-again' * again}.xml"
+
+    def command(self, smoke: bool, again: bool = False) -> list[str]:
+        """What runs it; ``again``: only what failed the last time, one after the other."""
+        words = ["env", *self.environment, sys.executable, "-m", "pytest"]
+        words += [*(self.tests or (f"tests/{self.name}",)), f"--junitxml={self.report(again)}"]
+        words += ["--tb=short", "--durations=15", "-o", f"cache_dir={self.cache}"]
+        if again:
+            words += ["--last-failed", "--last-failed-no-failures=none"]
+        elif self.workers:
+            words += ["-n", str(self.workers), "--dist=loadfile"]
+        return words + (["-m", "smoke"] if smoke and self.smoke == MARKED else [])
+
+
+def debian_root_obstacle() -> str | None:
+    """Say what keeps this machine from making namespaces and installing packages."""
+    if platform.system() != "Linux" or not is_debian():
+        return "it needs Debian or Ubuntu"
+    if os.geteuid() != 0:
+        return "it needs root"
+    wanted = CAP_NET_ADMIN | CAP_SYS_ADMIN
+    if effective_capabilities() & wanted != wanted:
+        return "root lacks CAP_NET_ADMIN or CAP_SYS_ADMIN here (a container?)"
+    return None
+
+
+def abuse_obstacle() -> str | None:
+    """Say what keeps this machine from bounding a process's memory, and from making namespaces."""
+    if platform.system() != "Linux":
+        return "it needs Linux"
+    if os.geteuid() != 0:
+        return "it needs root"
+    if not shutil.which("ip"):
+        return "it needs ip (iproute2)"
+    groups = Path("/sys/fs/cgroup")
+    if not any(os.access(groups / name, os.W_OK) for name in ("memory", "cgroup.subtree_control")):
+        return f"{groups} can't be written here (a container?)"
+    return None
+
+
+def is_debian() -> bool:
+    try:
+        release = platform.freedesktop_os_release()
+    except OSError:
+        return False
+    family = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
+    return bool(family & {"debian", "ubuntu"})
+
+
+def effective_capabilities() -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("CapEff:"):
+            return int(line.split()[1], 16)
+    return 0
+
+
+UNIT = Layer("unit", smoke=ALL, workers=2, second_look=False)
+INTEGRATION = Layer("integration", smoke=ALL, workers=2)
+ABUSE = Layer("abuse", obstacle=abuse_obstacle)
+CHART = Layer(
+    "chart", setup=(PROMETHEUS, KUBERNETES), obstacle=debian_root_obstacle, second_look=False
+)
+IMAGE = Layer("image", setup=(ENGINE, COMPOSE, IMAGES), obstacle=debian_root_obstacle)
+ROS_NODES = Layer("ros", MARKED, (ROS, NODES), (ROS, NODES), 2, debian_root_obstacle)
+ALIKE = (
+    *("inside-to-inside", "inside-to-outside"),
+    *("inside-about-inside", "inside-about-itself", "outside-about-inside"),
+)
+"""Cases of `ros` in which nobody inside wants anything of outside, by their names."""
+ISOLATED = Layer(
+    "isolated",
+    setup=(ROS, NODES),
+    workers=2,
+    obstacle=debian_root_obstacle,
+    tests=(
+        *(
+            f"tests/ros/test_{name}.py"
+            for name in (
+                *("recovery", "topics", "services", "actionlib"),
+                *("networks", "rosnode", "rostopic"),
+            )
+        ),
+        *("-k", " and ".join(f"not {name}" for name in ALIKE)),
+    ),
+    environment=("ROS_TESTS_ISOLATED=1",),
+)
+"""Inside has no way out but the proxy: what goes inwards, is asked from inside, or is recovered.
+
+All of tests/ros may run so, which takes as long again. What is left out is the same in `ros`, or
+rests on what runs here.
+"""
+ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
+BROWSER = Layer("browser", setup=(ROS, NODES, CHROMIUM), obstacle=debian_root_obstacle)
+DOCKER_ENGINE = Layer(
+    "docker",
+    MARKED,
+    (ENGINE, COMPOSE, PROMETHEUS, IMAGES),
+    (ENGINE, IMAGES),
+    obstacle=debian_root_obstacle,
+)
+_ROS2_PODS = "tests/kubernetes/test_ros2.py"
+CLUSTER = Layer(
+    "kubernetes",
+    setup=(ENGINE, KUBERNETES, IMAGES),
+    obstacle=debian_root_obstacle,
+    tests=("tests/kubernetes", f"--ignore={_ROS2_PODS}"),
+)
+ROS2_CLUSTER = Layer(
+    "kubernetes-ros2",
+    setup=CLUSTER.setup,
+    obstacle=debian_root_obstacle,
+    tests=(_ROS2_PODS,),
+)
+LAYERS = (
+    *(UNIT, INTEGRATION, ABUSE, CHART, IMAGE),
+    *(ROS_NODES, ISOLATED, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
+)
+
+BESIDE_PREPARATION = (UNIT,)
+ALONE_FIRST = (INTEGRATION,)
+LONGEST = (DOCKER_ENGINE, CLUSTER)
+SIDE_BY_SIDE = (ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, BROWSER, CHART)
+ALONE_LAST = (ABUSE, ROS2_CLUSTER)
+"""When which layers run, in this order; LONGEST and SIDE_BY_SIDE begin together."""
