@@ -28,8 +28,6 @@ ServeConnection = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitab
 
 CALL_SECONDS = 20.0
 """How long a call may take in all."""
-PORTS = range(15000, 32000)
-"""Where `free_ports` looks: below the ephemeral range."""
 
 
 class End(Enum):
@@ -96,14 +94,36 @@ def is_free(port: int, address: str = "", kind: int = socket.SOCK_STREAM) -> boo
     return True
 
 
-def free_ports(count: int) -> int:
-    """The first of `count` ports in a row among `PORTS` that nobody uses, for TCP or UDP."""
-    kinds = socket.SOCK_STREAM, socket.SOCK_DGRAM
-    while True:
-        first = random.randrange(PORTS.start, PORTS.stop - count)  # noqa: S311
-        ports = range(first, first + count)
-        if all(is_free(port, kind=kind) for port in ports for kind in kinds):
-            return first
+class PortDraws:
+    """Draws ports that nobody uses, for TCP or UDP, from a range that is gone through in order.
+
+    So a port that was freed comes again only after all others: who had it may be looked for yet.
+    It begins anywhere, since other processes may draw from the same range.
+    """
+
+    def __init__(self, ports: range) -> None:
+        self.keep_to(ports)
+
+    def keep_to(self, ports: range) -> None:
+        """Draw from these from now on."""
+        self.ports = ports
+        self._next = random.choice(ports)  # noqa: S311
+
+    def draw(self, count: int) -> int:
+        """The first of `count` ports in a row."""
+        kinds = socket.SOCK_STREAM, socket.SOCK_DGRAM
+        while True:
+            if self._next + count > self.ports.stop:
+                self._next = self.ports.start
+            row = range(self._next, self._next + count)
+            self._next = row.stop
+            if all(is_free(port, kind=kind) for port in row for kind in kinds):
+                return row.start
+
+
+PORTS = PortDraws(range(15000, 32000))
+"""Below the ephemeral range, from which the kernel draws for whoever doesn't mind."""
+free_ports = PORTS.draw
 
 
 async def call(
@@ -164,6 +184,7 @@ class FakeTcpServer:
 
     async def start(self, address: str, port: int = 0) -> None:
         """Listen; on a free port if none is given."""
+        port = port or free_ports(1)
         self._server = await asyncio.start_server(self._accept, address, port, backlog=256)
         self.address = self._server.sockets[0].getsockname()[:2]
 

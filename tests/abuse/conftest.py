@@ -33,7 +33,6 @@ from tests.abuse.apart import APART, APART_HOST, APART_MASTER, INSIDE, Apart
 from tests.abuse.cgroup import Cgroup
 from tests.abuse.health import Health
 from tests.integration.conftest import (  # noqa: F401 - fixtures
-    _ports_of_this_worker,
     make_node,
     master,
     node,

@@ -1,7 +1,6 @@
 """A real Prometheus; also with the guide's configuration, all alerts and shorter times."""
 
 import json
-import socket
 import subprocess
 import time
 import urllib.parse
@@ -14,6 +13,7 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
+from examples.demo.fake_http import free_ports
 from tests.chart.monitoring import ALERTS, scrape_configs
 from tests.docker.engine import engine_url, wait_until
 
@@ -84,8 +84,7 @@ def running_prometheus(directory: Path, config: Any) -> Iterator[Prometheus]:
     """Prometheus as a program of this host, with its files in a directory."""
     path = directory / "prometheus.yml"
     path.write_text(yaml.safe_dump(config))
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        where = f"127.0.0.1:{free.getsockname()[1]}"
+    where = f"127.0.0.1:{free_ports(1)}"
     words = [f"--config.file={path}", f"--storage.tsdb.path={directory / 'data'}",
              f"--web.listen-address={where}", "--log.level=warn"]  # fmt: skip
     log = directory / "prometheus.log"

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web import RequestPayloadError
 
-from examples.demo import fake_http
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
 from tests.integration.net import MASTER, NODE
@@ -32,15 +30,6 @@ def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, LoopFactory]:
     except ImportError:
         return factories
     return factories | {"uvloop": uvloop.new_event_loop}
-
-
-@pytest.fixture(autouse=True, scope="session")
-def _ports_of_this_worker() -> None:
-    """Tests that run side by side draw their ports from ranges of their own."""
-    number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    size = len(fake_http.PORTS) // count
-    fake_http.PORTS = fake_http.PORTS[number * size : (number + 1) * size]
 
 
 @pytest.fixture(autouse=True)

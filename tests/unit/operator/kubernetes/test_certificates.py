@@ -13,6 +13,7 @@ from typing import Any, cast
 import pytest
 from cryptography import x509
 
+from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
@@ -356,9 +357,7 @@ async def test_the_server_exchanges_its_certificate(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("rosproxy_operator.kubernetes.webhook.server.CHECK", 0.01)
     old = certificates.make(NAMES, NOW)
     new = certificates.make(NAMES, NOW, before=old.ca)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_ports(1)
     held = CertificateRotation(rotation.CertificateDirectory(""), ClusterMetrics())
 
     async def answer(review: Any, **_: Any) -> Any:

@@ -3,7 +3,6 @@
 import asyncio
 import base64
 import json
-import socket
 import ssl
 import threading
 import time
@@ -17,6 +16,7 @@ import jsonpatch
 import kopf
 import pytest
 
+from examples.demo.fake_http import free_ports
 from rosproxy.net.addresses import HostPort
 from rosproxy_operator.common.metrics import ClusterMetrics
 from rosproxy_operator.common.threads import in_thread
@@ -62,7 +62,7 @@ class Running:
 
     def __init__(self, server: ApiServer, api: Api) -> None:
         self.server, self.controller, self.metrics = server, Woken(), ClusterMetrics()
-        self.liveness, self.webhook = free_port(), free_port()
+        self.liveness, self.webhook = free_ports(1), free_ports(1)
         rotation = CertificateRotation(CertificateDirectory(""), self.metrics)
         rotation.pair = PAIR
         plan = ClusterSettings(bounds=Bounds(max_ports=64))
@@ -123,12 +123,6 @@ async def until_alive(running: Running) -> None:
             writer.close()
         else:
             return
-
-
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def get(url: str) -> tuple[int, str]:
