@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from examples.demo.fake_http import free_ports
 from examples.demo.fake_master import FakeMaster
 from examples.demo.proxy_process import clean_environment
 from rosproxy.admin.findings import DoctorFinding, Severity
@@ -58,9 +59,10 @@ async def test_a_second_proxy_on_the_range_of_the_first_ends_and_names_it(start_
 
 
 async def test_a_second_proxy_on_a_part_of_the_range_names_the_first(start_process):
-    first: Process = start_process()
-    port = int(first.options["port_range"].split("-")[0])
-    second: Process = start_process(port_range=f"{port - 3}-{port}")
+    low = free_ports(7)
+    port = low + 3
+    first: Process = start_process(port_range=f"{port}-{low + 6}")
+    second: Process = start_process(port_range=f"{low}-{port}")
     told = "\n".join(await problems(second))
     assert f"held by other programs: [{port}]" in told
     assert f"held by another rosproxy, with --port-range {first.options['port_range']}" in told
