@@ -3,7 +3,7 @@
 Made once, before the parts.
 """
 
-import time
+import asyncio
 import uuid
 from collections.abc import Collection
 
@@ -24,6 +24,8 @@ class Runtime:
 
     def __init__(self, settings: Settings, known_methods: Collection[str] = ()) -> None:
         self.settings, self.instance = settings, uuid.uuid4().hex
+        self._loop = asyncio.get_running_loop()
+        self._started = self.now()
         self.metrics, self.tasks, self.problems = Metrics(known_methods), Tasks(), Problems()
         self.refusals = Refusals(self.metrics, self.problems, self.now)
         self.policy = AccessPolicy(
@@ -31,5 +33,9 @@ class Runtime:
         )
 
     def now(self) -> float:
-        """Seconds of the monotonic clock."""
-        return time.monotonic()
+        """Seconds of the event loop's clock, which never goes back: timers go by the same."""
+        return self._loop.time()
+
+    def uptime(self) -> float:
+        """Seconds since it was made."""
+        return self.now() - self._started

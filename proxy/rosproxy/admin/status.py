@@ -51,7 +51,7 @@ class ProxyState(Collector):
             pid=os.getpid(),
             instance=context.instance,
             retired=context.retired,
-            uptime=round(context.now() - context.metrics.started, 1),
+            uptime=round(context.uptime(), 1),
             settings=self._settings(),
             master=self._master(),
             ports=self._ports(),

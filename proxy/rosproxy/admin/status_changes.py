@@ -50,14 +50,15 @@ class StatusChanges:
             raise Crowded
         self._waiting += 1
         try:
-            until = time.monotonic() + (min(within, LONGEST) if math.isfinite(within) else 0.0)
+            clock = asyncio.get_running_loop().time
+            until = clock() + (min(within, LONGEST) if math.isfinite(within) else 0.0)
             while True:
-                began = time.monotonic()
+                began = time.perf_counter()
                 status = self._status()
-                version, now = version_of(status), time.monotonic()
-                if version != since or now >= until or self._ending.is_set() or not there():
+                version, took = version_of(status), time.perf_counter() - began
+                if version != since or clock() >= until or self._ending.is_set() or not there():
                     return version, status
-                await self._pause(min(max(EVERY, (now - began) / SHARE), until - now))
+                await self._pause(min(max(EVERY, took / SHARE), until - clock()))
         finally:
             self._waiting -= 1
 

@@ -136,7 +136,7 @@ class App:
             version=__version__,
             pid=os.getpid(),
             instance=runtime.instance,
-            uptime=round(runtime.now() - runtime.metrics.started, 1),
+            uptime=round(runtime.uptime(), 1),
             settings=StatusSettings(
                 ros=settings.ros,
                 advertise_host=settings.advertise_host,

@@ -11,7 +11,6 @@ write does not read, so that they take some 100 KiB whatever their length.
 import asyncio
 import errno
 import re
-import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from typing import Protocol
@@ -255,21 +254,21 @@ class HttpClient:
         if handler.should_close or not handler.is_connected() or self._closed:
             handler.close()
             return
-        self._idle.setdefault(where, []).append((time.monotonic(), handler))
+        loop = asyncio.get_running_loop()
+        self._idle.setdefault(where, []).append((loop.time(), handler))
         if self._sweeper is None:
-            loop = asyncio.get_running_loop()
             self._sweeper = loop.call_later(self._keepalive, self._sweep)
 
     def _sweep(self) -> None:
         """Close what was not used for long."""
-        before, self._sweeper = time.monotonic() - self._keepalive, None
+        loop = asyncio.get_running_loop()
+        before, self._sweeper = loop.time() - self._keepalive, None
         for where, idle in self._idle.items():
             for _, handler in (old for old in idle if old[0] <= before):
                 handler.close()
             self._idle[where] = [one for one in idle if one[0] > before]
         self._idle = {where: idle for where, idle in self._idle.items() if idle}
         if self._idle:
-            loop = asyncio.get_running_loop()
             self._sweeper = loop.call_later(self._keepalive / 2, self._sweep)
 
 

@@ -85,8 +85,12 @@ class Context:
         self.read_networks()
 
     def now(self) -> float:
-        """Seconds of the monotonic clock."""
+        """Seconds of the event loop's clock, which never goes back."""
         return self._runtime.now()
+
+    def uptime(self) -> float:
+        """Seconds since the proxy was made."""
+        return self._runtime.uptime()
 
     async def take_turn(self) -> None:
         """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.

@@ -4,7 +4,6 @@ Counters of few outcomes begin with 0: Prometheus sees no increase in a series t
 and no alert would tell of what happened once.
 """
 
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 
@@ -89,7 +88,6 @@ class Metrics:
 
     def __init__(self, known_methods: Collection[str] = ()) -> None:
         self._known_methods = known_methods
-        self.started = time.monotonic()
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
         build = Info("rosproxy_build", "The proxy's version.", registry=self.registry)
