@@ -11,9 +11,10 @@ from aiohttp.web import RequestPayloadError
 
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
+from tests.clock import PatientLoop
 from tests.integration.net import MASTER, NODE
 from tests.integration.process import Process
-from tests.integration.proxy import Proxy, settings_for
+from tests.integration.proxy import BY_THE_WALL, Proxy, settings_for
 
 MakeProxy = Callable[..., Awaitable[Proxy]]
 MakeNode = Callable[..., Awaitable[FakeNode]]
@@ -21,8 +22,11 @@ LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 
 
 def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, LoopFactory]:
-    """A module with BOTH_LOOPS runs in both event loops that users have: uvloop is optional."""
-    factories: dict[str, LoopFactory] = {"asyncio": asyncio.new_event_loop}
+    """A module with BOTH_LOOPS runs in both event loops that users have: uvloop is optional.
+
+    The clock of asyncio's stands still while the process does; that of uvloop can't.
+    """
+    factories: dict[str, LoopFactory] = {"asyncio": PatientLoop}
     if not getattr(getattr(item, "module", None), "BOTH_LOOPS", False):
         return factories
     try:
@@ -104,7 +108,9 @@ async def make_proxy(
     made: list[Proxy] = []
 
     async def make(**options: Any) -> Proxy:
-        proxy = Proxy(settings_for(**{"master_uri": master.uri, **options}))
+        by_the_wall = not isinstance(asyncio.get_running_loop(), PatientLoop)
+        patience = BY_THE_WALL if by_the_wall else {}
+        proxy = Proxy(settings_for(**{"master_uri": master.uri, **patience, **options}))
         made.append(proxy)
         await proxy.start()
         return proxy

@@ -15,6 +15,8 @@ from rosproxy.settings import Settings
 from tests.integration.net import HOST, PATIENCE, PROXY, refuses, until
 from tests.run_options import parse_settings
 
+BY_THE_WALL = {"probe_timeout": 20.0}
+"""Of proxies that go by the wall's clock: no node of theirs hangs because the machine is busy."""
 PORTS = 8
 """How many ports a proxy of the tests has for nodes, unless told otherwise."""
 

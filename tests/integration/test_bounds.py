@@ -12,11 +12,13 @@ from rosproxy.net import gate, sockets
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, INVALID_REQUEST, PARSE_ERROR
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
+from tests.clock import PatientLoop, pass_time
 from tests.integration.net import (
     MASTER,
     NODE,
     OTHER_NODE,
     OUTSIDE,
+    Wire,
     connect,
     exchange,
     greet,
@@ -210,28 +212,31 @@ async def test_over_the_byte_budget_is_503_and_told(make_proxy, node):
 
 
 async def test_who_does_not_read_is_cut_and_who_reads_slowly_is_not(proxy, master, monkeypatch):
-    cut = lambda sock: sockets.end_if_stalled(sock, 1.0)  # noqa: E731
-    monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.end_if_stalled", cut)
+    def cut_soon(sock: socket.socket) -> None:
+        idles = sock.getpeername()[0] == NODE
+        sockets.end_if_stalled(sock, 1.0 if idles else sockets.WRITE_TIMEOUT)
+
+    monkeypatch.setattr("rosproxy.ros1.servers.xmlrpc_server.end_if_stalled", cut_soon)
     master.answers["getParam"] = value("x" * 20_000_000)
 
-    async def open_reader() -> socket.socket:
+    async def open_reader(source: str) -> socket.socket:
         sock = socket.socket()
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         sock.setblocking(False)
-        sock.bind((NODE, 0))
+        sock.bind((source, 0))
         loop = asyncio.get_running_loop()
         await loop.sock_connect(sock, proxy.master)
         await loop.sock_sendall(sock, post(xml("getParam", "/n", "/p")))
         return sock
 
-    idle, slow = await open_reader(), await open_reader()
+    idle, slow = await open_reader(NODE), await open_reader(OTHER_NODE)
     loop = asyncio.get_running_loop()
     passes = proxy.ros1.context.passing
     await until(lambda: passes.used == 2, "both replies are under way")
-    taken = 0
-    while passes.used == 2:
-        taken += len(await loop.sock_recv(slow, 100_000))
-        await asyncio.sleep(0.05)
+    await until(lambda: passes.used == 1, "the idle one is cut by the kernel")
+    taken = len(await loop.sock_recv(slow, 100_000))
+    if isinstance(loop, PatientLoop):
+        await pass_time(65)  # no timer of the proxy's minds how long a reply takes
     while taken < 20_000_000:
         part = await loop.sock_recv(slow, 1_000_000)
         assert part, f"the slow one was cut after {taken} bytes"
@@ -273,21 +278,32 @@ async def test_connections_to_one_port_are_bounded(make_proxy, make_node):
 
 
 async def test_the_silent_one_that_waited_longest_goes_first(proxy, node, monkeypatch):
-    monkeypatch.setattr(gate, "WAITING", 3)
+    monkeypatch.setattr(gate, "WAITING", 4)
     await node.publish(proxy.master)
     lease = proxy.lease(node)
+    waiting = proxy.ros1.context.gate._waiting
+
+    def newest() -> int:
+        return max(waiting.get(OUTSIDE, {}), default=-1)
+
+    async def wait_in_line(stack: AsyncExitStack, said: bytes = b"") -> Wire:
+        last = newest()
+        wire = await stack.enter_async_context(connect(lease))
+        await until(lambda: newest() > last, "it waits")
+        await wire.send(said)
+        return wire
+
     async with AsyncExitStack() as stack:
-        wires = [await stack.enter_async_context(connect(lease)) for _ in range(3)]
-        await wires[0].send(b"P")
-        await wires[1].send(b"POST / HTTP/1.1\r\n")
-        await wires[2].send(topic_header()[:10])
-        await asyncio.sleep(0.1)
+        wires = [await wait_in_line(stack, said) for said in (b"P", b"", topic_header()[:10])]
+        wires.append(await wait_in_line(stack))
+        last = newest()
+        await wires[3].send(b"POST / HTTP/1.1\r\n")
+        await until(lambda: newest() > last, "it waits with the rest of its request, from now on")
         assert (await exchange(lease, pid(), OTHER_NODE)).value[0] == 1
         for wire in wires:
             assert (await exchange(lease, pid())).value[0] == 1
             assert await wire.outcome() in ("closed", "reset", "answered")
-            await stack.enter_async_context(connect(lease))  # another one takes its place
-            await asyncio.sleep(0.1)
+            await wait_in_line(stack)  # another one takes its place
 
 
 async def test_a_compressed_reply_is_not_inflated(proxy, master):

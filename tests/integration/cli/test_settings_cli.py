@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 from contextlib import AsyncExitStack, suppress
-from time import monotonic
 from typing import Any
 
 import pytest
@@ -242,7 +241,13 @@ def admin_of(process: Process) -> Where:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 async def test_a_signal_ends_it_with_connections_open(start_process, master, make_node, number):
-    process: Process = start_process()
+    """At once: it waits for no call that is under way; no long time-out ever comes here."""
+    forever = (
+        "import asyncio, sys; real = asyncio.timeout\n"
+        "asyncio.timeout = lambda seconds: real(seconds if seconds < 15 else None)\n"
+        "from rosproxy.cli.main import main; sys.argv = ['rosproxy', *sys.argv[4:]]; main()"
+    )
+    process: Process = start_process(prefix=[sys.executable, "-c", forever])
     node, hung = await make_node(), await make_node("/hung", "127.0.2.12")
     await node.publish(process.master)
     await hung.publish(process.master)
@@ -266,11 +271,11 @@ async def test_a_signal_ends_it_with_connections_open(start_process, master, mak
         admin = await stack.enter_async_context(connect(admin_of(process), "127.0.0.1"))
         await admin.send(get)
         await admin.reply()
-        code, took = await asyncio.to_thread(process.terminate, number)
+        code = await asyncio.to_thread(process.terminate, number)
         for wire in wires:
             with suppress(ConnectionResetError):
                 await wire.reader.read()
-    assert (code, took < 10) == (0, True), (code, took)  # no call's time-out: 15 s and 30 s
+    assert code == 0
     assert "ERROR" not in process.text
 
 
@@ -285,12 +290,9 @@ async def test_it_works_and_ends_although_a_name_server_hangs(start_process, mak
     )
     process: Process = start_process(prefix=[sys.executable, "-c", slow])
     node = await make_node(host="nowhere.invalid")
-    started = monotonic()
     assert (await node.publish(process.master))[0] == 1
-    assert monotonic() - started < 30
     assert (await rpc(process.master, "getPid", "/n", source=NODE))[0] == 1
-    code, _ = await asyncio.to_thread(process.terminate)
-    assert code == 0
+    assert await asyncio.to_thread(process.terminate) == 0
 
 
 async def test_it_can_be_started_again_at_once_on_the_same_ports(start_process, node):
@@ -298,7 +300,7 @@ async def test_it_can_be_started_again_at_once_on_the_same_ports(start_process, 
     async with connect(process.master) as wire:
         await wire.send(post(xml("getPid", "/n")))
         await wire.reply()
-        assert (await asyncio.to_thread(process.terminate))[0] == 0
+        assert await asyncio.to_thread(process.terminate) == 0
         process.start()
     assert (await node.publish(process.master))[0] == 1
 

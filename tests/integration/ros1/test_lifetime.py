@@ -2,10 +2,9 @@
 
 import asyncio
 import os
-from time import monotonic
 
 from examples.demo.fake_http import End
-from rosproxy.ros1.context import Context
+from tests.clock import pass_time
 from tests.integration.net import (
     HOST,
     NODE,
@@ -243,14 +242,14 @@ async def test_a_restart_under_the_same_name_elsewhere_ends_the_old_process(
     assert proxy.endpoint(new).registrations
 
 
-async def test_a_lease_lingers_and_ends(make_proxy, master, node, monkeypatch):
+async def test_a_lease_lingers_and_ends(make_proxy, master, node):
     proxy = await make_proxy(**{**FAST, "linger": 60})
     await node.publish(proxy.master)
     lease = proxy.lease(node)
     await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
     await looks(master)
     assert await rpc_works(lease)
-    monkeypatch.setattr(Context, "now", lambda _: monotonic() + 60)
+    await pass_time(60)
     await until(lambda: refuses(lease), "the lease ends")
 
 

@@ -4,7 +4,6 @@ import asyncio
 from contextlib import AsyncExitStack
 from copy import deepcopy
 from functools import partial
-from time import monotonic
 from typing import Any
 
 import pytest
@@ -22,7 +21,6 @@ from tests.integration.net import (
     PROXY,
     THIRD_NODE,
     greet,
-    knock,
     looks,
     refuses,
     rpc,
@@ -74,28 +72,26 @@ async def nodes(make_node: Any) -> list[FakeNode]:
     ]
 
 
-async def restart(process: Process, while_down: Any = None) -> float:
-    """Kill a proxy, do something, start it again; the time at which it was ready."""
+async def restart(process: Process, while_down: Any = None) -> None:
+    """Kill a proxy, do something, start it again and wait until it is ready."""
     await asyncio.to_thread(process.kill)
     if while_down:
         await while_down()
     await asyncio.to_thread(process.start)
-    return monotonic()
 
 
 async def test_a_killed_proxy_serves_the_same_nodes_on_the_same_ports_before_any_probe(
     start_process, master, nodes
 ):
-    process = start_process(probe_interval=60)
+    process = start_process(probe_interval=3600)
     await populate(process, *nodes)
     before = everything(master)
-    ready = await restart(process)
+    await restart(process)
     for node in nodes:
         uri = uri_of(master, node.name)
         await until(partial(answers, uri), f"{node.name} is served")
         assert (await greet(uri, topic_header(f"{node.name}/out")))["callerid"] == node.name
         assert (await greet(uri, service_header(f"{node.name}/add")))["callerid"] == node.name
-    assert monotonic() - ready < 30
     await looks(master)
     assert everything(master) == before
     assert not [call for node in nodes for call, _ in node.calls if call == "shutdown"]
@@ -161,10 +157,11 @@ async def test_a_hanging_node_does_not_hold_up_recovery_and_is_served_later(
     async def news() -> None:
         await rpc(master.uri, "registerPublisher", "/new", "/news", "std_msgs/String", FAR)
 
-    started = monotonic()
+    clock = asyncio.get_running_loop().time
+    started = clock()
     await proxy.restart(news)
     await until(lambda: answers(uri_of(master, "/b")), "the others are served")
-    assert monotonic() - started < 8
+    assert clock() - started < 8
     await until(lambda: nodes[1].updates("/news")[-1:] == [[FAR]], "the others are told")
     assert await refuses(where(uri_of(master, "/a")))
     nodes[0].hang = False
@@ -193,7 +190,7 @@ async def test_recovery_waits_for_a_master_that_is_down(proxy, master, nodes):
     await populate(proxy, *nodes)
     uri = uri_of(master, "/a")
     await proxy.restart(master.stop)
-    assert await knock(proxy.master, b"") in ("silent", "closed")
+    assert not await refuses(proxy.master)
     with pytest.raises(ConnectionResetError):
         await nodes[0].publish(proxy.master, "/more")
     await master.start()
@@ -300,9 +297,8 @@ async def test_messages_flow_again(start_process, master):
         for one in (talker, far_talker):
             stack.callback(asyncio.create_task(one.talk()).cancel)
         await until(lambda: flowing(0, 0), "messages flow both ways")
-        ready = await restart(process)
+        await restart(process)
         counts = [len(one) for one in heard]
         await until(lambda: flowing(*counts), "messages flow again")
-        assert monotonic() - ready < 15
         assert await far_listener.add(master.uri, "/add", 2, 3) == 5
         assert HOST in master.holds("services", "/add")[0]
