@@ -82,7 +82,11 @@ class Player(FakeNode):
 
 
 class Talker(Player):
-    """Publishes numbers from 1 on; `sent` are those that a subscriber was connected for."""
+    """Publishes numbers from 1 on; `sent` are those that a subscriber was connected for.
+
+    `connections` counts the subscribers that have come, and `sent_over` has for each number how
+    many had come by then.
+    """
 
     def __init__(self, *who: str, topic: str) -> None:
         super().__init__(*who)
@@ -90,6 +94,8 @@ class Talker(Player):
         self.stream = self._admit
         self.number = 0
         self.sent: dict[int, float] = {}
+        self.connections = 0
+        self.sent_over: dict[int, int] = {}
         self.subscribers: set[asyncio.StreamWriter] = set()
 
     @property
@@ -108,6 +114,7 @@ class Talker(Player):
             self.number += 1
             if self.subscribers:
                 self.sent[self.number] = monotonic()
+                self.sent_over[self.number] = self.connections
             text = str(self.number).encode()
             for writer in self.subscribers:
                 writer.write(LENGTH.pack(len(text) + 4) + LENGTH.pack(len(text)) + text)
@@ -117,6 +124,7 @@ class Talker(Player):
         self, _node: FakeNode, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, _: Header
     ) -> None:
         writer.write(encode_header({"callerid": self.name, "topic": self.topic, **STRING}))
+        self.connections += 1
         self.subscribers.add(writer)
         try:
             while await reader.read(1024):
