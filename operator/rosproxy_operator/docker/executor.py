@@ -99,7 +99,7 @@ class Executor:
 
     ``finished`` is called when a key's work is over, ``port_taken`` with a container's name and the
     port (None if unknown) when it could not be started for that, ``counted`` with each action and
-    its outcome (ok, failed, taken).
+    its outcome (ok, failed, taken). ``now`` is the clock, in monotonic seconds.
     """
 
     def __init__(
@@ -108,8 +108,9 @@ class Executor:
         finished: Callable[[], None],
         port_taken: Callable[[str, int | None], None],
         counted: Callable[[Action, str], None],
+        now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._tasks, self._finished = tasks, finished
+        self._tasks, self._finished, self._now = tasks, finished, now
         self._port_taken, self._counted = port_taken, counted
         self._busy: dict[Job, asyncio.Task[None]] = {}
         self._failures: dict[Job, _Failure] = {}
@@ -130,7 +131,7 @@ class Executor:
     def again_in(self) -> float | None:
         """Seconds until something that has failed may be tried again; None if nothing has."""
         times = [f.again for job, f in self._failures.items() if job not in self._busy]
-        return max(min(times) - time.monotonic(), 0.0) if times else None
+        return max(min(times) - self._now(), 0.0) if times else None
 
     def start(self, groups: Iterable[Group], carry_out: CarryOut, seen: float) -> None:
         """Begin what is not under way and did not fail just now, and return.
@@ -138,7 +139,7 @@ class Executor:
         ``seen`` is when the look began (monotonic) that the groups were planned from: it may not
         have seen what work did that was over only after that.
         """
-        now = time.monotonic()
+        now = self._now()
         self._refused = {a: each for a, each in self._refused.items() if each[1] > now - QUIET}
         by_job: dict[Job, list[Group]] = {}
         for group in groups:
@@ -174,10 +175,10 @@ class Executor:
             before = self._failures.pop(job, None)
             if problem is not None:
                 count = before.count + 1 if before and before.actions == actions else 1
-                again = time.monotonic() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
+                again = self._now() + BACK_OFF[min(count, len(BACK_OFF)) - 1]
                 self._failures[job] = _Failure(actions, count, again, problem)
             del self._busy[job]
-            self._over[job] = time.monotonic()
+            self._over[job] = self._now()
             self._finished()
 
     async def _group(self, group: Group, carry_out: CarryOut) -> Problem | None:
@@ -204,7 +205,7 @@ class Executor:
         about = action.log_fields
         log.log(logging.INFO if before is None else logging.DEBUG, "%s", action, extra=about)
         outcome = "failed"
-        started = time.monotonic()
+        started = self._now()
         try:
             await carry_out(action)
             outcome = "ok"
@@ -215,11 +216,11 @@ class Executor:
                 outcome = reason = "taken"  # maybe another port each time
             level = logging.DEBUG if reason == before else logging.WARNING
             log.log(level, "%s: %s", action, error, extra=about)
-            self._refused[action] = reason, time.monotonic()
+            self._refused[action] = reason, self._now()
             raise
         finally:
             self._counted(action, outcome)
-            log.debug("%s: %s in %.3f s", action, outcome, time.monotonic() - started)
+            log.debug("%s: %s in %.3f s", action, outcome, self._now() - started)
 
 
 def _subject(job: Job) -> str:
