@@ -23,6 +23,7 @@ from rosproxy.ros2.protocol.reliable import acknowledged, heartbeat
 from rosproxy.ros2.protocol.rtps import NO_VENDOR, PREFIX
 from rosproxy.ros2.rewriting.discovery import BuiltinWriter
 
+COUNTS_EACH_SECOND = 4
 LEASE = 24 * 3600.0
 """Seconds for which participants remember the keeper without hearing it."""
 _BITS = 62
@@ -41,18 +42,20 @@ class Keeper:
     prefix: bytes
     ports: PortRange
     kept: dict[bytes, int] = field(default_factory=dict)
-    _count: int = 0
+    _first_count: int = 0
+    _counts: dict[bytes, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, host: str, ports: PortRange, domain: int, started: float) -> "Keeper":
         """That of a proxy, known by its advertised host, its range's first port and its domain.
 
-        ``started`` is Unix time: heartbeats are counted up from there, since a participant heeds
-        only those that count more than the last.
+        ``started`` is Unix time: heartbeats to a participant are counted up from there, since it
+        heeds only those that count more than the last, which another process may have sent. None
+        sends one participant more than `COUNTS_EACH_SECOND`.
         """
         known = f"{host} {ports.first} {_width(ports)} {domain}"
         own = blake2b(known.encode(), digest_size=PREFIX - 2).digest()
-        return cls(NO_VENDOR + own, ports, _count=int(started) & 0x7FFFFFFF)
+        return cls(NO_VENDOR + own, ports, _first_count=int(started * COUNTS_EACH_SECOND))
 
     def questions(self, of: bytes, reached_at: HostPort) -> list[bytes]:
         """What asks a participant for its ports; ``reached_at`` is where it answers."""
@@ -84,6 +87,7 @@ class Keeper:
     def forget(self, of: bytes) -> None:
         """Forget a participant that has gone."""
         self.kept.pop(of, None)
+        self._first_count = max(self._first_count, self._counts.pop(of, 0))  # it may come again
 
     def number(self, ports: Iterable[int]) -> int:
         """What holds these ports, as many of them as fit."""
@@ -104,8 +108,8 @@ class Keeper:
             left >>= width
 
     def _heartbeat(self, of: bytes, first: int) -> bytes:
-        self._count = (self._count + 1) & 0x7FFFFFFF
-        return heartbeat(self.prefix, of, BuiltinWriter.PUBLICATIONS, first, self._count)
+        count = self._counts[of] = self._counts.get(of, self._first_count) + 1
+        return heartbeat(self.prefix, of, BuiltinWriter.PUBLICATIONS, first, count & 0x7FFFFFFF)
 
 
 def _width(ports: PortRange) -> int:

@@ -81,6 +81,7 @@ class Returning:
         """Forget those who wait at addresses where nobody is any more."""
         for prefix in [one for one, (source, *_) in self.waiting.items() if source in addresses]:
             self._here -= Counter((self.waiting.pop(prefix)[0],))
+            self.keeper.forget(prefix)
 
     def note_former(self, former: Mapping[bytes, Sequence[int]], known: Container[bytes]) -> None:
         """Note which ports participants had at a proxy elsewhere; not of those known.

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros2.discovery.keeper import Keeper
+from rosproxy.ros2.discovery.keeper import COUNTS_EACH_SECOND, Keeper
 from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import destination, source_prefix
 
@@ -42,8 +42,23 @@ def test_the_next_process_is_the_same_keeper_and_counts_on() -> None:
     first, later = keeper(1000.0), keeper(2000.0)
     assert first.prefix == later.prefix
     assert first.prefix != Keeper.of("10.0.0.1", RANGE, 1, 0.0).prefix
-    asked = [one.questions(PEER, BACK)[-1] for one in (first, later)]
-    assert int.from_bytes(asked[0][-4:], "little") < int.from_bytes(asked[1][-4:], "little")
+    asked = [count_of(one.questions(PEER, BACK)[-1]) for one in (first, later)]
+    assert asked[0] < asked[1]
+
+
+def count_of(question: bytes) -> int:
+    return int.from_bytes(question[-4:], "little")
+
+
+def test_how_many_others_were_asked_is_nothing_to_a_participant() -> None:
+    """It heeds only what counts more than the last, also from the next process a second later."""
+    first, later = keeper(1000.0), keeper(1001.0)
+    for other in range(100):
+        first.questions(other.to_bytes(12, "big"), BACK)
+    asked = [count_of(first.questions(PEER, BACK)[-1]) for _ in range(COUNTS_EACH_SECOND)]
+    first.forget(PEER)
+    assert count_of(first.questions(PEER, BACK)[-1]) > max(asked)
+    assert count_of(later.questions(PEER, BACK)[-1]) > max(asked)
 
 
 @given(some_ports, st.integers(0, 63))
