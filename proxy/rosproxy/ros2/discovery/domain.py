@@ -269,11 +269,14 @@ class Domain:
         one = self.inside.meet(message, source, now)
         if one is None:
             return []
+        leases = len(one.leases)
         told = self.inside.exported(one, message, now, self.returning.had(prefix))
         sent = self.inside.introduced(one, message)
         if is_new and prefix in self.returning.former:
             sent += self.own.met_elsewhere(one)
             one.parting_from = now
+        else:
+            sent += self._kept_more(one, leases)
         sent += self._tell_outside(one, for_all(told), now)  # it may be an answer to the observer
         if is_new:
             sent += self.outside.introduced(self.outside.by_prefix.values(), [one], now)
@@ -321,9 +324,16 @@ class Domain:
         if one.is_apart:
             return [], []
         self.partings.note_met(one, reader)
-        exported = partial(self.inside.exported, one, now=now)
+        leases, exported = len(one.leases), partial(self.inside.exported, one, now=now)
         passed, asked = self.fragments.rewritten(port, message, reader, exported)
-        return passed, sent_to(one.metatraffic, asked)
+        return passed, sent_to(one.metatraffic, asked) + self._kept_more(one, leases)
+
+    def _kept_more(self, one: InsideParticipant, leases: int) -> list[Outgoing]:
+        """What has one keep the ports that it has got beside so many, at once.
+
+        The proxy may be killed before the next round; what is lost on its way comes again then.
+        """
+        return self.returning.reminders(one) if len(one.leases) > leases else []
 
     def _imported(
         self,

@@ -16,6 +16,7 @@ from rosproxy.ros2.protocol.announcement import LAST_SEQUENCE
 from rosproxy.ros2.protocol.envelope import wrapped
 from rosproxy.ros2.protocol.locators import pack_locator
 from rosproxy.ros2.protocol.parameters import Pid
+from rosproxy.ros2.protocol.reliable import heartbeats
 from rosproxy.ros2.protocol.rtps import destination, source_prefix, source_vendor
 from rosproxy.ros2.registry.participants import LeaseKind
 from rosproxy.ros2.registry.ports import SETTLING
@@ -174,8 +175,9 @@ def test_discovery_of_inside_leaves_with_ports_of_the_range() -> None:
     one.heard_outside(spdp(B, ROBOT), ROBOT, NOW)
     meet(one)
     (stand_in,) = one.outside.stand_ins
-    (sent,) = one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
+    *reminders, sent = one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW)
     assert sent.to == HostPort(ROBOT, 7410)
+    assert {reminder.to for reminder in reminders} == {HostPort(INSIDE, 7410)}
     (where,) = reached_at(sent.datagram)
     assert where.host == HOST
     assert one.inside.leases[where.port - 1000][1].where.port == 7000
@@ -222,7 +224,7 @@ def test_an_unproven_participant_gets_no_more_than_it_sent() -> None:
     sent = 0
     for _ in range(20):
         for outgoing in one.at_stand_in(stand_in, sedp(A, INSIDE, 7000), INSIDE, NOW):
-            sent += len(outgoing.datagram)
+            sent += len(outgoing.datagram) if outgoing.to.host == ROBOT else 0
     assert 0 < sent <= len(heard)
     (port,) = [port for port, (_, lease) in one.inside.leases.items() if lease.where.port == 7410]
     one.at_lease(port, sedp(B, ROBOT, 7411, to=A), ROBOT, NOW)
@@ -287,6 +289,20 @@ def test_a_participant_says_which_ports_it_had() -> None:
     one.settle(SETTLING)
     ports = {lease.where.port: port for port, (_, lease) in one.inside.leases.items()}
     assert ports == {7410: 45009, 7411: 45004}
+
+
+def test_a_participant_keeps_its_ports_as_soon_as_it_has_them() -> None:
+    """The proxy may be killed at any time."""
+    one = domain()
+
+    def reminded() -> list[int]:
+        told = [sent for sent in to(meet(one), INSIDE) if source_prefix(sent) == keeper.prefix]
+        return [beat.first for sent in told for beat in heartbeats(sent)]
+
+    keeper = one.own.keeper
+    numbers = reminded()
+    assert numbers == [keeper.number(one.inside.by_prefix[A].ports)]
+    assert reminded() == []  # not by each announcement
 
 
 def test_participants_are_reminded_until_they_keep_their_ports() -> None:
