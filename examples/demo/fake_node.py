@@ -6,7 +6,8 @@ demonstration's nodes (:mod:`.players`) publish and serve.
 
 For tests, `answers` replaces the answer to a slave API method (a function gets the parameters),
 `delay` holds all answers up, and `hang` never answers; `calls` are the calls that came, `requests`
-the same on the wire, `headers` those of all TCPROS connections.
+the same on the wire, `headers` those of all TCPROS connections. `own_ports` has the servers of
+topics and services that do not share the node's, as in some client libraries.
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ class FakeNode:
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.requests: list[FakeRequest] = []
         self.headers: list[Header] = []
+        self.own_ports: dict[str, FakeTcpServer] = {}
 
     @property
     def uri(self) -> str:
@@ -77,13 +79,17 @@ class FakeNode:
 
     @property
     def service_api(self) -> str:
-        """Where it says its services are."""
+        """Where it says its services are, unless they have ports of their own."""
         return f"rosrpc://{authority((self.host, self.tcpros_port))}"
 
     @property
     def tcpros_port(self) -> int:
         """The port of its TCPROS server."""
         return self.tcpros.address[1]
+
+    def port_of(self, name: str) -> int:
+        """The port of a topic or service."""
+        return self.own_ports.get(name, self.tcpros).address[1]
 
     async def start(self) -> None:
         """Listen; the slave API on the same port as before if there was one."""
@@ -92,7 +98,8 @@ class FakeNode:
 
     async def stop(self) -> None:
         """End, without a word to anybody."""
-        await self.tcpros.stop()
+        for server in (self.tcpros, *self.own_ports.values()):
+            await server.stop()
         await self.slave.stop()
 
     async def call(self, master: Where | str, method: str, *params: Any) -> Any:
@@ -111,7 +118,28 @@ class FakeNode:
 
     async def serve(self, master: Where | str, service: str = "/add") -> list[Any]:
         """Register a service; the ROS triple."""
-        return await self._register(master, "registerService", service, self.service_api)
+        api = f"rosrpc://{authority((self.host, self.port_of(service)))}"
+        return await self._register(master, "registerService", service, api)
+
+    async def open_own_port(self, name: str) -> None:
+        """Have a topic or service on a port of its own, which is for nothing else."""
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            header = await read_header(reader)
+            if name in (header.get("topic"), header.get("service")):
+                self.headers.append(header)
+                await self.stream(self, reader, writer, header)
+            else:
+                writer.write(encode_header({"error": f"{name} alone is here"}))
+
+        await self.close_own_port(name)
+        server = self.own_ports[name] = FakeTcpServer(serve)
+        await server.start(self.address)
+
+    async def close_own_port(self, name: str) -> None:
+        """End such a server."""
+        if name in self.own_ports:
+            await self.own_ports.pop(name).stop()
 
     async def _register(self, master: Where | str, method: str, *params: str) -> list[Any]:
         triple: list[Any] = await self.call(master, method, *params, self.uri)
@@ -144,8 +172,8 @@ class FakeNode:
             case "requestTopic", (_, str(topic), _):
                 if topic not in self.published:
                     return [-1, f"Not a publisher of [{topic}]", []]
-                said = f"ready on {self.host}:{self.tcpros_port}"
-                return [1, said, ["TCPROS", self.host, self.tcpros_port]]
+                port = self.port_of(topic)
+                return [1, f"ready on {self.host}:{port}", ["TCPROS", self.host, port]]
         return [1, "", 0]
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

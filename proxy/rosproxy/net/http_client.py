@@ -277,7 +277,11 @@ def pieces(head: bytes, body: bytes) -> tuple[bytes, ...]:
     return (head + body,) if len(body) < SEPARATE_BODY else (head, body)
 
 
-class TooLong(ValueError):
+class BadResponse(ValueError):
+    """A response in HTTP that is not the one that was asked for: another status, another form."""
+
+
+class TooLong(BadResponse):
     """A body of more bytes than there may be."""
 
     def __init__(self, most: int) -> None:
@@ -326,9 +330,9 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
     except aiohttp.http.HttpProcessingError as error:
         raise ValueError(f"no HTTP: {error.message}") from error
     if message.code != 200:
-        raise ValueError(f"HTTP status {message.code}")
+        raise BadResponse(f"HTTP status {message.code}")
     if not is_plain(message.headers):
-        raise ValueError("the body is compressed")
+        raise BadResponse("the body is compressed")
     length = None if message.chunked else message.headers.get("Content-Length")
     return payload, int(length) if length else None
 

@@ -69,7 +69,7 @@ class Bench:
     def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
         node = HostPort(NODE, 40000 + number)
         endpoint = self.context.registry.admit(f"http://{node}/", node, Place(NODE, True), NODE)
-        endpoint.tcpros_port = tcpros_port
+        endpoint.topic_ports = {"/a": tcpros_port} if tcpros_port else {}
         return endpoint
 
     async def forwarded(self, number: int = 0) -> Endpoint:
@@ -128,7 +128,7 @@ async def test_an_endpoint_is_forwarded_when_it_is_asked_for(bench: Bench) -> No
 
 async def test_another_tcpros_port_is_followed(bench: Bench) -> None:
     endpoint = await bench.forwarded()
-    endpoint.tcpros_port = 50009
+    endpoint.topic_ports = {"/a": 50009}
     assert await bench.plane.syncer.forwards(endpoint, 50009)
     assert bench.tools.forwards == {45002: (NODE, 50009)}
     assert not await bench.plane.syncer.forwards(endpoint, 50000)
@@ -150,7 +150,7 @@ async def test_a_node_that_is_down_or_gone_is_not_forwarded(bench: Bench) -> Non
 
 async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
     first, second = await bench.forwarded(), await bench.forwarded(1)
-    first.tcpros_port = second.tcpros_port = 50001
+    first.topic_ports = second.topic_ports = {"/a": 50001}
     assert await bench.plane.syncer.forwards(second, 50001)
     assert bench.tools.forwards == {45002: (NODE, 50000), 45003: (NODE, 50001)}
     await bench.plane.look()
@@ -235,7 +235,7 @@ async def test_a_plane_that_is_lost_is_told_and_comes_back(
     monkeypatch.setattr(syncer, "RETRY_LOST", 0.0)
     endpoint = await bench.forwarded()
     endpoint.fast_peers = {"198.51.100.2": 1}
-    bench.tools.failing, endpoint.tcpros_port = 2, 50001
+    bench.tools.failing, endpoint.topic_ports = 2, {"/a": 50001}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
     assert not bench.plane.syncer.usable
     assert endpoint.fast_peers == {}
@@ -249,7 +249,7 @@ async def test_a_plane_that_is_lost_is_told_and_comes_back(
 
 async def test_a_plane_that_stays_lost_is_tried_again_later(bench: Bench) -> None:
     endpoint = await bench.forwarded()
-    bench.tools.failing, endpoint.tcpros_port = 10, 50001
+    bench.tools.failing, endpoint.topic_ports = 10, {"/a": 50001}
     assert not await bench.plane.syncer.forwards(endpoint, 50001)
     left = bench.tools.failing
     await bench.plane.look()
@@ -304,7 +304,7 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     later.plane.recovered([endpoint])
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
-    endpoint.tcpros_port, endpoint.trusted = 50001, True
+    endpoint.topic_ports, endpoint.trusted = {"/a": 50001}, True
     assert await later.plane.syncer.forwards(endpoint, 50001)
     assert later.tools.forwards == {45002: (NODE, 50001)}
     assert later.plane.status_of(endpoint)["plane"] == "kernel"

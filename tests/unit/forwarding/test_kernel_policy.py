@@ -26,7 +26,7 @@ THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)
 def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
     node = HostPort(address, 40001)
     made = Endpoint(f"http://{node}/", node, Place(address, True), 45000)
-    made.tcpros_port = 50000
+    made.topic_ports = {"/a": 50000}
     for name, value in changed.items():
         setattr(made, name, value)
     return made
@@ -34,7 +34,7 @@ def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
 
 @pytest.mark.parametrize(
     "named",
-    [{}, {"topic_ports": {"/a": 50000}}, {"tcpros_port": None, "topic_ports": {"/a": 50000}}],
+    [{}, {"topic_ports": {"/a": 50000, "/b": 50000}}],
 )
 def test_a_node_that_named_its_port_is_forwarded_to(named: dict[str, Any]) -> None:
     assert destination(an_endpoint(**named), HostForwarding()) == THERE
@@ -48,9 +48,8 @@ BOTH = HostForwarding()
     ("endpoint", "world", "why"),
     [
         (an_endpoint(trusted=False), BOTH, "does not answer"),
-        (an_endpoint(tcpros_port=None), BOTH, "nobody has asked"),
-        (an_endpoint(topic_ports={"/a": 50001}), BOTH, "several TCPROS ports"),
-        (an_endpoint(topic_ports={"/a": 1, "/b": 2}, tcpros_port=None), BOTH, "several"),
+        (an_endpoint(topic_ports={}), BOTH, "nobody has asked"),
+        (an_endpoint(topic_ports={"/a": 1, "/b": 2}), BOTH, "several TCPROS ports"),
         (an_endpoint("127.0.0.1"), BOTH, "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(own={NODE}), "namespace of the proxy itself"),
         (an_endpoint(), HostForwarding(ipv4=False), "net.ipv4.ip_forward"),

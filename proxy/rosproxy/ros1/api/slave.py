@@ -182,7 +182,7 @@ class SlaveApi:
         reply = await self._ask(endpoint, slave_api.rewrite_call(body, parsed, view))
         port, said = endpoint.port, slave_api.topic_port(parsed, reply)
         if said is not None:
-            endpoint.note_tcpros_port(said, parsed.string(1) or "")
+            endpoint.note_topic_port(parsed.string(1) or "", said)
             if self._judge.may_bypass(endpoint):
                 port = await self._leases.fast_port(endpoint, said) or port
         reached = HostPort(call.local.host, port) if near else addressing.outside(port)
@@ -224,6 +224,8 @@ class SlaveApi:
         try:
             reply = await answer
         except Unreachable as error:
+            if error.probe is ProbeResult.ANSWERED:
+                health.note(error.probe, self._context.now())
             if error.refused and health.note(error.probe, self._context.now()):
                 # Refused twice, the node has ended: its port refuses as well at once.
                 log.info("%s is gone: %s", endpoint.label, error)

@@ -19,7 +19,7 @@ import aiohttp
 import msgspec
 
 from rosproxy.net.addresses import HostPort, is_address
-from rosproxy.net.http_client import MAX_BODY, HttpClient, LongBody, LongReply
+from rosproxy.net.http_client import MAX_BODY, BadResponse, HttpClient, LongBody, LongReply
 from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
@@ -46,20 +46,25 @@ NODE_TIMEOUT = 15.0
 
 
 class Unreachable(Exception):
-    """A call that got no answer; ``refused`` if the connection was refused."""
+    """A call that got no XML-RPC reply.
 
-    def __init__(self, message: str, refused: bool = False) -> None:
+    ``probe`` is what that means for the health of whoever was called: the connection was refused,
+    nothing came, or (ANSWERED) something in HTTP that is no reply, as libraries answer what they
+    don't implement.
+    """
+
+    def __init__(self, message: str, probe: ProbeResult = ProbeResult.SILENT) -> None:
         super().__init__(message)
-        self.refused = refused
+        self.probe = probe
 
     @property
-    def probe(self) -> ProbeResult:
-        """What this means for a node's health."""
-        return ProbeResult.REFUSED if self.refused else ProbeResult.SILENT
+    def refused(self) -> bool:
+        """Whether the connection was refused."""
+        return self.probe is ProbeResult.REFUSED
 
 
 class MasterError(Exception):
-    """The master answered, but not with status 1."""
+    """The master or a node answered, but not with status 1."""
 
 
 class MasterClient:
@@ -152,7 +157,7 @@ class MasterClient:
             part = calls[start : start + MULTICALL_SIZE]
             body = [{"methodName": method, "params": params} for method, params in part]
             call = xmlrpc.dump_call("system.multicall", body)
-            results = _parsed(await self.post_to_master(call, OWN_REPLY))
+            results = parsed(await self.post_to_master(call, OWN_REPLY))
             if not isinstance(results, list) or len(results) != len(part):
                 raise Unreachable(f"master {self.master_uri}: no answer to system.multicall")
             values += [_result_of(result) for result in results]
@@ -234,27 +239,31 @@ def _told_of(who: str) -> Iterator[None]:
 
 
 def _unreachable(who: str, error: BaseException) -> Unreachable:
-    refused = isinstance(error, ConnectionRefusedError)
+    probe = ProbeResult.SILENT
+    if isinstance(error, ConnectionRefusedError):
+        probe = ProbeResult.REFUSED
+    elif isinstance(error, BadResponse):
+        probe = ProbeResult.ANSWERED
     if isinstance(error, TimeoutError):
         reason = "no answer in time"
     elif isinstance(error, OSError) and error.strerror:
         reason = error.strerror.lower()
     else:
         reason = brief(error, LONGEST_TEXT) or type(error).__name__
-    return Unreachable(f"{who}: {reason}", refused)
+    return Unreachable(f"{who}: {reason}", probe)
 
 
-def _parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
+def parsed(reply: bytes, limits: Limits = OWN_REPLY) -> Any:
     """A reply's value, a fault's too."""
     try:
         return xmlrpc.read_response(reply, limits)
     except xmlrpc.XmlRpcError as error:
-        raise Unreachable(f"no XML-RPC reply: {error}") from None
+        raise Unreachable(f"no XML-RPC reply: {error}", ProbeResult.ANSWERED) from None
 
 
 def read_value(method: str, reply: bytes, limits: Limits = REPLY) -> Any:
     """The value in a reply of the master's or a node's. Raises Unreachable, MasterError."""
-    match _parsed(reply, limits):
+    match parsed(reply, limits):
         case [list(), list()] as value if method == "getBusStats":
             return value  # roscpp gives the value alone (TopicManager::getBusStatsCallback)
         case [1, _, value]:

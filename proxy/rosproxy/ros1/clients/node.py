@@ -22,18 +22,20 @@ from rosproxy.ros1.clients.master import (
     MasterClient,
     MasterError,
     Unreachable,
-    read_value,
+    parsed,
 )
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
-from rosproxy.ros1.registry.graph import NodeInfo, read_types
+from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo, read_types
 from rosproxy.ros1.registry.health import ProbeResult
 
 log = logging.getLogger(__name__)
 
 GET_PID = "getPid"
 TOPICS_ASKED = 3
-"""How many of its topics a node is asked for at most before its TCPROS port counts as unknown."""
+"""How many of its topics a node is asked for at most until it has answered for enough."""
+ENOUGH_PORTS = 2
+"""How many of their TCPROS ports are asked for: a node has one for all topics, or one for each."""
 
 _PID_CALL = xmlrpc.dump_call(GET_PID, CALLER_ID)
 
@@ -53,14 +55,12 @@ class NodeClient:
         self._upstream, self._within = upstream, within
 
     async def probe(self, where: HostPort, within: float | None = None) -> ProbeAnswer:
-        """Call ``getPid``; anything but a ROS triple with a number is no node."""
+        """Call ``getPid``. Whatever answers in HTTP lives, even if it does not know that call."""
         try:
-            pid = await self._upstream.call_node(where, within or self._within, GET_PID)
+            body = await self._upstream.post_to_node(where, _PID_CALL, within or self._within)
+            return ProbeAnswer(ProbeResult.ANSWERED, self.read_pid(body))
         except Unreachable as error:
             return ProbeAnswer(error.probe, reason=str(error))
-        except MasterError as error:
-            return ProbeAnswer(ProbeResult.SILENT, reason=str(error))
-        return ProbeAnswer(ProbeResult.ANSWERED, pid if isinstance(pid, int) else None)
 
     def connect(self, where: HostPort) -> socket.socket:
         """A connection to the slave API at an address that is about to be made. Raises OSError."""
@@ -71,23 +71,27 @@ class NodeClient:
         return self._upstream.node_request(where, _PID_CALL)
 
     def read_pid(self, body: bytes) -> int | None:
-        """The pid that a reply's body gives. Raises Unreachable, MasterError if there is none."""
-        pid = read_value(GET_PID, body)
-        return pid if isinstance(pid, int) else None
+        """The pid that a reply's body gives, whatever its status; None if it gives none.
+
+        Raises Unreachable if it is no XML-RPC.
+        """
+        match parsed(body):
+            case [_, _, int(pid)]:
+                return pid
+        return None
 
     async def inspect(self, where: HostPort) -> NodeInfo | None:
-        """What the node at an address says of itself; None if it gives no proper answer."""
-        try:
-            answer, published, subscribed = await asyncio.gather(
-                self.probe(where),
-                self._topics(where, "getPublications"),
-                self._topics(where, "getSubscriptions"),
-            )
-        except (Unreachable, MasterError) as error:
-            log.debug("%s does not describe itself: %s", where, error)
+        """What the node at an address says of itself; None if nothing answers there."""
+        answer, published, subscribed = await asyncio.gather(
+            self.probe(where),
+            self._topics(where, "getPublications"),
+            self._topics(where, "getSubscriptions"),
+        )
+        if answer.probe is not ProbeResult.ANSWERED:
+            log.debug("%s does not describe itself: %s", where, answer.reason)
             return None
-        port = await self._tcpros_port(where, sorted(published))
-        return NodeInfo(answer.pid, published, subscribed, port)
+        ports = await self._topic_ports(where, sorted(published or {}))
+        return NodeInfo(answer.pid, published, subscribed, ports)
 
     async def name(self, where: HostPort, service: tuple[str, int] | None = None) -> str | None:
         """What the node at an address is called, as it says itself; None if it doesn't.
@@ -102,26 +106,32 @@ class NodeClient:
         """
         try:
             said = await self._upstream.call_node(where, self._within, "getName")
-            return said if isinstance(said, str) else await self._name_by_tcpros(where, service)
-        except Unreachable:
-            return None
-        except MasterError:
-            return await self._name_by_tcpros(where, service)
+            if isinstance(said, str):
+                return said
+        except Unreachable as error:
+            if error.probe is not ProbeResult.ANSWERED:
+                return None
+        except MasterError as error:
+            log.debug("%s does not tell its name: %s", where, error)
+        return await self._name_by_tcpros(where, service)
 
     async def provider(self, where: HostPort, service: str) -> str | None:
         """The name of the node with a TCPROS server, if it has a service; None if it has not."""
         return await self._greet(where, {"service": service})
 
+    async def publisher(self, where: HostPort, topic: str) -> str | None:
+        """The name of the node with a TCPROS server, if it publishes a topic; None if it doesn't.
+
+        None, too, of a library that does not answer somebody who takes any type.
+        """
+        return await self._greet(where, {"topic": topic, "type": "*"})
+
     async def _name_by_tcpros(self, where: HostPort, service: tuple[str, int] | None) -> str | None:
-        try:
-            published = await self._topics(where, "getPublications")
-            topics = sorted(published, key=lambda topic: topic != "/rosout")[:TOPICS_ASKED]
-            port = await self._tcpros_port(where, topics)
-        except (Unreachable, MasterError) as error:
-            log.debug("%s does not tell its topics: %s", where, error)
-            return None
-        for topic in topics if port else []:
-            name = await self._greet(HostPort(where.host, port or 0), {"topic": topic, "type": "*"})
+        published = await self._topics(where, "getPublications") or {ROSOUT: ""}
+        topics = sorted(published, key=lambda topic: topic != ROSOUT)[:TOPICS_ASKED]
+        for topic in topics:
+            port = await self._topic_port_if_told(where, topic)
+            name = await self.publisher(HostPort(where.host, port), topic) if port else None
             if name:
                 return name
         if service is None:
@@ -143,8 +153,12 @@ class NodeClient:
             log.debug("%s does not answer a TCPROS header: %s", where, error)
             return None
 
-    async def _topics(self, where: HostPort, method: str) -> dict[str, str]:
-        return read_types(await self._upstream.call_node(where, self._within, method))
+    async def _topics(self, where: HostPort, method: str) -> dict[str, str] | None:
+        try:
+            return read_types(await self._upstream.call_node(where, self._within, method))
+        except (Unreachable, MasterError) as error:
+            log.debug("%s does not tell its topics: %s", where, error)
+            return None
 
     async def topic_port(self, where: HostPort, topic: str) -> int | None:
         """The TCPROS port that a node names for a topic. Raises Unreachable, MasterError."""
@@ -156,13 +170,20 @@ class NodeClient:
                 return port
         return None
 
-    async def _tcpros_port(self, where: HostPort, topics: list[str]) -> int | None:
+    async def _topic_ports(self, where: HostPort, topics: list[str]) -> dict[str, int]:
+        """The TCPROS ports of two topics, which show whether all of the node's are the same."""
+        ports: dict[str, int] = {}
         for topic in topics[:TOPICS_ASKED]:
-            try:
-                port = await self.topic_port(where, topic)
-            except (Unreachable, MasterError) as error:
-                log.debug("%s gives no TCPROS port for %s: %s", where, topic, error)
-                continue
+            port = await self._topic_port_if_told(where, topic)
             if port is not None:
-                return port
-        return None
+                ports[topic] = port
+            if len(ports) == ENOUGH_PORTS:
+                break
+        return ports
+
+    async def _topic_port_if_told(self, where: HostPort, topic: str) -> int | None:
+        try:
+            return await self.topic_port(where, topic)
+        except (Unreachable, MasterError) as error:
+            log.debug("%s gives no TCPROS port for %s: %s", where, topic, error)
+            return None

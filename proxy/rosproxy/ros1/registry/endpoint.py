@@ -77,7 +77,8 @@ class Endpoint:
     `Registry` keeps what it is found by.
 
     ``uri`` is what the node calls itself, ``node`` its host and port, ``port`` the one the proxy
-    listens on. TCPROS ports are those that the node itself named, by topic, and the last of all.
+    listens on. ``topic_ports`` are the TCPROS ports that the node itself named, by topic: one for
+    all in rospy and roscpp, one for each in other client libraries.
     ``trusted`` is False while only the master's data tell of the endpoint. ``source`` is the
     address whose registration it was made for; after a recovery the node's own.
 
@@ -99,7 +100,6 @@ class Endpoint:
     callers: dict[str, int] = field(default_factory=dict)
     characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
-    tcpros_port: int | None = None
     connections: int = 0
     pending: int = 0
     idle_since: float | None = None
@@ -117,9 +117,9 @@ class Endpoint:
     restored: bool = False
     """Whether a former process of the proxy knew it, which may have known more of it."""
 
-    def mark_alive(self, pid: int | None, tcpros_port: int | None, now: float) -> None:
+    def mark_alive(self, pid: int | None, topic_ports: Mapping[str, int], now: float) -> None:
         """Take in what its node has said of itself: it is served, and what it registered holds."""
-        self.trusted, self.tcpros_port = True, tcpros_port
+        self.trusted, self.topic_ports = True, dict(topic_ports)
         self.health.note(ProbeResult.ANSWERED, now)
         self.health.pid, self.health.cleaned = pid, False
 
@@ -141,9 +141,9 @@ class Endpoint:
             self.idle_since = now
         return now - self.idle_since
 
-    def note_verified(self, pid: int | None, tcpros_port: int | None) -> None:
+    def note_verified(self, pid: int | None, topic_ports: Mapping[str, int]) -> None:
         """Note that the node itself has borne out what the master says of it."""
-        self.tcpros_port, self.trusted = tcpros_port, True
+        self.topic_ports, self.trusted = dict(topic_ports), True
         if self.health.pid is None:
             self.health.pid = pid
 
@@ -173,20 +173,20 @@ class Endpoint:
         """Note that the node registered from its own address: what it says is believed."""
         self.place, self.trusted = replace(self.place, confirmed=True), True
 
-    def note_tcpros_port(self, port: int, topic: str) -> None:
-        """Note the TCPROS port that the node named for a topic.
+    def note_topic_port(self, topic: str, port: int | None) -> None:
+        """Note the TCPROS port that the node names for a topic now, if it does.
 
-        By topic only for those that it has registered: roscpp names its port for any topic, so
-        anybody could have names remembered without end.
+        Only for those that it has registered: roscpp names its port for any topic, so anybody could
+        have names remembered without end.
         """
-        self.tcpros_port = port
-        if self.publishes(topic):
+        if port is not None and self.publishes(topic):
             self.topic_ports[topic] = port
+        else:
+            self.topic_ports.pop(topic, None)
 
-    def replace_tcpros_ports(self, port: int | None) -> None:
-        """Note the TCPROS port that the node names now, in place of all before."""
-        self.topic_ports.clear()
-        self.tcpros_port = port
+    def replace_topic_ports(self, ports: Mapping[str, int]) -> None:
+        """Note the TCPROS ports that another process names, in place of all before."""
+        self.topic_ports = dict(ports)
 
     def note_connection(self) -> None:
         """Note that somebody outside has connected through the proxy."""
@@ -244,7 +244,7 @@ class Endpoint:
     @property
     def node_ports(self) -> set[int]:
         """The TCPROS ports that the node has named."""
-        return {port for port in (self.tcpros_port, *self.topic_ports.values()) if port}
+        return set(self.topic_ports.values())
 
     @property
     def direct(self) -> bool:

@@ -13,6 +13,10 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 
 _Table = list[tuple[str, list[str]]]
+ROSOUT = "/rosout"
+"""The topic that nearly every node publishes, so that it tells nothing of who a node is."""
+TOPIC_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER)
+"""What a node can be asked for (getPublications, getSubscriptions)."""
 _STATE_KINDS = (Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE)
 
 
@@ -33,25 +37,34 @@ class Graph(msgspec.Struct, frozen=True):
 
 
 class NodeInfo(msgspec.Struct, frozen=True):
-    """What a node says of itself: its pid, its topics with their types, its TCPROS port.
+    """What a node says of itself: its pid, its topics with their types, the TCPROS ports of some.
 
-    ``pid`` and ``tcpros_port`` are None where it does not tell.
+    None is what it does not tell. That means nothing: no client library has to implement all of
+    the slave API, and several don't.
     """
 
     pid: int | None
-    published: Mapping[str, str]
-    subscribed: Mapping[str, str]
-    tcpros_port: int | None
-
-    @property
-    def topics(self) -> set[str]:
-        """All topics that it publishes or subscribes to."""
-        return {*self.published, *self.subscribed}
+    published: Mapping[str, str] | None
+    subscribed: Mapping[str, str] | None
+    topic_ports: Mapping[str, int] = {}
 
     @property
     def by_kind(self) -> dict[Kind, Mapping[str, str]]:
-        """Its topics by the kind of registration that they need; of other kinds it can't tell."""
-        return {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
+        """Its topics by the kind of registration that they need, as far as it tells them."""
+        told = {Kind.PUBLISHER: self.published, Kind.SUBSCRIBER: self.subscribed}
+        return {kind: topics for kind, topics in told.items() if topics is not None}
+
+    def has(self, topic: str) -> bool | None:
+        """Whether it publishes a topic or subscribes to it; None if it does not tell."""
+        told = self.by_kind.values()
+        if any(topic in topics for topics in told):
+            return True
+        return False if len(told) == len(TOPIC_KINDS) else None
+
+    def holds(self, held: Registration) -> bool | None:
+        """Whether it has what is registered; None if it does not tell, as of services."""
+        topics = self.by_kind.get(held.kind)
+        return None if topics is None else held.name in topics
 
 
 def read_state(state: Any, types: Any) -> dict[str, list[Registration]]:

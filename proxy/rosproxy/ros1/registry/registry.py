@@ -11,7 +11,7 @@ from dataclasses import replace
 from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_service_uri
+from rosproxy.ros1.protocol.uris import parse_service_uri, service_uri
 from rosproxy.ros1.registry.endpoint import LONGEST_REGISTRATION, Endpoint, Place, Registration
 
 MOST_ADMISSIONS = 16
@@ -213,12 +213,19 @@ class Registry:
         return sorted(same, key=lambda endpoint: endpoint.port in self._former)
 
     def service_port(self, endpoint: Endpoint, name: str) -> int | None:
-        """The TCPROS port that an endpoint's node gave for a service, if it may be believed."""
+        """The TCPROS port that an endpoint's node gave for a service; None if it is not known."""
         known = self.services.get(name)
-        if known is None or known[0] is not endpoint or not endpoint.place.confirmed:
+        if known is None or known[0] is not endpoint:
             return None
         where = parse_service_uri(known[1].service_api or "")
         return where.port if where else None
+
+    def note_service_port(self, endpoint: Endpoint, name: str, port: int) -> None:
+        """Note the TCPROS port at which an endpoint's node has answered for a service."""
+        known = self.services.get(name)
+        if known is not None and known[0] is endpoint:
+            api = service_uri(HostPort(endpoint.node.host, port))
+            self.register(endpoint, replace(known[1], service_api=api))
 
     def registrations(self) -> Iterable[tuple[Endpoint, Registration]]:
         """Everything that is registered, with its endpoint."""
@@ -301,6 +308,8 @@ class Registry:
         kind, name, caller_id = key
         if kind is Kind.SERVICE:
             self.services.pop(name, None)
+        elif kind is Kind.PUBLISHER:
+            endpoint.topic_ports.pop(name, None)  # it may have another one if it is back
         endpoint.callers[caller_id] -= 1
         if not endpoint.callers[caller_id]:
             del endpoint.callers[caller_id], self.by_caller[caller_id]

@@ -182,10 +182,6 @@ class Addressing:
         return min(self.registry.by_uri(uri), key=distance, default=None)
 
     def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
-        """A service as its provider gave it, or as it must have done (rebuilt from the master)."""
+        """A service as its provider gave it; None if that is not known (after a recovery)."""
         known = self.registry.services.get(service)
-        if known is None or known[0] is not endpoint:
-            return None
-        if known[1].service_api is None and endpoint.tcpros_port:
-            return service_uri(HostPort(endpoint.node.host, endpoint.tcpros_port))
-        return known[1].service_api
+        return known[1].service_api if known and known[0] is endpoint else None

@@ -215,7 +215,7 @@ class NodeAdmission:
         end = self._context.now() + PATIENCE
         while True:
             answer = await self._context.nodes.probe(slave)
-            if answer.pid is not None:
+            if answer.probe is ProbeResult.ANSWERED:
                 return True
             over = self._context.now() >= end
             if answer.probe is ProbeResult.REFUSED or over or not self._is_crowded(source):
@@ -223,7 +223,7 @@ class NodeAdmission:
             await asyncio.sleep(PATIENCE_STEP)
 
     async def _answers(self, slave: HostPort) -> bool:
-        return (await self._context.nodes.probe(slave)).pid is not None
+        return (await self._context.nodes.probe(slave)).probe is ProbeResult.ANSWERED
 
     def _refuse(self, uri: str, asker: Asker, text: str) -> Refusal:
         self._context.metrics.exhausted.inc()
@@ -235,6 +235,7 @@ class NodeAdmission:
         """A node that registers is alive, whatever was believed of it."""
         if not endpoint.place.confirmed and endpoint.place.address == asker.address:
             endpoint.confirm()
+            self._context.problems.solved_at(endpoint.port)
         if endpoint.trusted:
             self._leases.open(endpoint)
         known = endpoint.caller_ids

@@ -19,11 +19,13 @@ from rosproxy.forwarding.relay_set import OpenRelays
 from rosproxy.net import sockets
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.budget import Charge, OverBudget
+from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import too_long_to_connect
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.registry.graph import ROSOUT
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.telemetry.metrics import Traffic
 
@@ -166,26 +168,49 @@ class InsideNodes:
 
     def __init__(self, context: Context, judge: PolicyJudge) -> None:
         self._context, self._judge = context, judge
-        self._asking: dict[Endpoint, asyncio.Task[int | None]] = {}
+        self._asking: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":
         """What connections to an endpoint's ports lead to."""
         return InsideNode(self._context, self._judge, endpoint, self._learn_port)
 
-    async def _learn_port(self, endpoint: Endpoint) -> int | None:
-        """The TCPROS port that the node names now; it is asked once for all who wait."""
-        asking = self._asking.get(endpoint)
+    async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
+        """The TCPROS port of a topic or service now; the node is asked once for all who wait."""
+        key = endpoint, kind, name
+        asking = self._asking.get(key)
         if asking is None:
-            work = self._ask_port(endpoint)
-            asking = self._context.tasks.spawn(work, f"TCPROS port of {endpoint.uri}")
-            self._asking[endpoint] = asking
-            asking.add_done_callback(lambda _: self._asking.pop(endpoint))
+            ask = self._ask_service_port if kind == "service" else self._ask_topic_port
+            asking = self._context.tasks.spawn(ask(endpoint, name), f"TCPROS port of {name}")
+            self._asking[key] = asking
+            asking.add_done_callback(lambda _: self._asking.pop(key))
         return await asyncio.shield(asking)
 
-    async def _ask_port(self, endpoint: Endpoint) -> int | None:
-        info = await self._context.nodes.inspect(endpoint.slave)
-        endpoint.replace_tcpros_ports(info.tcpros_port if info else None)
-        return endpoint.tcpros_port
+    async def _ask_topic_port(self, endpoint: Endpoint, topic: str) -> int | None:
+        """The port that the node names for a topic; None if it names none."""
+        try:
+            port = await self._context.nodes.topic_port(endpoint.slave, topic)
+        except (Unreachable, MasterError) as error:
+            log.debug("%s gives no TCPROS port for %s: %s", endpoint.label, topic, error)
+            port = None
+        endpoint.note_topic_port(topic, port)
+        return port
+
+    async def _ask_service_port(self, endpoint: Endpoint, service: str) -> int | None:
+        """The port at which the node answers for a service; None if it does at none that is known.
+
+        No node can be asked where its services are. In rospy and roscpp it is where its topics are.
+        """
+        registered = self._context.registry.service_port(endpoint, service)
+        ports = endpoint.node_ports | {registered}
+        if ports == {None}:
+            topic = next(iter(endpoint.names(Kind.PUBLISHER)), ROSOUT)
+            ports = {await self._learn_port(endpoint, "topic", topic)}
+        for port in sorted(port for port in ports if port):
+            where = HostPort(endpoint.address, port)
+            if await self._context.nodes.provider(where, service) in endpoint.callers:
+                self._context.registry.note_service_port(endpoint, service, port)
+                return port
+        return None
 
 
 @dataclass(slots=True)
@@ -195,7 +220,7 @@ class InsideNode:
     _context: Context
     _judge: PolicyJudge
     _endpoint: Endpoint
-    _learn_port: Callable[[Endpoint], Awaitable[int | None]]
+    _learn_port: Callable[[Endpoint, str, str], Awaitable[int | None]]
     inside: bool = True
 
     @property
@@ -209,16 +234,21 @@ class InsideNode:
         return self._judge.outside_may_not(asked, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node; its port is asked for anew if the known one refuses."""
+        """A connection to the node; a port that is not known or refuses is asked for.
+
+        A port of another topic or service is never tried: nodes may have one for each.
+        """
         endpoint = self._endpoint
-        if kind == "service":
-            known = self._context.registry.service_port(endpoint, name) or endpoint.tcpros_port
+        if kind == "topic":
+            port = endpoint.topic_ports.get(name)
+        elif endpoint.place.confirmed:
+            port = self._context.registry.service_port(endpoint, name)
         else:
-            known = endpoint.topic_ports.get(name, endpoint.tcpros_port)
-        node = await _dial(endpoint.place.address, known)
+            port = None  # it came from an address that hides several: the node has to answer for it
+        node = await _dial(endpoint.address, port)
         if node is not None:
             return node
-        return await _dial(endpoint.place.address, await self._learn_port(endpoint))
+        return await _dial(endpoint.address, await self._learn_port(endpoint, kind, name))
 
     def label(self, kind: str, name: str) -> str:
         """The topic or service if the node has registered it."""

@@ -25,6 +25,7 @@ from rosproxy.ros1.upkeep.policy import adoption as policy
 from rosproxy.ros1.upkeep.policy.adoption import Container, DirectNode
 from rosproxy.ros1.upkeep.policy.registration import known_as
 from rosproxy.ros1.upkeep.registrar import Former, Registrar
+from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +48,8 @@ class Adopter:
         """Adopt the nodes of containers that have arrived.
 
         A node is adopted if one answers at the container's address and the port that it gave,
-        and names its topics. The others are left as they are. Returns how many were adopted.
-        Raises Unreachable, MasterError.
+        and bears out what is registered for it. The others are left as they are. Returns how many
+        were adopted. Raises Unreachable, MasterError.
         """
         context = self._context
         inside: list[Container] = []
@@ -64,8 +65,8 @@ class Adopter:
             graph = await context.upstream.read_graph()
             nodes = policy.find_direct(graph, inside, context.addressing)
             infos = await self._inspect({place for node in nodes for place in node.places})
-            topics = {place: info.topics for place, info in infos.items()}
-            located, doubts = policy.locate(nodes, topics)
+            sure = await self._verify(nodes, infos)
+            located, doubts = policy.locate(nodes, infos, sure)
             for name, why in doubts.items():
                 self._report(name, why)
             return await self._take_in(located, infos)
@@ -118,10 +119,24 @@ class Adopter:
             log.warning("%s; what is lost is registered later", error)
 
     async def _inspect(self, places: set[HostPort]) -> dict[HostPort, NodeInfo]:
-        """What nodes say of themselves, where one answers with a pid."""
+        """What nodes say of themselves, where one answers."""
         found = await asyncio.gather(*map(self._context.nodes.inspect, places))
-        infos = zip(places, found, strict=True)
-        return {place: info for place, info in infos if info and info.pid is not None}
+        return {place: info for place, info in zip(places, found, strict=True) if info}
+
+    async def _verify(
+        self, nodes: Sequence[DirectNode], infos: Mapping[HostPort, NodeInfo]
+    ) -> set[tuple[str, HostPort]]:
+        """Which nodes are at which of their places for sure, by name."""
+        judge = Verifier(self._context.nodes).judge
+        tried = [(node, place) for node in nodes for place in node.places if place in infos]
+        borne_out = await asyncio.gather(
+            *(judge(place, node.registrations, infos[place]) for node, place in tried)
+        )
+        return {
+            (node.caller_id, place)
+            for (node, place), sure in zip(tried, borne_out, strict=True)
+            if sure
+        }
 
     async def _take_in(
         self, located: Mapping[HostPort, list[DirectNode]], infos: Mapping[HostPort, NodeInfo]
@@ -169,7 +184,7 @@ class Adopter:
         endpoint.hold()
         await self._leases.cleared(endpoint)
         now, known_pid = self._context.now(), endpoint.health.pid
-        endpoint.mark_alive(info.pid, info.tcpros_port, now)
+        endpoint.mark_alive(info.pid, info.topic_ports, now)
         if known_pid not in (None, info.pid):
             endpoint.health.suspect()
         self._leases.open(endpoint)

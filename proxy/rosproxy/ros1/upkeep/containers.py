@@ -26,6 +26,7 @@ from rosproxy.ros1.upkeep.policy import liveness
 from rosproxy.ros1.upkeep.policy.adoption import Container
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
@@ -151,14 +152,18 @@ class ContainerEvents:
 
     async def _inspect(self, endpoint: Endpoint, address: str) -> NodeInfo | None:
         """What the node of an endpoint says, if it is the one that answers at another address."""
-        info = await self.context.nodes.inspect(HostPort(address, endpoint.node.port))
-        same = info is not None and liveness.is_same_process(endpoint, info.pid, info.topics)
-        return info if same else None
+        held = list(endpoint.registrations.values())
+        where = HostPort(address, endpoint.node.port)
+        info, borne_out = await Verifier(self.context.nodes).ask(where, held)
+        known = endpoint.health.pid
+        if info is None or not liveness.is_same_process(known, info.pid, borne_out):
+            return None
+        return info
 
     def _settle(self, endpoint: Endpoint, before: str, info: NodeInfo) -> None:
         """Serve a node at its new address; the master has the former URI yet."""
         endpoint.note_moved(before, self.context.addressing.advertised_uri(endpoint))
-        endpoint.mark_alive(info.pid, info.tcpros_port, self.context.now())
+        endpoint.mark_alive(info.pid, info.topic_ports, self.context.now())
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)

@@ -7,7 +7,7 @@ get another port, and the master would shut it down for having moved. Before tha
 policy is waited for (``--await-policy``), or what it denies would be registered for a moment.
 
 What the master says is only a claim, since anybody can write to it. Until the node itself has
-borne it out (`_verify`), the endpoint's port is held but refuses. Then subscribers are made to
+borne it out (`Verifier`), the endpoint's port is held but refuses. Then subscribers are made to
 connect again (`Resubscriber.announce`). A node that does not answer yet is verified when a probe
 finds it (`Prober`).
 
@@ -37,12 +37,18 @@ from rosproxy.ros1.upkeep.policy import recovery as policy
 from rosproxy.ros1.upkeep.policy.recovery import Claim
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
+from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
 
 PARALLEL_INSPECTIONS = 64
 HASTE = 1.0
 """Seconds that a claim gets to be borne out once a living node waits for its port."""
+DOUBT = (
+    "answers, but does not tell whether it is the node that the master has at this port, which is "
+    "closed until it registers again: its client library lacks getPublications or "
+    "getSubscriptions, and it has no topic or service that the proxy could ask it for"
+)
 
 
 class Recovery:
@@ -61,6 +67,7 @@ class Recovery:
         judge: PolicyJudge,
     ) -> None:
         self._context, self._leases, self._plane = context, leases, plane
+        self._verifier = Verifier(context.nodes)
         self._judge = judge
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
@@ -150,8 +157,7 @@ class Recovery:
         async def ask(claim: Claim) -> None:
             log.warning("port %d is claimed by more than one URI: %s", claim.port, claim.uri)
             if is_inside(claim.slave.host, self._context.addressing.networks):
-                info = await self._context.nodes.inspect(claim.slave)
-                claim.said = info.topics if info else None
+                claim.said = await self._context.nodes.inspect(claim.slave)
 
         await asyncio.gather(*map(ask, policy.contested(found)))
         return policy.settle(found)
@@ -185,31 +191,37 @@ class Recovery:
         """Take back at the master what nobody stands for, after the time for nodes that are gone.
 
         A node that bears out what the master says of it is not: it gets its port if that is free
-        by now, and if it is inside, which an operator may have told meanwhile.
+        by now, and if it is inside, which an operator may have told meanwhile. One that does not
+        tell who it is is left alone.
         """
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
         for claim in left:
             try:
-                if not await self._is_borne_out(claim):
+                borne_out = await self._is_borne_out(claim)
+                if borne_out is False:
                     await self._registrar.take_back(claim.advertised, claim.registrations)
-                elif endpoint := self._restore(claim):
+                elif borne_out and (endpoint := self._restore(claim)):
                     await self.serve(endpoint)
                     await self._registrar.apply_policy()
             except (Unreachable, MasterError) as error:
                 log.warning("%s stays at the master as it is: %s", claim.advertised, error)
 
-    async def _is_borne_out(self, claim: Claim) -> bool:
-        """Whether the node of a claim is inside and says itself what the master has for it."""
+    async def _is_borne_out(self, claim: Claim) -> bool | None:
+        """Whether the node of a claim is inside and is the one that the master has.
+
+        None if it lives and does not tell.
+        """
         if self._context.standing(claim.slave.host) is Standing.OUTSIDE:
             return False
-        info = await self._context.nodes.inspect(claim.slave)
-        return info is not None and policy.confirmed_by(claim, info.topics)
+        info, borne_out = await self._verifier.ask(claim.slave, claim.registrations)
+        return False if info is None else borne_out
 
     async def _verify(self, endpoint: Endpoint) -> None:
         self._inspecting.add(endpoint)
+        held = list(endpoint.registrations.values())
         try:
-            info = await self._context.nodes.inspect(endpoint.slave)
+            info, borne_out = await self._verifier.ask(endpoint.slave, held)
         finally:
             self._inspecting.discard(endpoint)
         if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
@@ -218,12 +230,16 @@ class Recovery:
             if endpoint.health.answered is None:
                 endpoint.health.note(ProbeResult.SILENT, self._context.now())
             return
-        if not policy.confirmed_by(endpoint, info.topics):
+        if borne_out is None:
+            self._note_doubt(endpoint)
+            return
+        if not borne_out:
             log.warning("%s: the node there has none of its topics; not served", endpoint.label)
             await self._registrar.clean_up(endpoint)
             self._leases.end(endpoint)
             return
-        endpoint.note_verified(info.pid, info.tcpros_port)
+        self._context.problems.solved_at(endpoint.port)
+        endpoint.note_verified(info.pid, info.topic_ports)
         endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         self._leases.open(endpoint)
         address = endpoint.place.address
@@ -232,3 +248,8 @@ class Recovery:
         if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
         await self._registrar.register_missing(endpoint, info)
+
+    def _note_doubt(self, endpoint: Endpoint) -> None:
+        """Note that something lives there that does not tell who it is: it stays registered."""
+        endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
+        self._context.problems.add(endpoint.label, DOUBT, endpoint.port)

@@ -169,7 +169,7 @@ class Registrar:
         started = self._context.now()
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
-            endpoint.replace_tcpros_ports(info.tcpros_port)
+            endpoint.replace_topic_ports(info.topic_ports)
             await self._forget(endpoint, policy.left_over(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:

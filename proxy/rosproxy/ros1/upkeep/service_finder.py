@@ -52,18 +52,18 @@ class ServiceFinder:
 
     def _may_have(self, endpoint: Endpoint, name: str) -> bool:
         """Whether a node may have a service that is hidden and that it registered before."""
-        if not (endpoint.restored and endpoint.answers and endpoint.tcpros_port):
+        if not (endpoint.restored and endpoint.answers and endpoint.node_ports):
             return False
         judge = self._context.policy.judge
         return not judge(RuleKind.SERVE, name, endpoint.caller_ids, endpoint.address).allowed
 
     async def _ask(self, endpoint: Endpoint, name: str) -> None:
-        port = endpoint.tcpros_port or 0
-        where = HostPort(endpoint.address, port)
-        caller_id = await self._context.nodes.provider(where, name)
-        if caller_id in endpoint.caller_ids:
-            api = service_uri(HostPort(endpoint.node.host, port))
-            held = Registration(
-                Kind.SERVICE, name, caller_id, "*", api, self._context.now(), hidden=True
-            )
-            self._context.registry.register(endpoint, held)
+        for port in endpoint.node_ports:
+            where = HostPort(endpoint.address, port)
+            caller_id = await self._context.nodes.provider(where, name)
+            if caller_id is not None and caller_id in endpoint.caller_ids:
+                api = service_uri(HostPort(endpoint.node.host, port))
+                now = self._context.now()
+                held = Registration(Kind.SERVICE, name, caller_id, "*", api, now, hidden=True)
+                self._context.registry.register(endpoint, held)
+                return

@@ -269,24 +269,36 @@ def test_a_service_registered_anew_takes_its_new_uri() -> None:
 
 
 @pytest.mark.parametrize(
-    ("confirmed", "api", "port"),
+    ("api", "port"),
     [
-        (True, "rosrpc://10.0.0.5:50001", 50001),
-        (True, "rosrpc://somewhere-else:50001", 50001),  # only the port is believed
-        (False, "rosrpc://10.0.0.5:50001", None),
-        (True, None, None),
-        (True, "nonsense", None),
+        ("rosrpc://10.0.0.5:50001", 50001),
+        ("rosrpc://somewhere-else:50001", 50001),  # only the port is of use
+        (None, None),
+        ("nonsense", None),
     ],
 )
-def test_the_port_of_a_service_is_believed_from_the_node_only(
-    confirmed: bool, api: str | None, port: int | None
-) -> None:
+def test_the_port_of_a_service(api: str | None, port: int | None) -> None:
     registry = make_registry()
-    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", confirmed=confirmed)
+    endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5")
     registry.register(endpoint, Registration(SRV, "/s", "/node", service_api=api))
     assert registry.service_port(endpoint, "/s") == port
     assert registry.service_port(node(registry, 6), "/s") is None
     assert registry.service_port(endpoint, "/other") is None
+    registry.note_service_port(endpoint, "/s", 50009)
+    registry.note_service_port(endpoint, "/other", 50010)
+    assert registry.service_port(endpoint, "/s") == 50009
+    assert registry.service_port(endpoint, "/other") is None
+
+
+def test_a_topics_port_is_forgotten_with_the_topic() -> None:
+    registry = make_registry()
+    endpoint = node(registry, 5)
+    for topic in ("/a", "/b"):
+        register(registry, endpoint, PUB, topic)
+        endpoint.note_topic_port(topic, 50001)
+    endpoint.note_topic_port("/not_registered", 50002)
+    registry.unregister(PUB, "/a", "/node")
+    assert endpoint.topic_ports == {"/b": 50001}
 
 
 def test_removing_an_endpoint_removes_all_that_it_had() -> None:

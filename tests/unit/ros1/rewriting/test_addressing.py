@@ -277,14 +277,14 @@ def test_a_service_is_imported_and_exported(asker, given: str) -> None:
 
 @pytest.mark.parametrize("asker", [asker for asker, _ in SERVICES])
 def test_a_service_that_was_rebuilt_from_the_master(asker) -> None:
-    """Its own URI is not known: the node's TCPROS port serves services as well."""
+    """Its own URI is not known until the node has answered for it."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
     held = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
     object.__setattr__(held, "service_api", None)
     outside = "rosrpc://robot-host:45000"
     assert addressing.import_service(outside, "/s", asker) == f"rosrpc://{PROXY}:45000"
-    endpoint.tcpros_port = 50001
+    addressing.registry.note_service_port(endpoint, "/s", 50001)
     given = addressing.import_service(outside, "/s", asker)
     assert given == dict(SERVICES)[asker]
     assert addressing.export_service(given, "/s", asker) == outside
@@ -293,7 +293,7 @@ def test_a_service_that_was_rebuilt_from_the_master(asker) -> None:
 def test_a_service_that_is_not_known_is_relayed() -> None:
     """It was guessed to be at the node's TCPROS port, and could not be exported again."""
     addressing = make_addressing()
-    add_node(addressing).tcpros_port = 50001
+    add_node(addressing).topic_ports["/a"] = 50001
     given = addressing.import_service("rosrpc://robot-host:45000", "/s", NEIGHBOUR)
     assert given == f"rosrpc://{PROXY}:45000"
     assert addressing.export_service(given, "/s", NEIGHBOUR) == "rosrpc://robot-host:45000"

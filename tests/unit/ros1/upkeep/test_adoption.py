@@ -7,9 +7,10 @@ import pytest
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
-from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.policy import adoption as policy
 from rosproxy.ros1.upkeep.policy.adoption import DirectNode
+from rosproxy.ros1.upkeep.policy.recovery import confirmed_by
 from rosproxy.ros1.upkeep.policy.registration import known_as
 from tests.unit.builders import add_node, make_addressing
 
@@ -89,13 +90,38 @@ LOCATED = [
 ]
 
 
+Located = tuple[dict[HostPort, list[DirectNode]], dict[str, str]]
+
+
+def locate(nodes: Sequence[DirectNode], said: Mapping[str, Sequence[str]]) -> Located:
+    """Where nodes are, if those at places publish these topics."""
+    infos = {
+        places(where)[0]: NodeInfo(7, dict.fromkeys(topics, "t"), {})
+        for where, topics in said.items()
+    }
+    sure = {
+        (node.caller_id, place)
+        for node in nodes
+        for place in infos
+        if confirmed_by(node.registrations, infos[place])
+    }
+    return policy.locate(nodes, infos, sure)
+
+
+def test_who_tells_no_topics_is_where_it_has_answered_for_them() -> None:
+    one = direct("/n", ["/a"], SIX, SEVEN)
+    six, seven = places(SIX, SEVEN)
+    silent = {place: NodeInfo(7, None, None) for place in (six, seven)}
+    assert policy.locate([one], silent, {("/n", seven)}) == ({seven: [one]}, {})
+    assert list(policy.locate([one], silent)[1]) == ["/n"]
+
+
 @pytest.mark.parametrize(("topics", "said", "expected"), LOCATED)
 def test_where_a_node_is(
     topics: list[str], said: Mapping[str, list[str]], expected: str | None
 ) -> None:
     one = direct("/n", topics, SIX, SEVEN)
-    answers = {places(where)[0]: topics for where, topics in said.items()}
-    found, doubts = policy.locate([one], answers)
+    found, doubts = locate([one], said)
     if expected is None:
         assert found == {}
         assert list(doubts) == ["/n"]
@@ -106,22 +132,21 @@ def test_where_a_node_is(
 
 def test_a_service_is_no_topic() -> None:
     one = direct("/n", ["/add"], SIX, kind=SRV)
-    assert policy.locate([one], {places(SIX)[0]: ["/add"]})[0] == {}
+    assert locate([one], {SIX: ["/add"]})[0] == {}
 
 
 def test_doubts_tell_what_was_found() -> None:
     one = direct("/n", ["/a"], SIX, SEVEN)
-    six, seven = places(SIX, SEVEN)
-    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in policy.locate([one], {})[1]["/n"]
-    assert "is another" in policy.locate([one], {six: ["/b"]})[1]["/n"]
-    either = policy.locate([one], {six: ["/a"], seven: ["/a"]})[1]["/n"]
+    assert "no node answers at 10.0.0.6:40001, 10.0.0.7:40001" in locate([one], {})[1]["/n"]
+    assert "is another" in locate([one], {SIX: ["/b"]})[1]["/n"]
+    either = locate([one], {SIX: ["/a"], SEVEN: ["/a"]})[1]["/n"]
     assert "could be at 10.0.0.6:40001 and 10.0.0.7:40001; left alone" in either
 
 
 def test_two_containers_with_the_same_names_and_ports() -> None:
     first, second = direct("/n1", ["/a"], SIX, SEVEN), direct("/n2", ["/b"], SIX, SEVEN)
     six, seven = places(SIX, SEVEN)
-    found, doubts = policy.locate([first, second], {six: ["/b", "/rosout"], seven: ["/a"]})
+    found, doubts = locate([first, second], {SIX: ["/b", "/rosout"], SEVEN: ["/a"]})
     assert found == {seven: [first], six: [second]}
     assert not doubts
 
@@ -129,7 +154,7 @@ def test_two_containers_with_the_same_names_and_ports() -> None:
 def test_two_names_of_one_process() -> None:
     both = [direct("/manager", ["/a"], SIX), direct("/nodelet", ["/b"], SIX)]
     (six,) = places(SIX)
-    assert policy.locate(both, {six: ["/a", "/b"]}) == ({six: both}, {})
+    assert locate(both, {SIX: ["/a", "/b"]}) == ({six: both}, {})
 
 
 def test_by_what_uris_an_endpoint_may_be_known() -> None:

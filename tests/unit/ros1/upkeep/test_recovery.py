@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
-from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.policy import recovery as policy
 from rosproxy.ros1.upkeep.policy.recovery import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
@@ -89,7 +89,7 @@ def claim(
     said: Collection[str] | None = None,
     slave: int = 40001,
 ) -> Claim:
-    named = None if said is None else set(said)
+    named = None if said is None else NodeInfo(7, dict.fromkeys(said, "t"), {})
     where = HostPort(address, slave)
     return Claim(port, where, where, list(map(held, topics)), named)
 
@@ -173,23 +173,45 @@ def test_only_addresses_in_an_inside_network_are_recovered(address: str, allowed
 
 
 @pytest.mark.parametrize(
-    ("registered", "said", "confirmed"),
+    ("registered", "published", "subscribed", "confirmed"),
     [
-        (["/rosout", "/chatter"], {"/rosout", "/chatter"}, True),
-        (["/rosout", "/chatter", "/gone"], {"/rosout", "/chatter"}, True),
-        (["/rosout", "/chatter"], {"/rosout", "/other"}, False),  # every node has /rosout
-        (["/rosout", "/chatter"], set(), False),
-        (["/rosout"], {"/rosout", "/other"}, True),
-        (["/rosout"], set(), False),
-        ([], {"/rosout"}, False),
+        (["/rosout", "/chatter"], ["/rosout", "/chatter"], [], True),
+        (["/rosout", "/chatter", "/gone"], ["/rosout", "/chatter"], [], True),
+        (["/rosout", "/chatter"], ["/rosout", "/other"], [], False),  # every node has /rosout
+        (["/rosout", "/chatter"], [], [], False),
+        (["/rosout", "/chatter"], ["/rosout"], ["/chatter"], True),
+        (["/rosout"], ["/rosout", "/other"], [], True),
+        (["/rosout"], [], [], False),
+        ([], ["/rosout"], [], None),  # a service alone: no node can be asked for those
+        # what it does not tell is not what it does not have
+        (["/rosout", "/chatter"], ["/rosout"], None, None),
+        (["/rosout", "/chatter"], ["/rosout", "/chatter"], None, True),
+        (["/rosout", "/chatter"], None, ["/chatter"], True),
+        (["/rosout", "/chatter"], None, None, None),
     ],
 )
 def test_a_node_bears_out_what_the_master_says_of_it(
-    registered: list[str], said: set[str], confirmed: bool
+    registered: list[str],
+    published: list[str] | None,
+    subscribed: list[str] | None,
+    confirmed: bool | None,
 ) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
     for name in registered:
         add_registration(addressing, endpoint, PUB, name)
     add_registration(addressing, endpoint, SRV, "/chatter")
-    assert policy.confirmed_by(endpoint, said) is confirmed
+    told = [
+        None if names is None else dict.fromkeys(names, "t") for names in (published, subscribed)
+    ]
+    said = NodeInfo(7, told[0], told[1])
+    assert policy.confirmed_by(endpoint.registrations.values(), said) is confirmed
+
+
+def test_a_node_is_asked_for_a_few_of_its_topics_and_services() -> None:
+    topics = [held(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
+    services = [Registration(SRV, name, "/n") for name in ("/y", "/x")]
+    heard = [Registration(Kind.SUBSCRIBER, "/heard", "/n")]
+    asked = policy.to_ask([*topics, *services, *heard])
+    assert asked == (["/a", "/b", "/c"], [*reversed(services)])
+    assert policy.to_ask(topics[:2])[0] == ["/d", "/rosout"]

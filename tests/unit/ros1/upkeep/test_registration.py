@@ -28,7 +28,7 @@ def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0)
 def said(published: Iterable[str], subscribed: Iterable[str] = ()) -> NodeInfo:
     """What a node says of itself; the type of /a is t/a."""
     types = [{name: f"t{name}" for name in names} for names in (published, subscribed)]
-    return NodeInfo(7, types[0], types[1], tcpros_port=None)
+    return NodeInfo(7, types[0], types[1])
 
 
 OWN, SERVICE = "http://10.0.0.5:40001/", "rosrpc://10.0.0.5:50001"

@@ -11,15 +11,15 @@ calls ``shutdown`` at the node, through the proxy, as it does if another node ha
 """
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
 import msgspec
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.rewriting.addressing import Addressing
 from rosproxy.ros1.upkeep.policy.registration import known_as
 
@@ -41,8 +41,8 @@ class DirectNode(msgspec.Struct, frozen=True):
     @property
     def topics(self) -> set[str]:
         """Its topics, without everybody's /rosout as far as it has others."""
-        names = {held.name for held in self.registrations if held.kind is not Kind.SERVICE}
-        return names - {"/rosout"} or names
+        names = {held.name for held in self.registrations if held.kind in TOPIC_KINDS}
+        return names - {ROSOUT} or names
 
 
 def find_direct(
@@ -63,22 +63,25 @@ def find_direct(
 
 
 def locate(
-    nodes: Iterable[DirectNode], topics: Mapping[HostPort, Iterable[str]]
+    nodes: Iterable[DirectNode],
+    infos: Mapping[HostPort, NodeInfo],
+    sure: Collection[tuple[str, HostPort]] = (),
 ) -> tuple[dict[HostPort, list[DirectNode]], dict[str, str]]:
     """Where each node is, and why some are left alone, by name.
 
-    ``topics`` are those that the node at a place names itself; places without a node are missing.
+    ``infos`` is what the node at a place says of itself; places without a node are missing. Those
+    that are ``sure``, by name and place, have borne out what is registered for them.
     """
     found: dict[HostPort, list[DirectNode]] = {}
     doubts: dict[str, str] = {}
     for node in nodes:
-        scores = {p: _score(node, set(topics[p])) for p in node.places if p in topics}
-        likely = {place: score for place, score in scores.items() if score is not None}
+        places = [p for p in node.places if p in infos and (node.caller_id, p) in sure]
+        likely = {place: _score(node, infos[place]) for place in places}
         best = [place for place, score in likely.items() if score == max(likely.values())]
         if len(best) == 1:
             found.setdefault(best[0], []).append(node)
         else:
-            doubts[node.caller_id] = _doubt(node, best, topics)
+            doubts[node.caller_id] = _doubt(node, best, infos)
     return found, doubts
 
 
@@ -99,17 +102,17 @@ def has_name_still(endpoint: Endpoint, uri: str | None, advertised: str) -> bool
     return uri == advertised or known_as(endpoint, uri)
 
 
-def _score(node: DirectNode, topics: set[str]) -> int | None:
-    """How well the topics of whoever answers at a place fit a node; None if not at all."""
-    shared = node.topics & topics
-    return len(shared) - len(node.topics - topics) if shared else None
+def _score(node: DirectNode, info: NodeInfo) -> int:
+    """How well the topics of whoever answers at a place fit a node."""
+    told = Counter(info.has(topic) for topic in node.topics)
+    return told[True] - told[False]
 
 
-def _doubt(node: DirectNode, best: list[HostPort], topics: Mapping[HostPort, Iterable[str]]) -> str:
+def _doubt(node: DirectNode, best: list[HostPort], infos: Mapping[HostPort, NodeInfo]) -> str:
     places = ", ".join(map(str, node.places))
     if best:
         why = f"could be at {' and '.join(map(str, best))}; left alone"
-    elif any(place in topics for place in node.places):
+    elif any(place in infos for place in node.places):
         why = f"the node at {places} is another"
     else:
         why = f"no node answers at {places}"

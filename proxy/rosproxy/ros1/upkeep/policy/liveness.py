@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import UNKNOWN_PID, ProbeResult
-from rosproxy.ros1.upkeep.policy.recovery import confirmed_by
 
 DIRECT_INTERVAL = 2.0
 """Seconds between probes, at most, of a node that registered around the proxy."""
@@ -106,12 +105,12 @@ def new_place(endpoint: Endpoint, address: str) -> Place:
     return Place(address, named=False, confirmed=before.confirmed, stale=stale)
 
 
-def is_same_process(endpoint: Endpoint, pid: int | None, topics: set[str]) -> bool:
-    """Whether the node that answers elsewhere, with a pid and topics, is that of an endpoint.
+def is_same_process(known: int | None, pid: int | None, borne_out: bool | None) -> bool:
+    """Whether the node that answers elsewhere with a pid is one with a known pid.
 
-    In a container of its own every node has the same pid, so the topics must fit as well.
+    In a container of its own every node has the same pid, so the node has to bear out as well what
+    it has registered; if that can't be told (None), the pid alone decides.
     """
-    known = endpoint.health.pid
-    if pid is None or (known not in UNKNOWN_PID and known != pid):
+    if pid is not None and known not in UNKNOWN_PID and known != pid:
         return False
-    return confirmed_by(endpoint, topics) if endpoint.topics else known == pid
+    return known == pid and pid is not None if borne_out is None else borne_out

@@ -7,17 +7,19 @@ served (`confirmed_by`).
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.registry.graph import Graph
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
+MOST_ASKED = 3
+"""How many topics, and services, a node is asked for at most."""
 
 
 @dataclass(slots=True)
@@ -26,21 +28,21 @@ class Claim:
 
     ``node`` is the host and port that the node calls itself, ``path`` its URI's, ``slave`` where to
     look for it, ``advertised`` the URI that the master has.
-    ``said`` are the topics that it names there; None if it was not asked or gave no answer.
+    ``said`` is what it says of itself; None if it was not asked or gave no answer.
     """
 
     port: int
     node: HostPort
     slave: HostPort
     registrations: list[Registration] = field(default_factory=list)
-    said: set[str] | None = None
+    said: NodeInfo | None = None
     advertised: str = ""
     path: str = "/"
 
     @property
     def topics(self) -> set[str]:
         """The topics that the master has for it."""
-        return {held.name for held in self.registrations if held.kind is not Kind.SERVICE}
+        return {held.name for held in self.registrations if held.kind in TOPIC_KINDS}
 
     @property
     def uri(self) -> str:
@@ -69,8 +71,11 @@ def settle(found: Sequence[Claim]) -> list[Claim]:
     """One claim per port and inside address: the one that its node bears out best."""
 
     def merit(claim: Claim) -> tuple[int, int]:
-        topics, said, count = claim.topics, claim.said, len(claim.registrations)
-        return NO_MERIT if said is None else len(topics & said) - len(topics - said), count
+        count = len(claim.registrations)
+        if claim.said is None:
+            return NO_MERIT, count
+        told = Counter(claim.said.has(topic) for topic in claim.topics)
+        return told[True] - told[False], count
 
     ports: dict[int, Claim] = {}
     slaves: set[HostPort] = set()
@@ -81,11 +86,27 @@ def settle(found: Sequence[Claim]) -> list[Claim]:
     return list(ports.values())
 
 
-def confirmed_by(endpoint: Endpoint | Claim, topics: set[str]) -> bool:
-    """Whether the topics that a node itself names bear out what the master says of it.
+def confirmed_by(held: Iterable[Registration], info: NodeInfo) -> bool | None:
+    """Whether what a node says of its topics bears out what is registered for it.
 
     A forged URI that leads to something other than the node of that name finds no answer here,
-    or one of another node.
+    or one of another node. None: it does not tell, or no topic is registered.
     """
-    telling = endpoint.topics - {"/rosout"}  # everybody's
-    return bool((telling or endpoint.topics) & topics)
+    topics = {one.name for one in held if one.kind in TOPIC_KINDS}
+    told = [info.has(topic) for topic in (topics - {ROSOUT} or topics)]
+    if any(told):
+        return True
+    return False if told and None not in told else None
+
+
+def to_ask(held: Iterable[Registration]) -> tuple[list[str], list[Registration]]:
+    """The topics and services by which a node can show that it is the one that registered them.
+
+    It is asked for a few at most, everybody's /rosout last.
+    """
+    everything = list(held)
+    topics = {one.name for one in everything if one.kind is Kind.PUBLISHER}
+    services = [one for one in everything if one.kind is Kind.SERVICE]
+    return sorted(topics, key=lambda topic: (topic == ROSOUT, topic))[:MOST_ASKED], (
+        sorted(services, key=lambda one: one.name)[:MOST_ASKED]
+    )

@@ -16,7 +16,7 @@ from typing import Any
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, row
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
-from rosproxy.ros1.registry.graph import NodeInfo
+from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, NodeInfo
 
 MethodCall = tuple[str, list[Any]]
 """A method and its parameters, the caller_id first."""
@@ -112,17 +112,18 @@ def read_release(
 def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
     """Which of an endpoint's registrations a process that is gone has left behind.
 
-    A topic is, if the node does not name it; a whole node name is, if another has registered
-    since and none of its topics, apart from everybody's /rosout, holds. Registrations made after
-    ``before`` are not.
+    A topic is, if the node says that it does not have it; a whole node name is, if another has
+    registered since and none of its topics, apart from everybody's /rosout, may hold.
+    Registrations made after ``before`` are not.
     """
-    topics, everything = info.by_kind, list(endpoint.registrations.values())
+    everything = list(endpoint.registrations.values())
     newest = max(everything, key=lambda held: held.since, default=None)
-    alive = {
-        held.caller_id
-        for held in everything
-        if held is newest or (held.name != "/rosout" and held.name in topics.get(held.kind, ()))
-    }
+
+    def may_hold(held: Registration) -> bool:
+        telling = held.kind in TOPIC_KINDS and held.name != ROSOUT
+        return telling and info.holds(held) is not False
+
+    alive = {held.caller_id for held in everything if held is newest or may_hold(held)}
     gone = vanished(endpoint, info, before)
     return [
         held
@@ -132,29 +133,26 @@ def left_over(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registr
 
 
 def vanished(endpoint: Endpoint, info: NodeInfo, before: float) -> list[Registration]:
-    """The topics registered before a time that the node no longer has.
+    """The topics registered before a time that the node says it does not have.
 
     A node that registers around the proxy unregisters there too, where its URI means nothing.
     """
-    topics = info.by_kind
-    return [
-        held
-        for held in endpoint.registrations.values()
-        if held.name not in topics.get(held.kind, (held.name,)) and held.since < before
-    ]
+    everything = endpoint.registrations.values()
+    return [held for held in everything if info.holds(held) is False and held.since < before]
 
 
 def still_held(endpoint: Endpoint, info: NodeInfo, same_process: bool) -> list[Registration]:
     """Which of an endpoint's registrations hold for a node that has come back.
 
-    Topics count if the node itself names them; services and parameters, which it can't be asked
-    for, only if it is the ``same_process`` and at least one topic holds.
+    A topic does unless the node says that it does not have it; services and parameters, which it
+    can't be asked for, if it is the ``same_process`` and not all of its topics have gone.
     """
-    topics, everything = info.by_kind, list(endpoint.registrations.values())
-    kept = [held for held in everything if held.name in topics.get(held.kind, ())]
-    if not (kept and same_process):
+    everything = list(endpoint.registrations.values())
+    topics = [held for held in everything if held.kind in TOPIC_KINDS]
+    kept = [held for held in topics if info.holds(held) is not False]
+    if not same_process or (topics and not kept):
         return kept
-    return kept + [held for held in everything if held.kind not in topics]
+    return kept + [held for held in everything if held.kind not in TOPIC_KINDS]
 
 
 def unregistered(endpoint: Endpoint, info: NodeInfo) -> list[Registration]:

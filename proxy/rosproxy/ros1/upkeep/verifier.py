@@ -1,0 +1,74 @@
+"""Is the node at an address the one that somebody says it is?
+
+The master says so after a restart, an operator of a container that has moved or arrived. Anybody
+can write to the master, so it is only a claim, and the node itself has to bear it out. First by the
+topics that it names. A library that does not tell them (ROS makes none implement the whole slave
+API) is asked for one of the topics that are registered for it: where it names a TCPROS port for
+that, and is called there by a name that is registered, it is the one; so it is where it answers for
+a service under that name.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from rosproxy.net.addresses import HostPort
+from rosproxy.ros1.clients.master import MasterError, Unreachable
+from rosproxy.ros1.clients.node import NodeClient
+from rosproxy.ros1.protocol.uris import parse_service_uri
+from rosproxy.ros1.registry.endpoint import Registration
+from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo
+from rosproxy.ros1.upkeep.policy import recovery as policy
+
+
+@dataclass(frozen=True, slots=True)
+class Verifier:
+    """Asks nodes whether they are who they are said to be."""
+
+    _nodes: NodeClient
+
+    async def ask(
+        self, where: HostPort, held: Collection[Registration]
+    ) -> tuple[NodeInfo | None, bool | None]:
+        """What the node at an address says of itself, and whether it is the one that registered.
+
+        The second is None if it can't be told; the first is, if nothing answers there.
+        """
+        info = await self._nodes.inspect(where)
+        return (None, None) if info is None else (info, await self.judge(where, held, info))
+
+    async def judge(
+        self, where: HostPort, held: Collection[Registration], info: NodeInfo
+    ) -> bool | None:
+        """The same of a node that has said something of itself."""
+        borne_out = policy.confirmed_by(held, info)
+        if borne_out is None and await self._answers_for(where, held, info):
+            return True
+        return borne_out
+
+    async def _answers_for(
+        self, where: HostPort, held: Collection[Registration], info: NodeInfo
+    ) -> bool:
+        """Whether it answers for a topic or service, by a name that has registered it."""
+        callers, ports = {one.caller_id for one in held}, set(info.topic_ports.values())
+        topics, services = policy.to_ask(held)
+        for topic in topics:
+            port = info.topic_ports.get(topic) or await self._port(where, topic)
+            if port is None:
+                continue
+            ports.add(port)
+            name = await self._nodes.publisher(HostPort(where.host, port), topic)
+            if name in callers or (name is None and topic != ROSOUT):
+                return True
+        for service in services:
+            own = parse_service_uri(service.service_api or "")
+            for port in {own.port} if own else ports:
+                name = await self._nodes.provider(HostPort(where.host, port), service.name)
+                if name in callers:
+                    return True
+        return False
+
+    async def _port(self, where: HostPort, topic: str) -> int | None:
+        try:
+            return await self._nodes.topic_port(where, topic)
+        except (Unreachable, MasterError):
+            return None

@@ -1,0 +1,187 @@
+"""Nodes of client libraries that lack calls of the slave API, or have more TCPROS ports than one.
+
+ROS makes no library implement everything. What a node can't say is neither its death nor a forgery:
+it stays registered, and is served again after a restart of the proxy as far as it can show who it
+is.
+"""
+
+import itertools
+from functools import partial
+from typing import Any
+from xmlrpc.client import Fault
+
+import pytest
+
+from examples.demo.fake_http import Answer, value, where
+from examples.demo.fake_node import FakeNode
+from tests.clock import pass_time
+from tests.integration.net import (
+    OTHER_NODE,
+    greet,
+    looks,
+    refuses,
+    rpc,
+    service_header,
+    topic_header,
+    until,
+)
+from tests.integration.proxy import Proxy
+
+BAD_REQUEST = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\n\r\n"
+LACKING: dict[str, Answer] = {
+    "goroslib": BAD_REQUEST,
+    "a fault": value(Fault(-1, "method not implemented")),
+    "a status": value([-1, "not implemented", 0]),
+    "no XML": b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nno",
+}
+"""How a node answers a call that it does not know."""
+CALLS = ("getPid", "getPublications", "getSubscriptions")
+SOME_CALLS = [calls for count in (1, 2, 3) for calls in itertools.combinations(CALLS, count)]
+
+
+async def answers(uri: str) -> bool:
+    """Whether anything in HTTP comes back from there."""
+    try:
+        await rpc(uri, "getBusInfo", "/outside")
+    except OSError:
+        return False
+    return True
+
+
+def lack(node: FakeNode, how: str, *calls: str) -> None:
+    node.answers.update(dict.fromkeys(calls, LACKING[how]))
+
+
+async def populate(proxy: Proxy, node: FakeNode) -> None:
+    await node.publish(proxy.master, "/rosout")
+    await node.publish(proxy.master, "/out")
+    await node.subscribe(proxy.master, "/news")
+    await node.serve(proxy.master)
+
+
+@pytest.fixture(params=SOME_CALLS, ids="+".join)
+def calls(request: pytest.FixtureRequest) -> tuple[str, ...]:
+    return request.param  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("how", LACKING)
+async def test_a_node_that_lacks_calls_lives(proxy, master, node, how, calls):
+    lack(node, how, *calls)
+    await populate(proxy, node)
+    before = dict(master.nodes)
+    await pass_time(10)
+    assert not proxy.endpoint(node).is_down
+    assert master.nodes == before
+    assert (await greet(proxy.lease(node), topic_header("/out")))["callerid"] == node.name
+
+
+@pytest.mark.parametrize("how", LACKING)
+async def test_a_node_that_lacks_calls_is_served_by_the_next_proxy(proxy, master, node, how, calls):
+    lack(node, how, *calls)
+    await populate(proxy, node)
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    assert (await greet(uri, topic_header("/out")))["callerid"] == node.name
+    assert (await greet(uri, service_header("/add")))["callerid"] == node.name
+    await pass_time(5)
+    assert master.nodes == {node.name: uri}
+    assert master.holds("services", "/add")
+
+
+async def test_a_pid_is_taken_whatever_the_status(proxy, node):
+    node.answers["getPid"] = value([0, "", 4242])
+    await node.publish(proxy.master)
+    await until(lambda: proxy.endpoint(node).health.pid == 4242, "its pid is known")
+
+
+async def test_one_that_can_not_show_who_it_is_stays_registered(proxy, master, node):
+    """It publishes nothing: there is no topic that it could be asked for, and no port known."""
+    lack(node, "goroslib", *CALLS)
+    await node.subscribe(proxy.master, "/news")
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(lambda: proxy.app.status()["problems"], "it is told")
+    (problem,) = proxy.app.status()["problems"]
+    assert "does not tell whether it is the node" in problem["text"]
+    await pass_time(10)
+    assert master.nodes == {node.name: uri}
+    assert await refuses(where(uri))
+    await node.subscribe(proxy.master, "/more")  # from its own address: that shows it
+    assert master.nodes == {node.name: uri}
+    await until(partial(answers, uri), "it is served")
+    assert not proxy.app.status()["problems"]
+
+
+async def test_another_node_is_not_taken_for_it_by_what_it_lacks(proxy, master, node, make_node):
+    """Its name in the TCPROS header is another one."""
+    await populate(proxy, node)
+    uri = master.nodes[node.name]
+    other = await make_node("/other", OTHER_NODE)
+
+    async def replaced() -> None:
+        node.name = other.name
+        lack(node, "goroslib", "getPublications", "getSubscriptions")
+
+    await proxy.restart(replaced)
+    await until(lambda: proxy.app.status()["problems"], "it is told")
+    await pass_time(5)
+    assert await refuses(where(uri))
+
+
+async def on_own_ports(node: FakeNode, *names: str) -> None:
+    for name in names:
+        await node.open_own_port(name)
+
+
+async def greeted(proxy: Proxy, node: FakeNode, header: bytes) -> dict[str, Any]:
+    return await greet(proxy.lease(node), header)
+
+
+async def test_each_topic_and_service_has_a_port_of_its_own(proxy, master, node):
+    await on_own_ports(node, "/rosout", "/out", "/too", "/add")
+    await populate(proxy, node)
+    await node.publish(proxy.master, "/too")
+    for _ in range(2):  # the second time from what is known
+        for topic in ("/out", "/too"):
+            assert (await greeted(proxy, node, topic_header(topic)))["callerid"] == node.name
+        assert (await greeted(proxy, node, service_header("/add")))["callerid"] == node.name
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    for topic in ("/too", "/out"):
+        assert (await greeted(proxy, node, topic_header(topic)))["callerid"] == node.name
+
+
+async def test_a_port_that_refuses_is_asked_for_anew_and_no_other_is_forgotten(proxy, node):
+    await on_own_ports(node, "/rosout", "/out", "/too", "/add")
+    await populate(proxy, node)
+    await node.publish(proxy.master, "/too")
+    for topic in ("/out", "/too"):
+        await greeted(proxy, node, topic_header(topic))
+    await node.open_own_port("/out")  # anew
+    asked = len([1 for method, _ in node.calls if method == "requestTopic"])
+    for topic in ("/too", "/out"):
+        assert (await greeted(proxy, node, topic_header(topic)))["callerid"] == node.name
+    assert (await greeted(proxy, node, service_header("/add")))["callerid"] == node.name
+    assert len([1 for method, _ in node.calls if method == "requestTopic"]) == asked + 1
+
+
+async def test_a_topic_that_has_no_port_is_refused(proxy, node):
+    await on_own_ports(node, "/out")
+    await populate(proxy, node)
+    await greeted(proxy, node, topic_header("/out"))
+    with pytest.raises((EOFError, ConnectionResetError)):
+        await greeted(proxy, node, topic_header("/none"))
+
+
+async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy, master, node):
+    await on_own_ports(node, "/rosout", "/out", "/add")
+    await populate(proxy, node)
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    with pytest.raises((EOFError, ConnectionResetError)):
+        await greeted(proxy, node, service_header("/add"))
+    await looks(master)
+    assert master.holds("services", "/add")
