@@ -61,6 +61,7 @@ class FakeNode:
         self.tcpros = FakeTcpServer(self._serve)
         self.stream: Stream = echo
         self.pid = 100
+        self.uri_form = "http://{}/"
         # Every ROS node offers it; a proxy that starts anew asks for it to find the TCPROS port.
         self.published = {"/rosout": "rosgraph_msgs/Log"}
         self.subscribed: dict[str, str] = {}
@@ -75,7 +76,7 @@ class FakeNode:
     @property
     def uri(self) -> str:
         """What it calls itself."""
-        return f"http://{authority((self.host, self.slave.address[1]))}/"
+        return self.uri_form.format(authority((self.host, self.slave.address[1])))
 
     @property
     def service_api(self) -> str:

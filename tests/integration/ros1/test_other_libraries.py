@@ -185,3 +185,46 @@ async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy
         await greeted(proxy, node, service_header("/add"))
     await looks(master)
     assert master.holds("services", "/add")
+
+
+async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(proxy, master, node):
+    node.uri_form = "http://{}"
+    await populate(proxy, node)
+    assert (await node.subscribe(proxy.master, "/out"))[2] == [node.uri]  # its own, literally
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    assert (await node.publish(proxy.master, "/more"))[0] == 1
+    assert (await node.subscribe(proxy.master, "/more"))[2] == [node.uri]
+    assert master.nodes == {node.name: uri}
+    for topic in ("/out", "/more", "/rosout"):
+        found = await node.call(proxy.master, "unregisterPublisher", topic, node.uri)
+        assert found[2] == 1, topic
+    for topic in ("/out", "/more", "/news"):
+        found = await node.call(proxy.master, "unregisterSubscriber", topic, node.uri)
+        assert found[2] == 1, topic
+    found = await node.call(proxy.master, "unregisterService", "/add", node.service_api)
+    assert found[2] == 1
+    assert not master.nodes
+
+
+async def test_a_uri_without_a_host_is_at_the_callers_address(proxy, master, node, make_node):
+    """As roslisp gives it where it has ROS_IP alone."""
+    node.uri_form = f"http://:{node.slave.address[1]}"
+    await populate(proxy, node)
+    uri = master.nodes[node.name]
+    assert (await greet(uri, topic_header("/out")))["callerid"] == node.name
+    neighbour = await make_node("/neighbour", OTHER_NODE)
+    at_node = f"http://{node.address}:{node.slave.address[1]}"
+    assert (await neighbour.subscribe(proxy.master, "/out"))[2] == [at_node]
+    api = f"rosrpc://:{node.tcpros_port}"
+    assert (await node.call(proxy.master, "registerService", "/own", api, node.uri))[0] == 1
+    assert (await greet(uri, service_header("/own")))["callerid"] == node.name
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    assert (await node.publish(proxy.master, "/more"))[0] == 1
+    assert master.nodes[node.name] == uri
+    found = await node.call(proxy.master, "unregisterPublisher", "/out", node.uri)
+    assert found[2] == 1
+    found = await node.call(proxy.master, "unregisterService", "/own", api)
+    assert found[2] == 1

@@ -21,6 +21,7 @@ URI. What is longer is no URI to the proxy: it is neither rewritten nor remember
 
 LONGEST_PATH = 512
 """Characters of a node's own path that an advertised URI carries at most."""
+_NO_HOST = re.compile(r"((?:http|rosrpc)://):(\d{1,5})(/?)")
 _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
@@ -45,6 +46,15 @@ def parse_slave_uri(uri: str) -> HostPort | None:
 def parse_service_uri(uri: str) -> HostPort | None:
     """Host and port of a ``rosrpc://host:port`` URI, or None if it is no such URI."""
     return parse_authority(uri) if uri.startswith("rosrpc://") and _fits(uri) else None
+
+
+def placed(uri: str, address: str) -> str:
+    """A URI with the address that it came from where it names no host, as ``http://:41063``.
+
+    roslisp says so where it has ROS_IP alone, and rosmaster takes it.
+    """
+    found = _NO_HOST.fullmatch(uri)
+    return f"{found[1]}{HostPort(address, int(found[2]))}{found[3]}" if found else uri
 
 
 def slave_uri(where: HostPort, path: str = "/") -> str:

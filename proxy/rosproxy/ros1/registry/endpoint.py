@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
 
@@ -106,8 +107,8 @@ class Endpoint:
     trusted: bool = True
     source: str = ""
     health: Health = field(default_factory=Health)
-    admissions: dict[tuple[str, str], None] = field(default_factory=dict)
-    """The URIs and sources that were found to mean it, oldest first; `Registry` keeps them."""
+    admissions: dict[tuple[HostPort, str], None] = field(default_factory=dict)
+    """What was found to mean it, by source, oldest first; `Registry` keeps that."""
     former_uris: set[str] = field(default_factory=set)
     unsettled: bool = False
     settles_at: float = 0.0
@@ -150,6 +151,10 @@ class Endpoint:
     def note_named(self, named: bool) -> None:
         """Note whether the host that the node gives leads to it."""
         self.place = replace(self.place, named=named)
+
+    def note_uri(self, uri: str) -> None:
+        """Note how the node writes its own URI, of which a recovery knows the host and port."""
+        self.uri = uri
 
     def note_former_uri(self, uri: str) -> None:
         """Note a URI by which the master may have known the node."""
@@ -249,7 +254,7 @@ class Endpoint:
     @property
     def direct(self) -> bool:
         """Whether the node registered around the proxy, so that it may do so again."""
-        return self.uri in self.former_uris
+        return any(parse_slave_uri(uri) == self.node for uri in self.former_uris)
 
     @property
     def slave(self) -> HostPort:

@@ -15,8 +15,8 @@ from rosproxy.ros1.protocol.uris import parse_service_uri, service_uri
 from rosproxy.ros1.registry.endpoint import LONGEST_REGISTRATION, Endpoint, Place, Registration
 
 MOST_ADMISSIONS = 16
-"""URIs and sources remembered for one endpoint. A node gives one URI, from one address or, on a
-machine that is in several networks, from a few."""
+"""Hosts with ports, and sources, remembered for one endpoint. A node gives one, from one address
+or, on a machine that is in several networks, from a few."""
 UNPROVEN_SHARE = 4
 """One part in so many of the range is for nodes of one source that have never answered. A node
 that is well answers within milliseconds of its first registration."""
@@ -42,8 +42,8 @@ class Registry:
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
         self.hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
         self.changes = 0
-        self._by_uri: dict[str, dict[int, Endpoint]] = {}
-        self._admitted: dict[tuple[str, str], Endpoint] = {}
+        self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
+        self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
         self._former: dict[int, Endpoint] = {}
         self._unproven: dict[str, dict[Endpoint, None]] = {}
@@ -57,9 +57,13 @@ class Registry:
         """How many ports are held."""
         return len(self.by_port)
 
-    def admitted(self, uri: str, source: str) -> Endpoint | None:
-        """The endpoint that ``uri`` was found to mean when ``source`` registered it before."""
-        return self._admitted.get((uri, source))
+    def admitted(self, node: HostPort | None, source: str) -> Endpoint | None:
+        """The endpoint that a URI was found to mean when ``source`` registered it before.
+
+        URIs are told apart by host and port: some client libraries end them with a slash, some
+        don't, and what the master had of them is known without.
+        """
+        return self._admitted.get((node, source)) if node else None
 
     def admit(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
         """The endpoint of a slave URI that ``source`` registers; made if there is none.
@@ -79,10 +83,10 @@ class Registry:
                 )
             endpoint = self._add(uri, node, place, port, source)
         elif place.confirmed or not endpoint.place.confirmed:
-            self._forget_uri(endpoint)
+            self._forget_node(endpoint)
             endpoint.uri, endpoint.node, endpoint.place = uri, node, place
-            self._by_uri.setdefault(uri, {})[endpoint.port] = endpoint
-        self._admit(endpoint, uri, source)
+            self._by_node.setdefault(node, {})[endpoint.port] = endpoint
+        self._admit(endpoint, node, source)
         return endpoint
 
     def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
@@ -91,7 +95,7 @@ class Registry:
             return None
         endpoint = self._add(uri, node, place, port, place.address)
         endpoint.trusted, endpoint.restored = False, True
-        self._admit(endpoint, uri, place.address)
+        self._admit(endpoint, node, place.address)
         return endpoint
 
     def remove(self, endpoint: Endpoint) -> None:
@@ -123,8 +127,8 @@ class Registry:
             endpoint.place = places[endpoint]
             self.by_slave[endpoint.slave] = endpoint
             self._remember(endpoint)
-        for endpoint, uri in admissions:
-            self._admit(endpoint, uri, endpoint.place.address)
+        for endpoint, node in admissions:
+            self._admit(endpoint, node, endpoint.place.address)
         return moved
 
     def reclaimable(self) -> Endpoint | None:
@@ -203,13 +207,13 @@ class Registry:
         for key in [key for key in endpoint.registrations if key[2] == caller_id]:
             self._drop(endpoint, key)
 
-    def by_uri(self, uri: str) -> list[Endpoint]:
-        """The endpoints that call themselves ``uri``; several only for host names reused.
+    def by_node(self, node: HostPort) -> list[Endpoint]:
+        """The endpoints that call themselves so; several only for host names reused.
 
         Those removed come last, until somebody else has their port: a node that was handed their
         URI may still send it back.
         """
-        same = self._by_uri.get(uri, {}).values()
+        same = self._by_node.get(node, {}).values()
         return sorted(same, key=lambda endpoint: endpoint.port in self._former)
 
     def service_port(self, endpoint: Endpoint, name: str) -> int | None:
@@ -246,28 +250,28 @@ class Registry:
                 return kept
             moved = kept
 
-    def _take_admissions(self, endpoint: Endpoint) -> list[str]:
-        """The URIs that meant an endpoint if its own address gave them; they no longer do."""
+    def _take_admissions(self, endpoint: Endpoint) -> list[HostPort]:
+        """What meant an endpoint if its own address said so; it no longer does."""
         address = endpoint.place.address
-        uris = [uri for uri, source in endpoint.admissions if source == address]
-        for uri in uris:
-            del endpoint.admissions[uri, address]
-            del self._admitted[uri, address]
-        return [*uris, endpoint.uri]
+        nodes = [node for node, source in endpoint.admissions if source == address]
+        for node in nodes:
+            del endpoint.admissions[node, address]
+            del self._admitted[node, address]
+        return [*nodes, endpoint.node]
 
     def _add(self, uri: str, node: HostPort, place: Place, port: int, source: str) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port, source=source)
         self._unproven.setdefault(source, {})[endpoint] = None
         self.by_port[port] = self.by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
-        self._by_uri.setdefault(uri, {})[port] = endpoint
+        self._by_node.setdefault(node, {})[port] = endpoint
         return endpoint
 
-    def _admit(self, endpoint: Endpoint, uri: str, source: str) -> None:
-        before = self._admitted.get((uri, source), endpoint)
-        before.admissions.pop((uri, source), None)
-        self._admitted[uri, source] = endpoint
-        endpoint.admissions[uri, source] = None
+    def _admit(self, endpoint: Endpoint, node: HostPort, source: str) -> None:
+        before = self._admitted.get((node, source), endpoint)
+        before.admissions.pop((node, source), None)
+        self._admitted[node, source] = endpoint
+        endpoint.admissions[node, source] = None
         if len(endpoint.admissions) > MOST_ADMISSIONS:
             oldest = next(iter(endpoint.admissions))
             del endpoint.admissions[oldest], self._admitted[oldest]
@@ -276,17 +280,17 @@ class Registry:
         """Note who has a port now, in place of who had it last."""
         former = self._former.pop(endpoint.port, None)
         if former is not None:
-            self._forget_uri(former)
+            self._forget_node(former)
         former = former or endpoint
         if self._last_port.get(former.slave) == endpoint.port:
             del self._last_port[former.slave]
         self._last_port[endpoint.slave] = endpoint.port
 
-    def _forget_uri(self, endpoint: Endpoint) -> None:
-        same = self._by_uri[endpoint.uri]
+    def _forget_node(self, endpoint: Endpoint) -> None:
+        same = self._by_node[endpoint.node]
         del same[endpoint.port]
         if not same:
-            del self._by_uri[endpoint.uri]
+            del self._by_node[endpoint.node]
 
     def _index_hidden(self, endpoint: Endpoint, held: Registration) -> None:
         """Note by kind and name that a registration is hidden, or no longer."""

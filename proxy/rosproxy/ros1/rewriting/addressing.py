@@ -17,6 +17,7 @@ from rosproxy.ros1.protocol.uris import (
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
+    placed,
     service_uri,
     slave_uri,
 )
@@ -73,10 +74,11 @@ class Addressing:
 
     def export_slave(self, uri: str, asker: Asker) -> str:
         """The outside form of a slave URI that an inside node gave."""
+        uri = placed(uri, asker.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         where = parse_slave_uri(uri)
-        endpoint = self._own(uri, asker) if where else None
+        endpoint = self._own(where, asker) if where else None
         if endpoint:
             return self.advertised_uri(endpoint)
         if where and self._is_relayed(where, asker):
@@ -85,6 +87,7 @@ class Addressing:
 
     def export_service(self, uri: str, service: str, asker: Asker) -> str:
         """The outside form of the URI of a service that an inside node gave."""
+        uri = placed(uri, asker.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         where = parse_service_uri(uri)
@@ -139,7 +142,7 @@ class Addressing:
         return self.stand_ins.import_uri(uri, asker.proxy) if self.foreign(uri) else uri
 
     def _import(self, endpoint: Endpoint, asker: Asker) -> str:
-        if self._direct(endpoint, asker) and self._own(endpoint.uri, asker) is endpoint:
+        if self._direct(endpoint, asker) and self._own(endpoint.node, asker) is endpoint:
             return endpoint.uri
         return slave_uri(HostPort(asker.proxy, endpoint.port), self._path(endpoint))
 
@@ -171,15 +174,15 @@ class Addressing:
     def _is_relayed(self, where: HostPort, asker: Asker) -> bool:
         return where.host == asker.proxy and where.port in self.ports.listen
 
-    def _own(self, uri: str, asker: Asker) -> Endpoint | None:
-        """Whom an asker means by an inside URI; several nodes may call themselves the same."""
-        admitted = self.registry.admitted(uri, asker.address)
+    def _own(self, node: HostPort, asker: Asker) -> Endpoint | None:
+        """Whom an asker means by a host and port; several nodes may call themselves the same."""
+        admitted = self.registry.admitted(node, asker.address)
 
         def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
             itself = endpoint is asker.endpoint
             return not itself, endpoint is not admitted, endpoint.place.address != asker.address
 
-        return min(self.registry.by_uri(uri), key=distance, default=None)
+        return min(self.registry.by_node(node), key=distance, default=None)
 
     def _service_literal(self, endpoint: Endpoint, service: str) -> str | None:
         """A service as its provider gave it; None if that is not known (after a recovery)."""

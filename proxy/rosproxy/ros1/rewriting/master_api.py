@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from rosproxy.ros1.protocol.master_methods import NO_ROW, Kind, Reply, resolve_name, row
-from rosproxy.ros1.protocol.uris import parse_service_uri
+from rosproxy.ros1.protocol.uris import parse_service_uri, placed
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
@@ -184,7 +184,7 @@ class MasterReply(msgspec.Struct, frozen=True):
         """
         found = []
         for result in self.results:
-            held = registration(result.call, now)
+            held = registration(result.call, now, self.exported.request.asker.address)
             if held and result.accepted and result.endpoint:
                 made = row(result.call.method).registers is not None
                 found.append(Noted(held, result.endpoint if made else None))
@@ -310,7 +310,7 @@ def _export_call(
     if isinstance(admission, Endpoint):
         if caller_api:
             yield xmlrpc.replace(caller_api, addressing.advertised_uri(admission))
-        if service_api and parse_service_uri(service_api.text):
+        if service_api and parse_service_uri(placed(service_api.text, asker.address)):
             yield xmlrpc.replace(service_api, addressing.advertised_service(admission))
         return
     if caller_api:
@@ -382,11 +382,14 @@ def _import_uris(
     ]
 
 
-def registration(call: Call, now: float) -> Registration | None:
-    """What a call registers or unregisters; None for any other call."""
+def registration(call: Call, now: float, source: str) -> Registration | None:
+    """What a call from an address registers or unregisters; None for any other call."""
     found, caller_id = row(call.method), _caller_id(call)
     kind, name = found.registers or found.unregisters, call.string(found.name)
     if kind is None or not name:
         return None
     name, type_ = resolve_name(name, caller_id), call.string(found.type) or "*"
-    return Registration(kind, name, caller_id, type_, call.string(found.service_api), now)
+    service_api = call.string(found.service_api)
+    if service_api is not None:
+        service_api = placed(service_api, source)
+    return Registration(kind, name, caller_id, type_, service_api, now)

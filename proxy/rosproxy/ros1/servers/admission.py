@@ -26,7 +26,7 @@ from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import row
-from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
+from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, placed
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, Place
 from rosproxy.ros1.registry.health import ProbeResult
@@ -85,10 +85,11 @@ class NodeAdmission:
             return None
         if self._context.retired:
             return Refusal(RETIRED)
-        endpoint = self._context.registry.admitted(uri, asker.address)
-        if endpoint is not None and not endpoint.never_found:
-            return await self._admit_again(endpoint, call, asker)
+        uri = placed(uri, asker.address)
         node = parse_slave_uri(uri)
+        endpoint = self._context.registry.admitted(node, asker.address)
+        if endpoint is not None and not endpoint.never_found:
+            return await self._admit_again(endpoint, uri, call, asker)
         if node is None:
             return Refusal(
                 f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
@@ -98,7 +99,7 @@ class NodeAdmission:
         return await self._admit_new(uri, node, call, asker)
 
     async def _admit_again(
-        self, endpoint: Endpoint, call: Call, asker: Asker
+        self, endpoint: Endpoint, uri: str, call: Call, asker: Asker
     ) -> Endpoint | Refusal:
         """The endpoint that a URI has meant before, for a node that is there.
 
@@ -106,12 +107,14 @@ class NodeAdmission:
         """
         caller_id, place = call.string(0) or "", endpoint.place
         if place.address != asker.address and caller_id not in endpoint.caller_ids:
-            name = await self._context.nodes.name(endpoint.slave, _service(call))
+            name = await self._context.nodes.name(endpoint.slave, _service(call, asker))
             if name != caller_id:
                 return Refusal(
                     f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
                     f"node there says that it is {(name or 'none')[:200]}"
                 )
+        if place.address == asker.address:
+            endpoint.note_uri(uri)
         self._welcome_back(endpoint, asker)
         return endpoint
 
@@ -256,7 +259,7 @@ class NodeAdmission:
             return Place(source, named=source in addresses)
         if await self._answers(HostPort(source, node.port)):
             return Place(source, named=False)
-        service = _service(call)
+        service = _service(call, asker)
         for address in elsewhere[:MOST_ADDRESSES]:
             where = HostPort(address, node.port)
             if await self._context.nodes.name(where, service) != caller_id:
@@ -288,10 +291,10 @@ class NodeAdmission:
         log.warning("%s: %s %s", endpoint.source, caller_id, text)
 
 
-def _service(call: Call) -> tuple[str, int] | None:
+def _service(call: Call, asker: Asker) -> tuple[str, int] | None:
     """The service that a call registers, and its port; None if it registers another thing."""
     found = row(call.method)
-    where = parse_service_uri(call.string(found.service_api) or "")
+    where = parse_service_uri(placed(call.string(found.service_api) or "", asker.address))
     return (call.string(found.name) or "", where.port) if where else None
 
 

@@ -101,7 +101,7 @@ class PolicyJudge:
         """What becomes of a call that registers or unregisters, once it is admitted."""
         if self.idle or isinstance(admission, LocalReply):
             return admission
-        held, found = registration(call, now), row(call.method)
+        held, found = registration(call, now, asker.address), row(call.method)
         if held is None or held.kind is Kind.PARAM:  # parameters were judged before
             return admission
         if found.unregisters:

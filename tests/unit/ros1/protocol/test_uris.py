@@ -18,6 +18,7 @@ from rosproxy.ros1.protocol.uris import (
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
+    placed,
     service_uri,
     slave_uri,
 )
@@ -249,3 +250,22 @@ def test_plain_addresses(address: str, plain: str) -> None:
 )
 def test_an_address_that_something_may_be_reached_at(text: str, address: str | None) -> None:
     assert parse_address(text) == address
+
+
+@pytest.mark.parametrize(
+    ("uri", "expected"),
+    [
+        ("http://:41063", "http://10.0.0.5:41063"),
+        ("http://:41063/", "http://10.0.0.5:41063/"),
+        ("rosrpc://:41064", "rosrpc://10.0.0.5:41064"),
+        ("http://c1:41063/", "http://c1:41063/"),
+        ("http://:41063/RPC2", "http://:41063/RPC2"),
+        ("http://:", "http://:"),
+        ("ftp://:41063", "ftp://:41063"),
+        ("", ""),
+    ],
+)
+def test_a_uri_without_a_host_is_where_it_came_from(uri: str, expected: str) -> None:
+    assert placed(uri, "10.0.0.5") == expected
+    if uri != expected:
+        assert placed(uri, "fd00::5") == expected.replace("10.0.0.5", "[fd00::5]")

@@ -48,6 +48,13 @@ def register(
     return held
 
 
+def at(uri: str) -> HostPort:
+    """Host and port of a URI."""
+    found = parse_slave_uri(uri)
+    assert found
+    return found
+
+
 def test_an_endpoint_is_keyed_by_address_and_port() -> None:
     registry = make_registry()
     first = node(registry, 5)
@@ -63,13 +70,13 @@ def test_two_containers_with_the_same_uri_are_two_endpoints() -> None:
     registry, uri = make_registry(), "http://node:40001/"
     one, other = admit(registry, uri, "10.0.0.5"), admit(registry, uri, "10.0.0.6")
     assert one is not other
-    assert registry.by_uri(uri) == [one, other]
-    assert registry.admitted(uri, "10.0.0.5") is one
-    assert registry.admitted(uri, "10.0.0.6") is other
-    assert registry.admitted(uri, "10.0.0.7") is None
+    assert registry.by_node(at(uri)) == [one, other]
+    assert registry.admitted(at(uri), "10.0.0.5") is one
+    assert registry.admitted(at(uri), "10.0.0.6") is other
+    assert registry.admitted(at(uri), "10.0.0.7") is None
     registry.remove(one)
-    assert registry.admitted(uri, "10.0.0.5") is None
-    assert registry.admitted(uri, "10.0.0.6") is other
+    assert registry.admitted(at(uri), "10.0.0.5") is None
+    assert registry.admitted(at(uri), "10.0.0.6") is other
 
 
 def test_a_node_that_changes_its_uri_keeps_its_lease() -> None:
@@ -77,8 +84,8 @@ def test_a_node_that_changes_its_uri_keeps_its_lease() -> None:
     endpoint = admit(registry, "http://c5:40001/", "10.0.0.5")
     assert admit(registry, own_uri("10.0.0.5"), "10.0.0.5") is endpoint
     assert endpoint.uri == own_uri("10.0.0.5")
-    assert registry.by_uri("http://c5:40001/") == []
-    assert registry.by_uri(own_uri("10.0.0.5")) == [endpoint]
+    assert registry.by_node(at("http://c5:40001/")) == []
+    assert registry.by_node(at(own_uri("10.0.0.5"))) == [endpoint]
 
 
 def test_nobody_renames_the_endpoint_of_somebody_else() -> None:
@@ -89,7 +96,7 @@ def test_nobody_renames_the_endpoint_of_somebody_else() -> None:
     assert forged is endpoint
     assert endpoint.uri == own_uri("10.0.0.5")
     assert endpoint.place.confirmed
-    assert registry.by_uri("http://alias:40001/") == []
+    assert registry.by_node(at("http://alias:40001/")) == []
 
 
 def test_an_endpoint_that_was_only_claimed_is_confirmed_by_its_own_address() -> None:
@@ -106,9 +113,9 @@ def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one
     old = admit(registry, uri, "10.0.0.5", "10.0.0.9")
     new = admit(registry, uri, "10.0.0.6", "10.0.0.9")
     registry.remove(old)
-    assert registry.admitted(uri, "10.0.0.9") is new
+    assert registry.admitted(at(uri), "10.0.0.9") is new
     registry.remove(new)
-    assert registry.admitted(uri, "10.0.0.9") is None
+    assert registry.admitted(at(uri), "10.0.0.9") is None
 
 
 def test_the_same_uri_that_comes_back_gets_the_same_port_while_it_can() -> None:
@@ -142,7 +149,7 @@ def test_an_exhausted_range_says_what_to_do_and_leaves_no_trace() -> None:
     for part in ("45000-45001", "1 leases held", "1 taken by other programs", "--port-range"):
         assert part in str(caught.value)
     assert len(registry) == 1
-    assert registry.by_uri(own_uri("10.0.0.6")) == []
+    assert registry.by_node(at(own_uri("10.0.0.6"))) == []
     assert node(registry, 5).port == 45000
 
 
@@ -200,7 +207,7 @@ def test_restored_endpoints_have_the_port_that_they_had() -> None:
     endpoint = registry.restore(own_uri("10.0.0.5"), where, place, 45002)
     assert endpoint
     assert (endpoint.port, endpoint.trusted) == (45002, False)
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is endpoint
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.5") is endpoint
     other = HostPort("10.0.0.6", 40001), Place("10.0.0.6", named=True)
     assert registry.restore(own_uri("10.0.0.5"), where, place, 45003) is None  # is there
     assert registry.restore(own_uri("10.0.0.6"), *other, 45002) is None  # port is taken
@@ -318,9 +325,9 @@ def test_a_removed_endpoint_is_known_by_its_uri_until_its_port_is_somebody_elses
     registry = make_registry(1)
     endpoint = node(registry, 5)
     registry.remove(endpoint)
-    assert registry.by_uri(own_uri("10.0.0.5")) == [endpoint]
+    assert registry.by_node(at(own_uri("10.0.0.5"))) == [endpoint]
     node(registry, 6)
-    assert registry.by_uri(own_uri("10.0.0.5")) == []
+    assert registry.by_node(at(own_uri("10.0.0.5"))) == []
 
 
 def test_endpoints_may_be_removed_while_they_are_gone_through() -> None:
@@ -344,8 +351,8 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     )
     assert registry.by_slave.get(HostPort("10.0.0.9", 40001)) is endpoint
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is None
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.5") is None
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.9") is endpoint
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.5") is None
     assert endpoint.registrations == {held.key: held}
     another = node(registry, 5)
     assert another is not endpoint
@@ -356,8 +363,8 @@ def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> Non
     registry = make_registry()
     endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", source="10.0.0.1")
     registry.move({endpoint: Place("10.0.0.9", False)})
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.1") is endpoint
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.9") is endpoint
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.1") is endpoint
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.9") is endpoint
 
 
 def test_two_nodes_may_swap_their_addresses() -> None:
@@ -367,8 +374,8 @@ def test_two_nodes_may_swap_their_addresses() -> None:
     assert registry.move(places) == [one, other]
     assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is one
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is other
-    assert registry.admitted(own_uri("10.0.0.5"), "10.0.0.6") is one
-    assert registry.admitted(own_uri("10.0.0.6"), "10.0.0.5") is other
+    assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.6") is one
+    assert registry.admitted(at(own_uri("10.0.0.6")), "10.0.0.5") is other
 
 
 def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
@@ -491,12 +498,12 @@ def test_few_uris_are_remembered_for_one_endpoint_and_the_oldest_go() -> None:
     uris = [f"http://name{number}:40001/" for number in range(MOST_ADMISSIONS + 2)]
     endpoints = {admit(registry, uri, "10.0.0.5") for uri in uris}
     (endpoint,) = endpoints
-    known = [uri for uri in uris if registry.admitted(uri, "10.0.0.5") is endpoint]
+    known = [uri for uri in uris if registry.admitted(at(uri), "10.0.0.5") is endpoint]
     assert known == uris[2:]
     assert len(endpoint.admissions) == MOST_ADMISSIONS
     admit(registry, uris[2], "10.0.0.5")  # used again: it is the newest now
     admit(registry, uris[0], "10.0.0.5")
-    assert registry.admitted(uris[2], "10.0.0.5") is endpoint
-    assert registry.admitted(uris[3], "10.0.0.5") is None
+    assert registry.admitted(at(uris[2]), "10.0.0.5") is endpoint
+    assert registry.admitted(at(uris[3]), "10.0.0.5") is None
     registry.remove(endpoint)
-    assert not any(registry.admitted(uri, "10.0.0.5") for uri in uris)
+    assert not any(registry.admitted(at(uri), "10.0.0.5") for uri in uris)

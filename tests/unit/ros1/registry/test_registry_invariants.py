@@ -55,7 +55,7 @@ class Registries(RuleBasedStateMachine):
             assert HostPort(address, port) not in before
         else:
             assert endpoint.slave == HostPort(address, port)
-            assert self.registry.admitted(slave_uri(where), source) is endpoint
+            assert self.registry.admitted(where, source) is endpoint
 
     @rule(address=ADDRESSES, slave=SLAVE_PORTS, port=st.integers(44999, 45006))
     def restore(self, address: str, slave: int, port: int) -> None:
@@ -83,9 +83,9 @@ class Registries(RuleBasedStateMachine):
             if endpoint in moved:
                 new = places[endpoint].address
                 assert endpoint.slave == HostPort(new, port)
-                for uri in [uri for uri, source in admitted[endpoint] if source == old]:
-                    assert self.registry.admitted(uri, new)
-                assert self.registry.admitted(endpoint.uri, new) in moved
+                for node in [node for node, source in admitted[endpoint] if source == old]:
+                    assert self.registry.admitted(node, new)
+                assert self.registry.admitted(endpoint.node, new) in moved
             else:
                 assert endpoint.slave == slave
                 wanted = places.get(endpoint)
@@ -153,10 +153,10 @@ class Registries(RuleBasedStateMachine):
     def every_endpoint_is_found_by_port_and_uri_and_admission(self) -> None:
         for port, endpoint in self.registry.by_port.items():
             assert endpoint.port == port
-            assert endpoint in self.registry.by_uri(endpoint.uri)
+            assert endpoint in self.registry.by_node(endpoint.node)
             assert endpoint.node == HostPort(endpoint.node.host, endpoint.slave.port)
-            for uri, source in endpoint.admissions:
-                assert self.registry.admitted(uri, source) is endpoint
+            for node, source in endpoint.admissions:
+                assert self.registry.admitted(node, source) is endpoint
         slaves = {endpoint.slave for endpoint in self.registry}
         assert len(slaves) == len(self.registry)
 
@@ -165,16 +165,16 @@ class Registries(RuleBasedStateMachine):
         live = set(self.registry)
         assert set(self.registry.by_slave.values()) == live
         former = set(self.registry._former.values())
-        by_uri = self.registry._by_uri.values()
-        assert all(by_uri)
-        assert sorted(e.port for found in by_uri for e in found.values()) == sorted(
+        by_node = self.registry._by_node.values()
+        assert all(by_node)
+        assert sorted(e.port for found in by_node for e in found.values()) == sorted(
             e.port for e in live | former
         )
         assert set(self.registry._admitted.values()) <= live
         assert not former & live
         assert not set(self.registry._former) & set(self.registry.by_port)
         for endpoint in live | former:
-            found = self.registry.by_uri(endpoint.uri)
+            found = self.registry.by_node(endpoint.node)
             assert [e in former for e in found] == sorted(e in former for e in found)
             assert endpoint in found
         last = self.registry._last_port

@@ -65,8 +65,8 @@ def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, lis
         st.lists(MEMBERS, min_size=1, max_size=7, unique_by=lambda m: (m.address, m.port))
     )
     for member in members:
-        uri = slave_uri(HostPort(member.name or member.address, member.port))
-        if not (distinct and addressing.registry.by_uri(uri)):
+        called = HostPort(member.name or member.address, member.port)
+        if not (distinct and addressing.registry.by_node(called)):
             member.join(addressing)
     return addressing, list(addressing.registry)
 

@@ -25,9 +25,12 @@ def held(name: str, caller_id: str = "/n", kind: Kind = PUB, since: float = 0.0)
     return Registration(kind, name, caller_id, since=since)
 
 
-def said(published: Iterable[str], subscribed: Iterable[str] = ()) -> NodeInfo:
-    """What a node says of itself; the type of /a is t/a."""
-    types = [{name: f"t{name}" for name in names} for names in (published, subscribed)]
+def said(published: Iterable[str] | None, subscribed: Iterable[str] | None = ()) -> NodeInfo:
+    """What a node says of itself, None where it does not tell; the type of /a is t/a."""
+    types = [
+        None if names is None else {name: f"t{name}" for name in names}
+        for names in (published, subscribed)
+    ]
     return NodeInfo(7, types[0], types[1])
 
 
@@ -77,10 +80,18 @@ HELD = [(PUB, "/a"), (SUB, "/b"), (SRV, "/s"), (PARAM, "/p")]
         ({"/b"}, {"/a"}, True, []),  # the kinds are not the same
         (set(), set(), True, []),
         ({"/rosout"}, set(), True, []),
+        # what it does not tell holds
+        (None, None, True, HELD),
+        (None, None, False, HELD[:2]),
+        (set(), None, True, HELD[1:]),
+        (None, set(), True, [HELD[0], *HELD[2:]]),
     ],
 )
 def test_what_still_holds_of_a_node_that_is_back(
-    published: set[str], subscribed: set[str], same_process: bool, kept: list[tuple[Kind, str]]
+    published: set[str] | None,
+    subscribed: set[str] | None,
+    same_process: bool,
+    kept: list[tuple[Kind, str]],
 ) -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
@@ -88,6 +99,14 @@ def test_what_still_holds_of_a_node_that_is_back(
         add_registration(addressing, endpoint, kind, name)
     found = policy.still_held(endpoint, said(published, subscribed), same_process)
     assert [(held.kind, held.name) for held in found] == kept
+
+
+def test_a_service_alone_holds_if_the_process_is_the_same() -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    service = add_registration(addressing, endpoint, SRV, "/s")
+    assert policy.still_held(endpoint, said({"/rosout"}), same_process=True) == [service]
+    assert policy.still_held(endpoint, said({"/rosout"}), same_process=False) == []
 
 
 OLD = [(PUB, "/rosout", "/old", 1.0), (PUB, "/a", "/old", 1.0), (SRV, "/s", "/old", 1.0)]
@@ -101,14 +120,18 @@ LEFT_OVER = [
     ([*OLD, *NEW], {"/rosout", "/a"}, {"/b"}, []),  # two names in one process
     ([*OLD, (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),  # is being made right now
     ([*OLD, (SRV, "/late", "/old", 12.0), (SUB, "/b", "/new", 20.0)], {"/rosout"}, set(), OLD),
+    # it does not tell whether it still has the old one's
+    ([*OLD, *NEW], None, {"/b"}, []),
+    ([*OLD, *NEW], {"/rosout"}, None, OLD),
+    ([*OLD, *NEW], None, None, []),
 ]
 
 
 @pytest.mark.parametrize(("registered", "published", "subscribed", "left"), LEFT_OVER)
 def test_what_a_process_that_is_gone_has_left_behind(
     registered: list[tuple[Kind, str, str, float]],
-    published: set[str],
-    subscribed: set[str],
+    published: set[str] | None,
+    subscribed: set[str] | None,
     left: list[tuple[Kind, str, str, float]],
 ) -> None:
     addressing = make_addressing()

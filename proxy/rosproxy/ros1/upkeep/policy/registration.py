@@ -15,6 +15,7 @@ from typing import Any
 
 from rosproxy.net.addresses import is_loopback
 from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, row
+from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, NodeInfo
 
@@ -65,7 +66,7 @@ def known_as(endpoint: Endpoint, uri: str) -> bool:
 
     A loopback address is everybody's own.
     """
-    own = uri == endpoint.uri and not is_loopback(endpoint.node.host)
+    own = parse_slave_uri(uri) == endpoint.node and not is_loopback(endpoint.node.host)
     return own or uri in endpoint.former_uris
 
 
