@@ -2,7 +2,7 @@
 
 import asyncio
 import socket
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, ExitStack
 from typing import Any
 
 import pytest
@@ -327,6 +327,24 @@ async def test_admin_connections_of_one_source_are_bounded(proxy, monkeypatch):
         assert await first.outcome() == "closed"
         await third.send(ask)
         assert (await third.reply()).status == 200
+
+
+async def test_so_are_those_that_come_in_one_moment(proxy, monkeypatch):
+    monkeypatch.setattr("rosproxy.admin.server.MOST_CONNECTIONS", 3)
+    where = proxy.settings.admin.host, proxy.settings.admin.port
+    with ExitStack() as stack:  # all before the proxy has its turn
+        conns = [stack.enter_context(socket.create_connection(where)) for _ in range(20)]
+        for conn in conns:
+            conn.setblocking(False)
+
+        def has_ended(conn: socket.socket) -> bool:
+            try:
+                return not conn.recv(1)
+            except BlockingIOError:
+                return False
+
+        await until(lambda: sum(map(has_ended, conns)) == 17, "all but three have ended")
+        assert not any(map(has_ended, conns[-3:]))
 
 
 async def test_a_half_sent_body_at_the_admin_endpoint_is_408(proxy, monkeypatch):

@@ -189,8 +189,9 @@ class _BoundedServer(web.Server):
         end_if_stalled(transport.get_extra_info("socket"))
         source = _source(handler)
         mine = [other for other in self.connections if _source(other) == source]
-        if len(mine) >= MOST_CONNECTIONS:
-            mine[0].force_close()
+        open_ones = [other for other in mine if other.transport is not None]
+        if len(open_ones) >= MOST_CONNECTIONS:  # those that end are there until the next turn
+            open_ones[0].force_close()
         super().connection_made(handler, transport)
 
 
