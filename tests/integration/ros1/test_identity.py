@@ -1,7 +1,7 @@
 """Who may use the proxy as its master, whom it believes, and who gets a port."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any
 
 import pytest
@@ -312,6 +312,24 @@ async def test_a_node_outside_is_left_to_itself(
     assert (await publish(far, proxy))[0] == 1
     assert master.nodes["/far"] == far.uri
     assert list(proxy.ros1.context.registry) == []
+
+
+@pytest.mark.usefixtures("_as_if_not_loopback")
+@pytest.mark.parametrize("calls", [(), ("getName", "getPublications", "getPid")])
+async def test_so_is_one_that_a_gateway_calls_by_another_name(
+    proxy: Proxy, make_node: MakeNode, master: FakeMaster, calls: Sequence[str]
+) -> None:
+    far = await make_node("/far", OUTSIDE)
+    far.answers.update(dict.fromkeys(calls, value([-1, "no such method", 0])))
+    params = "/far/chatter", "std_msgs/String", far.uri
+    found = await call(proxy.master, "registerPublisher", "/gateway_far", *params, source=NODE)
+    assert found[0] == 1
+    assert master.nodes["/gateway_far"] == far.uri
+    assert list(proxy.ros1.context.registry) == []
+    assert problems(proxy) == {}
+    ended = "/far/chatter", far.uri
+    found = await call(proxy.master, "unregisterPublisher", "/gateway_far", *ended, source=NODE)
+    assert found[2] == 1
 
 
 @pytest.mark.usefixtures("_as_if_not_loopback")

@@ -250,7 +250,8 @@ class NodeAdmission:
 
         If the address leads elsewhere than to the source of the call, and no node answers at the
         source (the way to the proxy hides it), the node there must bear out that it has the name
-        that the call registers.
+        that the call registers. Outside it need only be there: a gateway registers nodes of another
+        machine under names of its own, and no port is opened for that.
         """
         source, caller_id = asker.address, call.string(0) or ""
         addresses = await resolve(self._context.upstream.reach(node).host, source)
@@ -261,13 +262,16 @@ class NodeAdmission:
             return Place(source, named=False)
         service = _service(call, asker)
         for address in elsewhere[:MOST_ADDRESSES]:
-            where = HostPort(address, node.port)
-            if await self._context.nodes.name(where, service) != caller_id:
-                continue
-            if self._context.standing(address) is Standing.ADMITTED:
+            where, standing = HostPort(address, node.port), self._context.standing(address)
+            if standing is Standing.OUTSIDE:
+                bears_out = await self._answers(where)  # a gateway gives it another name
+            else:
+                bears_out = await self._context.nodes.name(where, service) == caller_id
+            if bears_out and standing is Standing.ADMITTED:
                 return Place(address, named=True, confirmed=False)
-            log.info("%s at %s is outside; its URI passes as it is", caller_id, where)
-            return None
+            if bears_out:
+                log.info("%s at %s is outside; its URI passes as it is", caller_id, where)
+                return None
         text = (
             f"gives its address as {node}, but registers from {source}: no node answers there at "
             f"port {node.port}, and none of this name at {', '.join(elsewhere[:MOST_ADDRESSES])}. "
