@@ -108,7 +108,7 @@ async def test_an_offer_of_udpros_passes_unharmed(proxy, node):
     offer = [["UDPROS", b"\0\1binary", OUTSIDE, 1234, 1500], ["TCPROS"]]
     asked = await rpc(proxy.uri(node), "requestTopic", "/outside", "/chatter", offer)
     assert asked[:2] == reply[:2]
-    assert asked[2][:3] == ["UDPROS", NODE, 4321]
+    assert asked[2][:3] == ["UDPROS", HOST, 4321]  # datagrams come from there
     assert asked[2][5].data == b"header"
     seen = node.calls[-1][1][2]
     assert (seen[0][1].data, seen[0][2:], seen[1]) == (

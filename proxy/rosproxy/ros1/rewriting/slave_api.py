@@ -75,7 +75,8 @@ def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:
 def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -> bytes:
     """The reply for the caller: addresses as it sees them.
 
-    ``reached`` is the address and port at which it is to find the node's topics.
+    ``reached`` is the address and port at which it is to find the node's topics, and the address
+    from which it gets datagrams.
     """
     triple = ros_triple(xmlrpc.parse_reply(reply))
     if triple is None:
@@ -83,6 +84,9 @@ def rewrite_reply(call: Call, reply: bytes, reached: HostPort, view: CallView) -
     edits: list[Edit] = []
     if call.method == "requestTopic" and _is_tcpros(triple):
         edits = send_to(triple, reached)
+    elif call.method == "requestTopic" and _is_udpros(triple):
+        # Datagrams come from there, by a relay or by NAT; some libraries drop any other's.
+        edits = [xmlrpc.replace(triple.items[2].items[1], reached.host)]
     elif call.method == "getBusInfo":
         edits = [xmlrpc.replace(peer, view.answered(peer.text)) for peer in _peers(triple)]
     elif call.method in _URI_REPLIES:
@@ -192,6 +196,11 @@ def _publishers(call: Call) -> list[Value]:
 def _is_tcpros(triple: Value) -> bool:
     protocol = triple.items[2].items
     return len(protocol) == 3 and protocol[0].string() == "TCPROS"
+
+
+def _is_udpros(triple: Value) -> bool:
+    protocol = triple.items[2].items
+    return len(protocol) > 2 and protocol[0].string() == "UDPROS"
 
 
 def _peers(triple: Value) -> list[Value]:

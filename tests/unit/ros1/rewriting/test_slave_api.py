@@ -123,11 +123,11 @@ REPLIES = [
     ("requestTopic", [0, "Unknown Error", 0], [0, "Unknown Error", 0]),
     ("requestTopic", [-1, "Not a publisher of [/x]", []], [-1, "Not a publisher of [/x]", []]),
     ("requestTopic", [1, "", ["TCPROS", "c5"]], [1, "", ["TCPROS", "c5"]]),
-    ("requestTopic", [1, "", ["UDPROS", "c5", 5]], [1, "", ["UDPROS", "c5", 5]]),
+    ("requestTopic", [1, "", ["UDPROS", "c5", 5]], [1, "", ["UDPROS", "robot-host", 5]]),
     (
         "requestTopic",
         [1, "", ["UDPROS", "10.0.0.5", 40123, 1, 1500, "header"]],
-        [1, "", ["UDPROS", "10.0.0.5", 40123, 1, 1500, "header"]],
+        [1, "", ["UDPROS", "robot-host", 40123, 1, 1500, "header"]],
     ),
     (
         "getBusInfo",
@@ -193,7 +193,8 @@ def test_a_udpros_reply_keeps_its_binary_header() -> None:
         b"<value><base64>" + header.encode() + b"\n</base64></value></data></array></value></data>"
         b"</array></value>\r\n</param></params></methodResponse>\r\n"
     )
-    assert outward("requestTopic", reply) == reply
+    expected = reply.replace(b"<value>c5</value>", b"<value>robot-host</value>")
+    assert outward("requestTopic", reply) == expected
 
 
 PORTS = [
