@@ -9,6 +9,7 @@ import pytest
 
 from examples.demo.fake_http import value
 from rosproxy.net import gate, sockets
+from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, INVALID_REQUEST, PARSE_ERROR
 from rosproxy.ros1.protocol.xmlrpc.limits import lease_call, master_call
@@ -59,12 +60,44 @@ async def test_a_long_parameter_reaches_its_subscriber(proxy, master, node):
     assert body in [request.body for request in node.requests]
 
 
-async def test_no_other_long_call_passes_a_node_s_port(proxy, node):
+async def test_a_long_call_that_has_to_be_read_does_not_pass_a_node_s_port(proxy, node):
     await node.publish(proxy.master)
-    for method in ("publisherUpdate", "shutdown", "getPid", "system.multicall", "foo"):
+    for method in ("publisherUpdate", "requestTopic", "getBusInfo", "shutdown", "system.multicall"):
         reply = await exchange(proxy.lease(node), post(xml(method, "/n", LONG)))
         assert reply.status == 413, method
     assert {caller for _, (caller, *_) in node.calls} <= {"/rosproxy"}
+    assert (await rpc(proxy.uri(node), "of_its_own", "/n", LONG))[0] == 1
+
+
+MANY = [""] * 6000
+"""More elements than a call that is read may have, in few bytes."""
+
+
+async def test_what_holds_no_address_passes_however_short_it_is(make_proxy, master, node):
+    proxy = await make_proxy(max_master_call=1)
+    await node.publish(proxy.master)
+    many = "<array><data>" + "<value/>" * len(MANY) + "</data></array>"
+
+    def call(method: str, *names: str) -> bytes:
+        return xml(method, *names, "MANY").replace(b"<string>MANY</string>", many.encode())
+
+    assert len(call("setParam", "/n", "/p")) < passing.SHORT
+    assert len(MANY) > master_call(1).elements
+    found = await exchange(proxy.master, post(call("setParam", "/n", "/p")), NODE)
+    assert found.value[0] == 1
+    assert master.params["/p"] == MANY
+    for method in ("paramUpdate", "of_its_own"):
+        found = await exchange(proxy.lease(node), post(call(method, "/n", "/p")), MASTER)
+        assert found.value[0] == 1, method
+        assert node.calls[-1] == (method, ("/n", "/p", MANY))
+
+
+@pytest.mark.parametrize("held", [LONG * 2, LISTED], ids=["text", "list"])
+async def test_the_value_of_a_parameter_reaches_whoever_subscribes_to_it(proxy, master, node, held):
+    master.params["/p"] = held
+    found = await node.call(proxy.master, "subscribeParam", node.uri, "/p")
+    assert (found[0], found[2]) == (1, held)
+    assert proxy.endpoint(node).names(Kind.PARAM) == ["/p"]
 
 
 async def test_a_long_body_that_hides_another_call_never_reaches_the_master(proxy, master):
@@ -161,7 +194,8 @@ async def test_too_many_elements_are_a_fault(proxy, node):
     await node.publish(proxy.master)
     for where, limits in ((proxy.lease(node), lease_call(1)), (proxy.master, master_call(4))):
         params = b"<param><value/></param>" * (limits.elements // 2)
-        body = xml("registerService").replace(b"<params>", b"<params>" + params)
+        method = "registerService" if where == proxy.master else "requestTopic"
+        body = xml(method).replace(b"<params>", b"<params>" + params)
         assert passing.SHORT < len(body) < limits.size
         assert (await exchange(where, post(body), NODE)).fault == PARSE_ERROR
 

@@ -33,6 +33,7 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 log = logging.getLogger(__name__)
 
 _Answer = TypeVar("_Answer")
+NO_CALLER_ID = "there is a policy, and the call's caller_id can't be told"
 NOT_THE_MASTER = "only the master may call this"
 
 
@@ -86,17 +87,19 @@ class SlaveApi:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        return passing.CallWatch() if method in slave_api.LONG else None
+        return passing.CallWatch() if slave_api.passes(method) else None
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
-        endpoint = self._endpoint(call)
+        endpoint, method = self._endpoint(call), long_call.method
         caller_id = next(iter(passing.first_strings(call.body, 1)), None)
-        why = await self._why_not(endpoint, long_call.method, caller_id or "", call.source)
+        why = await self._why_not(endpoint, method, caller_id or "", call.source)
+        if why is None and caller_id is None and not self._judge.idle:
+            why = NO_CALLER_ID
         if why is not None:
-            return self._refused(long_call.method, why)
+            return self._refused(method, why)
         reply = self._pass(endpoint, long_call)
-        return await counted(self._context.metrics, "slave", long_call.method, reply)
+        return await counted(self._context.metrics, "slave", method, reply)
 
     def _endpoint(self, call: IncomingCall) -> Endpoint:
         """The endpoint that a call is for. Raises Unreachable."""
@@ -161,7 +164,7 @@ class SlaveApi:
     ) -> bytes | LongReply:
         if await self._is_void(endpoint, parsed):
             return xmlrpc.dump_reply([1, "", 0])
-        if not slave_api.rewritten(parsed):
+        if not slave_api.rewritten(parsed.method):
             return await self._pass(endpoint, body)
         if parsed.method == "publisherUpdate":
             await self._context.after_registration(endpoint)

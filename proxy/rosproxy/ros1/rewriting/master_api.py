@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from rosproxy.ros1.protocol.master_methods import NO_ROW, Kind, Reply, resolve_name, row
 from rosproxy.ros1.protocol.uris import parse_service_uri, placed
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import (
@@ -104,8 +105,15 @@ class Request(msgspec.Struct, frozen=True):
 
     @property
     def reply_limits(self) -> Limits:
-        """How large the reply may be, if it is read."""
-        return OWN_REPLY if self.tells_graph else REPLY
+        """How large the reply may be."""
+        return OWN_REPLY if self.tells_graph or self.reply_passes else REPLY
+
+    @property
+    def reply_passes(self) -> bool:
+        """Whether nothing in the reply is rewritten."""
+        if self.multicall or self.tells_graph or self.method == "getParamNames":
+            return False
+        return row(self.method).reply is Reply.OTHER
 
     @property
     def plain(self) -> bool:
@@ -137,16 +145,25 @@ class Exported(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True):
-    """A call that the master has answered, its ROS triple, and the endpoint it registers."""
+    """A call that the master has answered: its ROS status and value, and the endpoint it registers.
+
+    ``triple`` is None where the reply holds nothing that is rewritten, and was not read.
+    """
 
     call: Call
-    triple: Value
+    status: int | None
+    triple: Value | None
     endpoint: Endpoint | None
 
     @property
     def accepted(self) -> bool:
         """Whether the master answered with ROS status 1."""
-        return self.triple.items[0].integer() == 1
+        return self.status == 1
+
+    @property
+    def value(self) -> Value | None:
+        """The third element of the triple, if it was read."""
+        return self.triple.items[2] if self.triple else None
 
 
 class Noted(msgspec.Struct, frozen=True):
@@ -173,8 +190,8 @@ class MasterReply(msgspec.Struct, frozen=True):
     def param_names(self) -> Iterator[str]:
         """The names of parameters that it lists."""
         for result in self.results:
-            if result.call.method == "getParamNames":
-                yield from (item.text for item in result.triple.items[2].items)
+            if result.call.method == "getParamNames" and result.value:
+                yield from (item.text for item in result.value.items)
 
     def facts(self, now: float) -> list[Noted]:
         """What the registry has to learn from the calls that the master accepted.
@@ -193,8 +210,8 @@ class MasterReply(msgspec.Struct, frozen=True):
     def uris(self) -> Iterator[str]:
         """The URIs that it hands to an inside node, as the master holds them."""
         for result in self.results:
-            held = result.triple.items[2]
-            if result.accepted and row(result.call.method).reply in _URIS:
+            held = result.value
+            if held and result.accepted and row(result.call.method).reply in _URIS:
                 texts = (item.string() for item in (held.items or [held]))
                 yield from (text for text in texts if text)
 
@@ -240,7 +257,15 @@ def export_request(
 
 
 def read_reply(exported: Exported, reply: bytes) -> MasterReply:
-    """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response."""
+    """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response.
+
+    Of one that holds no address only the status is read: the value of a parameter that a node
+    subscribes to may be anything.
+    """
+    if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
+        call, endpoint = exported.request.calls[0], exported.outcomes[0]
+        if call and not isinstance(endpoint, LocalReply):
+            return MasterReply(exported, reply, None, (Result(call, status, None, endpoint),))
     value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
     return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
 
@@ -273,7 +298,9 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
         return reply
     edits: list[Edit] = []
     for result in read_reply(Exported(request, (None,) * len(request.calls), None), reply).results:
-        text = result.triple.items[2].string()
+        if not (result.triple and result.value):
+            continue
+        text = result.value.string()
         if row(result.call.method).reply is Reply.MASTER_URI and text:
             edits += replace_held(result.triple, f"http://{master}/")
     return xmlrpc.apply(reply, edits)
@@ -329,48 +356,46 @@ def _results(exported: Exported, value: Value) -> Iterator[Result]:
     sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
     for (call, endpoint), triple in zip(sent, triples, strict=False):
         if call and triple and ros_triple(triple):
-            yield Result(call, triple, endpoint)
+            yield Result(call, triple.items[0].integer(), triple, endpoint)
 
 
 def _import_result(
     result: Result, asker: Asker, addressing: Addressing, unseen: Unseen
 ) -> list[Edit]:
-    if not result.accepted:
+    triple = result.triple
+    if triple is None or not result.accepted:
         return []
+    held = triple.items[2]
     if row(result.call.method).reply is Reply.SLAVE_URIS:
-        return _import_uris(result, asker, addressing, unseen)
+        return _import_uris(result.call, held, asker, addressing, unseen)
     if result.call.method == "getParamNames":
-        names = result.triple.items[2].items
-        return [xmlrpc.remove(item) for item in names if item.text in unseen.params]
+        return [xmlrpc.remove(item) for item in held.items if item.text in unseen.params]
     if unseen.graph and result.call.method in hidden_graph.METHODS:
-        held = result.triple.items[2]
         said = xmlrpc.python_value(held)
         more = hidden_graph.completed(result.call, said, addressing.registry)
         return [Edit(*held.outer, xmlrpc.dump_value(more))]
-    return _import_uri(result, asker, addressing)
+    return _import_uri(result.call, triple, asker, addressing)
 
 
-def _import_uri(result: Result, asker: Asker, addressing: Addressing) -> list[Edit]:
-    held, kind = result.triple.items[2], row(result.call.method).reply
-    text = held.string()
+def _import_uri(call: Call, triple: Value, asker: Asker, addressing: Addressing) -> list[Edit]:
+    text, kind = triple.items[2].string(), row(call.method).reply
     if text and kind is Reply.SLAVE_URI:
-        return replace_held(result.triple, addressing.import_slave(text, asker))
+        return replace_held(triple, addressing.import_slave(text, asker))
     if text and kind is Reply.SERVICE_URI:
-        uri = addressing.import_service(text, second_name(result.call), asker)
-        return replace_held(result.triple, uri)
+        uri = addressing.import_service(text, second_name(call), asker)
+        return replace_held(triple, uri)
     if text and kind is Reply.MASTER_URI and asker.master:
-        return replace_held(result.triple, f"http://{asker.master}/")
+        return replace_held(triple, f"http://{asker.master}/")
     return []
 
 
 def _import_uris(
-    result: Result, asker: Asker, addressing: Addressing, unseen: Unseen
+    call: Call, held: Value, asker: Asker, addressing: Addressing, unseen: Unseen
 ) -> list[Edit]:
     """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
-    held = result.triple.items[2]
     more: Sequence[str] = ()
-    if row(result.call.method).registers is Kind.SUBSCRIBER:
-        more = unseen.publishers.get(second_name(result.call), ())
+    if row(call.method).registers is Kind.SUBSCRIBER:
+        more = unseen.publishers.get(second_name(call), ())
     if more:
         uris = [*(item.text for item in held.items), *more]
         imported = dict.fromkeys(addressing.import_slave(uri, asker) for uri in uris)

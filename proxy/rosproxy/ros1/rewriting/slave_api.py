@@ -18,13 +18,11 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
+from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 
 MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
 """What the master calls at nodes; a policy can refuse it from anybody else."""
-
-LONG = frozenset({"paramUpdate"})
-"""What may be long and holds no address. All else that outside calls is short."""
 
 _URI_REPLIES = frozenset({"getUri", "getMasterUri"})
 _REWRITTEN = _URI_REPLIES | {"publisherUpdate", "requestTopic", "getBusInfo"}
@@ -54,9 +52,17 @@ def from_inside(asker: Asker, master_uri: str, addressing: Addressing) -> CallVi
     return CallView(exported, partial(addressing.import_slave, asker=asker), master_uri)
 
 
-def rewritten(call: Call) -> bool:
+def rewritten(method: str) -> bool:
     """Whether anything in a call or its reply is rewritten."""
-    return call.method in _REWRITTEN
+    return method in _REWRITTEN
+
+
+def passes(method: str) -> bool:
+    """Whether a call passes unread: it holds no address, and nothing in it is looked at.
+
+    A multicall is taken apart, and a ``shutdown`` may be kept from the node.
+    """
+    return not (rewritten(method) or method in ("shutdown", MULTICALL))
 
 
 def rewrite_call(body: bytes, call: Call, view: CallView) -> bytes:

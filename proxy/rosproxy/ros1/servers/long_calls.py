@@ -1,4 +1,4 @@
-"""Calls that are too long to be read whole and that a service need not read."""
+"""Calls that are too long to be read whole, or have too many elements, and need not be read."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -8,14 +8,14 @@ from aiohttp import StreamReader, web
 
 from rosproxy.net.http_client import PIECE_TIMEOUT, LongReply
 from rosproxy.ros1.clients.master import Unreachable
-from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch
+from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, cut
 
 if TYPE_CHECKING:
     from rosproxy.ros1.servers.xmlrpc_server import IncomingCall
 
 
 class LongCall:
-    """A call whose method is known and whose body of ``size`` bytes is still coming.
+    """A call whose method is known and whose body of ``size`` bytes may still be coming.
 
     ``head`` is what of it has come, ``rest`` brings the rest.
     """
@@ -31,7 +31,9 @@ class LongCall:
 
         Raises XmlRpcError if it must not pass, Unreachable if the caller does not send it.
         """
-        self._watch.see(self._head)
+        for piece in cut(self._head):
+            self._watch.see(piece)
+            await asyncio.sleep(0)
         held = self._head
         while not self._rest.at_eof():
             try:

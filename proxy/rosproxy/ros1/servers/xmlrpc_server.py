@@ -278,7 +278,7 @@ class XmlRpcServer(web.Server):
             size = request.content_length or 0
             if size <= passing.SHORT and request.content.is_eof():  # it came with the header
                 await self._take_in(call, request.content.read_nowait())
-                return None
+                return self._pass_unread(request, call)
             async with asyncio.timeout(BODY_TIMEOUT):
                 invite(request)
                 if size > passing.SHORT and self._long_calls is not None:
@@ -293,7 +293,21 @@ class XmlRpcServer(web.Server):
             raise HttpRefusal(408, "slow_body", text) from None
         except TooLong as error:
             raise HttpRefusal(413, "long_body", str(error)) from None
-        return None
+        return self._pass_unread(request, call)
+
+    def _pass_unread(
+        self, request: web.BaseRequest, call: IncomingCall
+    ) -> Awaitable[bytes | LongReply] | None:
+        """The answer to a whole call with more elements than are read, if it need not be read."""
+        service, limits = self._long_calls, self._limits
+        if service is None or not xmlrpc.exceeds_elements(call.body, limits):
+            return None
+        method = passing.method_of(call.body)
+        watch = service.watch(method, limits.size + 1) if method else None  # as one too long
+        if method is None or watch is None:
+            return None
+        long_call = LongCall(method, len(call.body), call.body, request.content, watch)
+        return self._pass_on(service, call, long_call)
 
     async def _read_head(
         self, request: web.BaseRequest, call: IncomingCall, size: int, service: LongCalls

@@ -373,7 +373,7 @@ class StandInPorts:
         if not stand_in.kept:
             body = await self.udpros.lead_inwards(stand_in, parsed, body, call.source)
         reply = await self._outside.ask(stand_in, body, call.path)
-        if not slave_api.rewritten(parsed):
+        if not slave_api.rewritten(parsed.method):
             return reply
         if stand_in.kept:
             address = self._context.upstream.master_address or stand_in.where.host

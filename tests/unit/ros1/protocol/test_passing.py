@@ -12,7 +12,7 @@ from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.protocol.xmlrpc.passing import CallWatch, MulticallWatch, method_of
-from tests.unit.builders import cpp_call, py_call
+from tests.unit.builders import cpp_call, cpp_reply, py_call, py_reply
 
 PLAIN = {"setParam", "getParam"}
 
@@ -213,3 +213,25 @@ def test_what_passes_python_reads_as_it_was_judged(soup: str, place: str) -> Non
         (calls,), method = read
         assert method == MULTICALL
         assert {call["methodName"] for call in calls} <= PLAIN
+
+
+@pytest.mark.parametrize("dialect", [py_reply, cpp_reply])
+@pytest.mark.parametrize("status", [1, 0, -1])
+def test_the_status_of_a_reply_is_told_by_its_head(dialect: Any, status: int) -> None:
+    body = dialect([status, "text", "x" * 100_000])
+    assert passing.status_of(body[: passing.HEAD]) == status
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        py_reply("1"),
+        py_reply(["1", "", 0]),
+        py_reply([[1, "", 0]]),
+        py_reply({"faultCode": 1, "faultString": ""}),
+        b"<methodResponse><fault><value><int>1</int></value></fault></methodResponse>",
+        b"",
+    ],
+)
+def test_what_has_no_status_is_read(body: bytes) -> None:
+    assert passing.status_of(body) is None

@@ -187,6 +187,14 @@ def python_value(value: Value) -> Any:
     return value.integer() if value.kind == "int" else value.text
 
 
+def exceeds_elements(body: bytes, limits: Limits) -> bool:
+    """Whether a document has more elements than may be read."""
+    shortest = len("<a/>")
+    if len(body) <= shortest * limits.elements:
+        return False
+    return body.count(b"</") + body.count(b"/>") > limits.elements
+
+
 class _Parser:
     """One pass of expat over a document, collecting values and their byte offsets."""
 
@@ -201,7 +209,7 @@ class _Parser:
         self._inner = 0
         if len(body) > limits.size:
             raise XmlRpcError(PARSE_ERROR, f"longer than {limits.size} bytes")
-        if body.count(b"</") + body.count(b"/>") > limits.elements:  # before any takes memory
+        if exceeds_elements(body, limits):  # before any takes memory
             raise XmlRpcError(PARSE_ERROR, f"more than {limits.elements} elements")
         if b"\0" in body:
             raise XmlRpcError(PARSE_ERROR, "neither UTF-8 nor another encoding without NUL bytes")

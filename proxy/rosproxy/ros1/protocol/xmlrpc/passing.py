@@ -1,4 +1,4 @@
-"""Calls that pass unread, because they are long and hold no address: parameters, above all.
+"""Calls that pass unread, because they are large and hold no address: parameters, above all.
 
 The method is read from the head of the document, in the form that ROS's clients write; a document
 with another head is read whole, within the bounds of `limits`. The rest is only watched while it
@@ -33,6 +33,12 @@ _HEAD = re.compile(
     rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")
     (?:\s+encoding=(["'])(?i:utf-8|us-ascii|ascii|iso-8859-1)\1)?\s*\?>)?
     \s*<methodCall>\s*<methodName>([\w./]{1,200})</methodName>""",
+    re.VERBOSE,
+)
+_STATUS = re.compile(
+    rb"""(?:<\?xml\s+version=(?:'1\.0'|"1\.0")[^>]{0,100}\?>)?
+    \s*<methodResponse>\s*<params>\s*<param>\s*<value>\s*<array>\s*<data>
+    \s*<value>\s*<(int|i4)>\s*(-?\d{1,9})\s*</\1>\s*</value>""",
     re.VERBOSE,
 )
 _PARAMS_BEGIN = re.compile(rb"\s*<params>\s*")
@@ -84,6 +90,12 @@ def first_strings(head: bytes, count: int) -> list[str | None]:
         strings.append(text_of(param[1] if param[1] is not None else param[2], "utf-8"))
         position = param.end()
     return strings
+
+
+def status_of(head: bytes) -> int | None:
+    """The ROS status of a reply that begins so; None if that can't be told from its head."""
+    found = _STATUS.match(head, 0, HEAD)
+    return int(found[2]) if found else None
 
 
 class CallWatch:
