@@ -137,6 +137,11 @@ class FakeNode:
         server = self.own_ports[name] = FakeTcpServer(serve)
         await server.start(self.address)
 
+    def name_port_for_any_topic(self) -> None:
+        """Answer ``requestTopic`` for topics that it does not publish, too, as roscpp does."""
+        protocol = ["TCPROS", self.host, self.tcpros_port]
+        self.answers["requestTopic"] = value([1, "", protocol])
+
     async def close_own_port(self, name: str) -> None:
         """End such a server."""
         if name in self.own_ports:

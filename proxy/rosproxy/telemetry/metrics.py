@@ -33,7 +33,7 @@ BOUNDS = (
     *("malformed", "participants", "rate", "stand_ins"),
 )
 """Reasons of refusals (docs/reference/limits.md) that a system that behaves does not meet."""
-RELAY_ERRORS = ("bad header", "denied", "node unreachable")
+RELAY_ERRORS = ("bad header", "denied", "node unreachable", "not offered")
 STRANGERS = ("outside", "unselected")
 
 

@@ -186,6 +186,7 @@ async def test_an_open_connection_is_counted(proxy: Proxy, node: FakeNode) -> No
 
 
 async def test_strangers_cannot_multiply_series(proxy: Proxy, node: FakeNode) -> None:
+    node.name_port_for_any_topic()
     await node.publish(proxy.master)
     for number in range(20):
         body = xml(f"method_{number}", "/outside")

@@ -60,16 +60,28 @@ async def test_a_neighbour_is_led_to_the_address_that_it_used(proxy, node):
     assert asked[2] == ["TCPROS", PROXY, port]
 
 
-async def test_an_unknown_topic_or_service_is_the_nodes_to_answer(proxy, node):
-    async def refuse(node, reader, writer, header):
-        writer.write(encode_header({"error": f"no {header}"}))
+UNKNOWN = (topic_header("/none"), service_header("/none"), encode_header({"x": "y"}))
 
+
+async def refuse(node, reader, writer, header):
+    writer.write(encode_header({"error": f"no {header}"}))
+
+
+async def test_an_unknown_topic_or_service_is_refused_in_a_header_as_by_a_node(proxy, node):
     node.stream = refuse
     await node.publish(proxy.master)
     asked = await rpc(proxy.uri(node), "requestTopic", "/outside", "/none", [["TCPROS"]])
     assert asked == [-1, "Not a publisher of [/none]", []]
-    for header in (topic_header("/none"), service_header("/none"), encode_header({"x": "y"})):
-        assert "no {" in (await greet(proxy.lease(node), header))["error"]
+    for header in UNKNOWN:
+        assert "has no" in (await greet(proxy.lease(node), header))["error"]
+    assert proxy.metric("relay_errors_total", reason="not offered") == len(UNKNOWN)
+
+
+async def test_a_topic_that_the_node_has_a_port_for_is_its_own_to_refuse(proxy, node):
+    node.stream = refuse
+    node.name_port_for_any_topic()
+    await node.publish(proxy.master)
+    assert "no {" in (await greet(proxy.lease(node), topic_header("/none")))["error"]
 
 
 async def test_a_header_in_tiny_slices(proxy, node):

@@ -8,7 +8,7 @@ or is asked for now. The header is sent on to that port, and the bytes are relay
 import asyncio
 import logging
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -34,6 +34,12 @@ log = logging.getLogger(__name__)
 RATE_INTERVAL = 2.0
 UNREGISTERED = "unregistered"
 """What a relay's topic or service is called that its node has not registered."""
+NO_PORT = 0
+"""In place of a TCPROS port: the node says that it does not have the topic or service."""
+
+
+class NotOffered(Exception):
+    """A node says that it does not have the topic or service that somebody connects for."""
 
 
 class Target(Protocol):
@@ -50,7 +56,7 @@ class Target(Protocol):
         """Why somebody may not have a topic or service; None if he may."""
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
-        """A connection to the node's TCPROS server; None if there is none."""
+        """A connection to the node's TCPROS server; None if there is none. Raises NotOffered."""
 
     def label(self, kind: str, name: str) -> str:
         """What a topic or service is called in status and metrics: whoever connects names it."""
@@ -96,20 +102,19 @@ class TcprosServer:
         """Relay a connection whose first bytes are a TCPROS header. Closes it on failure."""
         try:
             header = await read_header(self._context, peer, conn)
-            fields = decode_header(header[4:])
-            if too_long := too_long_to_connect(fields):
-                raise HeaderError(too_long)
-            if "service" in fields and "topic" in fields:
-                raise HeaderError("connection header for a topic and for a service")
+            kind, name, caller_id = _asked_for(decode_header(header[4:]))
         except HeaderError as error:
             await self._refuse(conn, str(error), "bad header")
             return
-        kind, caller_id = "service" if "service" in fields else "topic", fields.get("callerid", "")
-        name, version = fields.get(kind, ""), self._context.policy.version
+        version = self._context.policy.version
         if why := target.why_not(kind, name, peer, caller_id):
             await self._refuse(conn, why, "denied")
             return
-        node = await target.connect(kind, name)
+        try:
+            node = await target.connect(kind, name)
+        except NotOffered as error:  # roscpp tries for ever after a reset, and gives up after this
+            await self._refuse(conn, str(error), "not offered")
+            return
         if node is not None and kind == "topic" and sockets.has_ended(conn):
             # A subscriber that is told of a publisher twice keeps the later connection, and rospy's
             # publishers the one whose header comes last: were this one handed on, none was left.
@@ -186,17 +191,20 @@ class InsideNodes:
         return await asyncio.shield(asking)
 
     async def _ask_topic_port(self, endpoint: Endpoint, topic: str) -> int | None:
-        """The port that the node names for a topic; None if it names none."""
+        """The port that the node names for a topic, or NO_PORT; None if it can't be asked."""
+        port: int | None = None
         try:
-            port = await self._context.nodes.topic_port(endpoint.slave, topic)
-        except (Unreachable, MasterError) as error:
+            port = await self._context.nodes.topic_port(endpoint.slave, topic) or NO_PORT
+        except MasterError as error:
+            log.debug("%s does not publish %s: %s", endpoint.label, topic, error)
+            port = NO_PORT
+        except Unreachable as error:
             log.debug("%s gives no TCPROS port for %s: %s", endpoint.label, topic, error)
-            port = None
-        endpoint.note_topic_port(topic, port)
+        endpoint.note_topic_port(topic, port or None)
         return port
 
     async def _ask_service_port(self, endpoint: Endpoint, service: str) -> int | None:
-        """The port at which the node answers for a service; None if it does at none that is known.
+        """The port at which the node answers for a service, or NO_PORT; None if none answers.
 
         No node can be asked where its services are. In rospy and roscpp it is where its topics are.
         """
@@ -210,7 +218,7 @@ class InsideNodes:
             if await self._context.nodes.provider(where, service) in endpoint.callers:
                 self._context.registry.note_service_port(endpoint, service, port)
                 return port
-        return None
+        return None if service in endpoint.names(Kind.SERVICE) else NO_PORT
 
 
 @dataclass(slots=True)
@@ -248,7 +256,10 @@ class InsideNode:
         node = await _dial(endpoint.address, port)
         if node is not None:
             return node
-        return await _dial(endpoint.address, await self._learn_port(endpoint, kind, name))
+        port = await self._learn_port(endpoint, kind, name)
+        if port == NO_PORT:
+            raise NotOffered(f"{endpoint.label} has no {kind} {name or '(none is named)'}")
+        return await _dial(endpoint.address, port)
 
     def label(self, kind: str, name: str) -> str:
         """The topic or service if the node has registered it."""
@@ -276,6 +287,16 @@ class InsideNode:
             )
         log.warning("%s: %s", endpoint.label, text)
         self._context.problems.add(endpoint.label, text, endpoint.port)
+
+
+def _asked_for(fields: Mapping[str, str]) -> tuple[str, str, str]:
+    """Kind and name of what a header asks for, and who asks. Raises HeaderError."""
+    if too_long := too_long_to_connect(fields):
+        raise HeaderError(too_long)
+    if "service" in fields and "topic" in fields:
+        raise HeaderError("connection header for a topic and for a service")
+    kind = "service" if "service" in fields else "topic"
+    return kind, fields.get(kind, ""), fields.get("callerid", "")
 
 
 async def read_header(context: Context, peer: str, conn: socket.socket) -> bytes:
