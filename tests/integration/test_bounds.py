@@ -43,7 +43,7 @@ def pid(name: str = "/n") -> bytes:
 
 @pytest.mark.parametrize("held", [LONG, LISTED], ids=["text", "list"])
 async def test_long_parameters_pass_unread_both_ways(proxy, master, monkeypatch, held):
-    monkeypatch.setattr("rosproxy.ros1.api.master.master_api.read_request", None)
+    monkeypatch.setattr("rosproxy.ros1.api.master.master_calls.read_request", None)
     assert (await rpc(proxy.master, "setParam", "/n", "/p", held, source=NODE))[0] == 1
     assert master.params["/p"] == held
     monkeypatch.undo()

@@ -15,9 +15,9 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
-from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.master_api import Admission, Noted, Refusal
+from rosproxy.ros1.rewriting.master_calls import Admission, Noted, Refusal
 from rosproxy.settings import Settings
 
 HOST = "robot-host"
@@ -175,15 +175,15 @@ def exchange(
     refuse: Refuse = lambda uri: False,
 ) -> Exchange:
     """What the shell does with a call: admit, export, ask the master, note, import."""
-    request = master_api.read_request(body, asker)
+    request = master_calls.read_request(body, asker)
     admissions = [
-        _admit(addressing, master_api.registering_uri(call), asker, refuse)
+        _admit(addressing, master_calls.registering_uri(call), asker, refuse)
         for call in request.calls
     ]
     exported = master_api.export_request(request, admissions, addressing)
     if exported.body is None:
         return Exchange(b"", exported.local_reply())
-    answer = master_api.read_reply(exported, reply)
+    answer = master_calls.read_reply(exported, reply)
     facts = answer.facts(7.0)
     for fact in facts:
         note(addressing.registry, fact)

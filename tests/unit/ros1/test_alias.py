@@ -9,7 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.registry import stand_ins as book
-from rosproxy.ros1.rewriting import master_api, slave_api
+from rosproxy.ros1.rewriting import master_api, master_calls, slave_api
 from rosproxy.settings import Settings
 from tests.unit.builders import (
     DIALECTS,
@@ -49,9 +49,9 @@ def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = F
     body = [{"methodName": method, "params": params} for method, params in calls]
     method, params = calls[0]
     text = py_call("system.multicall", body) if multicall else py_call(method, *params)
-    request = master_api.read_request(text, make_asker("10.0.0.5"))
+    request = master_calls.read_request(text, make_asker("10.0.0.5"))
     exported = master_api.export_request(request, [None] * len(request.calls), make_addressing())
-    return list(master_api.read_reply(exported, reply).uris())
+    return list(master_calls.read_reply(exported, reply).uris())
 
 
 NAMED = [

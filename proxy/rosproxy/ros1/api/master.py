@@ -26,9 +26,9 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Admission, LocalReply, Noted, Refusal, Request
+from rosproxy.ros1.rewriting.master_calls import Admission, LocalReply, Noted, Refusal, Request
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
@@ -64,7 +64,7 @@ class MasterApi:
         if not judged and await _is_long_and_passes(call.body):
             return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
-            request = master_api.read_request(call.body, asker, self._context.master_call)
+            request = master_calls.read_request(call.body, asker, self._context.master_call)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
@@ -117,7 +117,7 @@ class MasterApi:
                 return exported.local_reply()
             limits = request.reply_limits
             answer = await self._context.upstream.post_to_master(exported.body, limits)
-            reply = master_api.read_reply(exported, answer)
+            reply = master_calls.read_reply(exported, answer)
             self._note(reply.facts(self._context.now()), request.asker.address)
             await self._stand_ins.listen_for(reply.uris(), request.asker)
             if self._context.policy.version != version:
@@ -225,7 +225,7 @@ class PublishedMaster:
         if await _is_long_and_passes(call.body):
             return await upstream.pass_to_master(call.body)
         asker = Asker(call.source, call.local.host, master=self._address)
-        request = master_api.read_request(call.body, asker, self._context.master_call)
+        request = master_calls.read_request(call.body, asker, self._context.master_call)
         if request.plain:
             return await upstream.pass_to_master(call.body)
         reply = await upstream.post_to_master(call.body)

@@ -17,7 +17,7 @@ from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry import hidden
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.master_api import Answered, Noted, second_name
+from rosproxy.ros1.rewriting.master_calls import Answered, Noted, second_name
 
 KINDS = {
     Kind.PUBLISHER: RuleKind.PUBLISH,

@@ -33,7 +33,7 @@ from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
 from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_api import Admission, Refusal, registering_uri
+from rosproxy.ros1.rewriting.master_calls import Admission, Refusal, registering_uri
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.master_api import (
+from rosproxy.ros1.rewriting.master_api import holder
+from rosproxy.ros1.rewriting.master_calls import (
     NOTHING_UNSEEN,
     Admission,
     Answered,
@@ -30,7 +31,6 @@ from rosproxy.ros1.rewriting.master_api import (
     Refusal,
     Request,
     Unseen,
-    holder,
     registration,
     second_name,
 )

@@ -16,7 +16,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.rewriting.master_api import Request, second_name
+from rosproxy.ros1.rewriting.master_calls import Request, second_name
 
 ASK_AGAIN = 5.0
 """Seconds in which nodes are not asked for the same service again."""

@@ -7,7 +7,7 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc.document import INVALID_PARAMS, XmlRpcError, dump_fault
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting import master_calls
 from rosproxy.ros1.rewriting.addressing import Addressing
 from tests.unit.builders import (
     DIALECTS,
@@ -194,7 +194,7 @@ def test_what_holds_no_call_goes_to_the_master_as_it_is(params: tuple[Any, ...])
     done = exchange(world(), NODE, body, reply)
     assert done.sent == body
     assert done.received == reply
-    assert master_api.read_request(body, NODE).plain
+    assert master_calls.read_request(body, NODE).plain
 
 
 def test_a_multicall_in_a_multicall_is_refused() -> None:
@@ -231,6 +231,6 @@ def test_empty_and_self_closing_results_keep_their_places() -> None:
 
 @pytest.mark.parametrize("calls", [[], [element("getParam", "/n", "/a")], [element("x"), 5]])
 def test_a_multicall_without_addresses_is_plain(calls: list[Any]) -> None:
-    request = master_api.read_request(py_call("system.multicall", calls), NODE)
+    request = master_calls.read_request(py_call("system.multicall", calls), NODE)
     assert request.plain
     assert request.method == MULTICALL

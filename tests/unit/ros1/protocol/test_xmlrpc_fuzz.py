@@ -13,7 +13,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import multicall
 from rosproxy.ros1.protocol.xmlrpc.document import Value, XmlRpcError
-from rosproxy.ros1.rewriting import master_api, slave_api
+from rosproxy.ros1.rewriting import master_api, master_calls, slave_api
 from tests.unit.builders import (
     add_node,
     cpp_call,
@@ -102,7 +102,7 @@ def swapped_booleans(value: Any) -> Any:
     return str(int(value)) if isinstance(value, bool) else value
 
 
-def exported(request: master_api.Request) -> master_api.Exported:
+def exported(request: master_calls.Request) -> master_calls.Exported:
     """The request for the master, of a node that is not admitted."""
     return master_api.export_request(request, [None] * len(request.calls), WORLD)
 
@@ -110,7 +110,7 @@ def exported(request: master_api.Request) -> master_api.Exported:
 @given(st.sampled_from(METHODS), st.lists(VALUES, max_size=4))
 def test_a_call_without_addresses_comes_out_byte_for_byte(method: str, values: list[Any]) -> None:
     body = py_call(method, *values)
-    request = master_api.read_request(body, ASKER)
+    request = master_calls.read_request(body, ASKER)
     assert exported(request).body == body
 
 
@@ -118,9 +118,9 @@ def test_a_call_without_addresses_comes_out_byte_for_byte(method: str, values: l
 def test_a_reply_without_addresses_comes_out_byte_for_byte(
     method: str, value: Any, status: int
 ) -> None:
-    request = master_api.read_request(py_call(method, "/node"), ASKER)
+    request = master_calls.read_request(py_call(method, "/node"), ASKER)
     for reply in (py_reply(value), py_reply([status, "said", value])):
-        answer = master_api.read_reply(exported(request), reply)
+        answer = master_calls.read_reply(exported(request), reply)
         assert master_api.import_reply(answer, WORLD) == reply
 
 
@@ -144,7 +144,7 @@ def test_the_slave_side_leaves_other_values_alone(
 
 def everything(body: bytes) -> None:
     """Do all that the shell does with a body from somebody else."""
-    request = master_api.read_request(body, ASKER)
+    request = master_calls.read_request(body, ASKER)
     exported(request)
     parsed = xmlrpc.parse_call(body)
     slave_api.rewrite_call(body, parsed, VIEW)
@@ -158,8 +158,8 @@ def everything_in_reply(reply: bytes) -> None:
     call = xmlrpc.parse_call(py_call("requestTopic", "/a", "/b", [["TCPROS"]]))
     slave_api.topic_port(call, reply)
     slave_api.rewrite_reply(call, reply, REACHED, VIEW)
-    request = master_api.read_request(py_call("system.multicall", []), ASKER)
-    master_api.import_reply(master_api.read_reply(exported(request), reply), WORLD)
+    request = master_calls.read_request(py_call("system.multicall", []), ASKER)
+    master_api.import_reply(master_calls.read_reply(exported(request), reply), WORLD)
     multicall.results_reply([multicall.result_value(reply)])
 
 

@@ -7,7 +7,7 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc.document import XmlRpcError, dump_fault
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.rewriting import master_api
+from rosproxy.ros1.rewriting import master_api, master_calls
 from rosproxy.ros1.rewriting.addressing import Addressing
 from tests.unit.builders import (
     DIALECTS,
@@ -196,19 +196,19 @@ OTHER_METHODS = ["getParam", "setParam", "getSystemState", "system.listMethods",
 
 @pytest.mark.parametrize("method", OTHER_METHODS)
 def test_other_methods_are_plain(method: str) -> None:
-    request = master_api.read_request(py_call(method, ID, OWN, OUT), NODE)
+    request = master_calls.read_request(py_call(method, ID, OWN, OUT), NODE)
     assert request.plain
     assert request.method == method
 
 
 @pytest.mark.parametrize("method", ["registerPublisher", "lookupNode", "getUri"])
 def test_methods_of_the_table_are_not_plain(method: str) -> None:
-    assert not master_api.read_request(py_call(method), NODE).plain
+    assert not master_calls.read_request(py_call(method), NODE).plain
 
 
 def test_the_caller_is_known_by_its_name() -> None:
-    assert master_api.read_request(py_call("getUri", ID), NODE).asker.caller_id == ID
-    assert master_api.read_request(py_call("getUri", 5), NODE).asker.caller_id == ""
+    assert master_calls.read_request(py_call("getUri", ID), NODE).asker.caller_id == ID
+    assert master_calls.read_request(py_call("getUri", 5), NODE).asker.caller_id == ""
 
 
 @pytest.mark.parametrize(
@@ -227,9 +227,9 @@ def test_the_caller_is_known_by_its_name() -> None:
     ],
 )
 def test_which_calls_need_a_lease(method: str, params: list[Any], uri: str | None) -> None:
-    request = master_api.read_request(py_call(method, *params), NODE)
-    assert master_api.registering_uri(request.calls[0]) == uri
-    assert master_api.registering_uri(None) is None
+    request = master_calls.read_request(py_call(method, *params), NODE)
+    assert master_calls.registering_uri(request.calls[0]) == uri
+    assert master_calls.registering_uri(None) is None
 
 
 NOTED = [
@@ -315,12 +315,12 @@ def test_a_node_that_makes_room_for_its_successor_ends_none_of_its_registrations
 def test_a_registration_with_a_uri_that_the_proxy_handed_out_ends_none() -> None:
     """Made in the name of somebody else it has no endpoint, and was taken for an ending."""
     addressing = world()
-    request = master_api.read_request(
+    request = master_calls.read_request(
         py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_RELAYED), NODE
     )
     exported = master_api.export_request(request, [None], addressing)
     assert exported.body == py_call("registerPublisher", "/far", "/far/held", TYPE, FAR_OUT)
-    assert master_api.read_reply(exported, py_reply([1, "", []])).facts(7.0) == []
+    assert master_calls.read_reply(exported, py_reply([1, "", []])).facts(7.0) == []
 
 
 def test_a_fault_is_passed_on_and_nothing_is_noted() -> None:
@@ -357,6 +357,6 @@ def test_the_published_master_renames_itself_only() -> None:
         (py_call("getUri", ID), [1, "", "http://inside:11311/"], [1, "", "http://robot-host:1/"]),
         (py_call("lookupNode", ID, ID), [1, "", OUT], [1, "", OUT]),
     ):
-        request = master_api.read_request(body, asker)
+        request = master_calls.read_request(body, asker)
         renamed = master_api.rename_master(request, py_reply(reply), "robot-host:1")
         assert renamed == py_reply(expected)

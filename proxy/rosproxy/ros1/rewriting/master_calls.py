@@ -1,0 +1,274 @@
+"""A request to the master and its reply, read: which calls they hold and what follows from them.
+
+A request is one call or a ``system.multicall`` of several; each follows its own row of
+``rosproxy.ros1.protocol.master_methods``. What a call registers, which URIs a reply holds and what
+the registry has to learn of both is told here; `rosproxy.ros1.rewriting.master_api` rewrites them.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, row
+from rosproxy.ros1.protocol.uris import placed
+from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
+from rosproxy.ros1.protocol.xmlrpc import passing
+from rosproxy.ros1.protocol.xmlrpc.document import Call, Value
+from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
+from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls, inner_items
+from rosproxy.ros1.registry.endpoint import Endpoint, Registration
+from rosproxy.ros1.rewriting import hidden_graph
+from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.rewriting.slave_api import ros_triple
+
+
+class Refusal(msgspec.Struct, frozen=True):
+    """A call that the proxy answers itself: with ROS status -1 and a reason."""
+
+    reason: str
+
+    def triple(self) -> list[object]:
+        """The ROS status triple (http://wiki.ros.org/ROS/Master_Slave_APIs)."""
+        return [-1, self.reason, 0]
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """A call that the proxy answers itself, in the master's place; ``fact`` follows from it.
+
+    ``value`` is the third element of the triple, whose status is ``code``.
+    """
+
+    code: int
+    text: str
+    value: object
+    fact: "Noted | None" = None
+
+    def triple(self) -> list[object]:
+        """The ROS status triple."""
+        return [self.code, self.text, self.value]
+
+
+class Unseen(msgspec.Struct, frozen=True):
+    """What a reply has to say otherwise than the master does.
+
+    ``publishers`` are those by topic that the master does not know of, as it would have them;
+    ``params`` the names that getParamNames leaves out; ``graph`` says whether replies that tell
+    the graph are completed.
+    """
+
+    publishers: Mapping[str, Sequence[str]] = {}
+    params: Collection[str] = ()
+    graph: bool = False
+
+
+NOTHING_UNSEEN = Unseen()
+_URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
+LocalReply = Refusal | Answered
+"""The reply to a call that the master does not get."""
+Admission = Endpoint | LocalReply | None
+"""What became of a call: the endpoint that it registers, or the proxy's own reply to it."""
+
+
+class Request(msgspec.Struct, frozen=True):
+    """A request of an inside node, read: one call, or the calls of a ``system.multicall``.
+
+    ``calls`` holds None for an element of a multicall that is no call; ``items`` are those
+    elements as they were sent.
+    """
+
+    body: bytes
+    calls: tuple[Call | None, ...]
+    multicall: bool
+    asker: Asker
+    items: Sequence[Value] = ()
+
+    @property
+    def method(self) -> str:
+        """The outer method's name."""
+        if self.multicall:
+            return MULTICALL
+        return self.calls[0].method if self.calls and self.calls[0] else ""
+
+    @property
+    def tells_graph(self) -> bool:
+        """Whether the reply tells of the graph of all nodes."""
+        return any(call and call.method in hidden_graph.METHODS for call in self.calls)
+
+    @property
+    def reply_limits(self) -> Limits:
+        """How large the reply may be."""
+        return OWN_REPLY if self.tells_graph or self.reply_passes else REPLY
+
+    @property
+    def reply_passes(self) -> bool:
+        """Whether nothing in the reply is rewritten."""
+        if self.multicall or self.tells_graph or self.method == "getParamNames":
+            return False
+        return row(self.method).reply is Reply.OTHER
+
+    @property
+    def plain(self) -> bool:
+        """Whether request and reply pass untouched."""
+        return all(call is None or row(call.method) == NO_ROW for call in self.calls)
+
+
+class Exported(msgspec.Struct, frozen=True):
+    """A request made ready for the master, and what became of each of its calls.
+
+    ``body`` is what the master gets; None if it gets nothing, since the proxy answers all calls.
+    An ``outcome`` is the endpoint whose registration the call makes or ends, None for another
+    call, or the proxy's own reply.
+    """
+
+    request: Request
+    outcomes: tuple[Admission, ...]
+    body: bytes | None
+
+    def local_reply(self) -> bytes:
+        """The whole reply to a request of which the master gets nothing."""
+        triples = [one.triple() for one in self.outcomes if isinstance(one, LocalReply)]
+        return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
+
+    def facts(self) -> "list[Noted]":
+        """What the registry has to learn from the calls that the proxy answers."""
+        local = (one for one in self.outcomes if isinstance(one, Answered))
+        return [one.fact for one in local if one.fact]
+
+
+class Result(msgspec.Struct, frozen=True):
+    """A call that the master has answered: its ROS status and value, and the endpoint it registers.
+
+    ``triple`` is None where the reply holds nothing that is rewritten, and was not read.
+    """
+
+    call: Call
+    status: int | None
+    triple: Value | None
+    endpoint: Endpoint | None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the master answered with ROS status 1."""
+        return self.status == 1
+
+    @property
+    def value(self) -> Value | None:
+        """The third element of the triple, if it was read."""
+        return self.triple.items[2] if self.triple else None
+
+
+class Noted(msgspec.Struct, frozen=True):
+    """A fact from an accepted call, for the registry.
+
+    ``endpoint`` is where the registration was made, None if it has ended.
+    """
+
+    registration: Registration
+    endpoint: Endpoint | None
+
+
+class MasterReply(msgspec.Struct, frozen=True):
+    """The master's reply, matched with its request.
+
+    ``results`` leaves out faults and malformed triples.
+    """
+
+    exported: Exported
+    body: bytes
+    value: Value | None
+    results: tuple[Result, ...]
+
+    def param_names(self) -> Iterator[str]:
+        """The names of parameters that it lists."""
+        for result in self.results:
+            if result.call.method == "getParamNames" and result.value:
+                yield from (item.text for item in result.value.items)
+
+    def facts(self, now: float) -> list[Noted]:
+        """What the registry has to learn from the calls that the master accepted.
+
+        The master also accepts what changes nothing: a node that makes room for another of its
+        name unregisters with its own URI, and the other's registrations stay.
+        """
+        found = []
+        for result in self.results:
+            held = registration(result.call, now, self.exported.request.asker.address)
+            if held and result.accepted and result.endpoint:
+                made = row(result.call.method).registers is not None
+                found.append(Noted(held, result.endpoint if made else None))
+        return found
+
+    def uris(self) -> Iterator[str]:
+        """The URIs that it hands to an inside node, as the master holds them."""
+        for result in self.results:
+            held = result.value
+            if held and result.accepted and row(result.call.method).reply in _URIS:
+                texts = (item.string() for item in (held.items or [held]))
+                yield from (text for text in texts if text)
+
+
+def read_request(body: bytes, asker: Asker, limits: Limits = OWN_REPLY) -> Request:
+    """Parse a request within limits. Raises XmlRpcError if it is none, or is beyond them."""
+    call = xmlrpc.parse_call(body, limits)
+    if call.method != MULTICALL:
+        return Request(body, (call,), False, replace(asker, caller_id=caller_id_of(call)))
+    calls = tuple(inner_calls(call))
+    caller_id = next((caller_id_of(inner) for inner in calls if inner), "")
+    return Request(body, calls, True, replace(asker, caller_id=caller_id), inner_items(call))
+
+
+def read_reply(exported: Exported, reply: bytes) -> MasterReply:
+    """Match a reply with its request. Raises XmlRpcError if it is no XML-RPC response.
+
+    Of one that holds no address only the status is read: the value of a parameter that a node
+    subscribes to may be anything.
+    """
+    if exported.request.reply_passes and (status := passing.status_of(reply)) is not None:
+        call, endpoint = exported.request.calls[0], exported.outcomes[0]
+        if call and not isinstance(endpoint, LocalReply):
+            return MasterReply(exported, reply, None, (Result(call, status, None, endpoint),))
+    value = xmlrpc.parse_reply(reply, exported.request.reply_limits)
+    return MasterReply(exported, reply, value, tuple(_results(exported, value)) if value else ())
+
+
+def registering_uri(call: Call | None) -> str | None:
+    """The slave URI that a call registers, if it is a complete registration."""
+    if call is None or row(call.method).registers is None:
+        return None
+    return call.string(row(call.method).caller_api)
+
+
+def registration(call: Call, now: float, source: str) -> Registration | None:
+    """What a call from an address registers or unregisters; None for any other call."""
+    found, caller_id = row(call.method), caller_id_of(call)
+    kind, name = found.registers or found.unregisters, call.string(found.name)
+    if kind is None or not name:
+        return None
+    name, type_ = resolve_name(name, caller_id), call.string(found.type) or "*"
+    service_api = call.string(found.service_api)
+    if service_api is not None:
+        service_api = placed(service_api, source)
+    return Registration(kind, name, caller_id, type_, service_api, now)
+
+
+def second_name(call: Call) -> str:
+    """The topic, service or node that a call's second parameter names."""
+    return resolve_name(call.string(1) or "", caller_id_of(call))
+
+
+def caller_id_of(call: Call) -> str:
+    """The name of the node that makes a call; "" if it gives none."""
+    return call.string(0) or ""
+
+
+def _results(exported: Exported, value: Value) -> Iterator[Result]:
+    """The calls that went to the master with their ROS triples; faults are left out."""
+    triples: Sequence[Value | None] = [value]
+    if exported.request.multicall:
+        triples = [item.items[0] if item.items else None for item in value.items]
+    pairs = zip(exported.request.calls, exported.outcomes, strict=True)
+    sent = [(call, outcome) for call, outcome in pairs if not isinstance(outcome, LocalReply)]
+    for (call, endpoint), triple in zip(sent, triples, strict=False):
+        if call and triple and ros_triple(triple):
+            yield Result(call, triple.items[0].integer(), triple, endpoint)
