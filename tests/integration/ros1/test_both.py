@@ -111,7 +111,8 @@ async def test_what_comes_back_is_what_the_master_has(
 ) -> None:
     """As `rosnode cleanup` unregisters somebody else's node."""
     given, api = await look_up(proxy, robot), await look_up_service(proxy)
-    await proxy.restart()  # nothing is remembered
+    await proxy.restart()  # nothing is remembered; the port is as before
+    assert await look_up(proxy, robot) == given
     ended = await rpc(proxy.master, "unregisterPublisher", "/robot", "/chatter", given, source=NODE)
     assert ended[2] == 1
     assert await look_up_service(proxy) == api

@@ -4,10 +4,8 @@ A *stand-in* is a port on one of the proxy's inside addresses. What arrives ther
 one node outside, or to the server of one service. There are two cases of it:
 
   * ``--direction both``: inside has no way outwards but the proxy. Every URI of outside gets a
-    stand-in, at a port of the proxy's choice, and inside is told that port instead. A slave URI
-    carries the original in its path, ``http://PROXY:PORT/outside/http%3A%2F%2Frobot%3A41234%2F``,
-    so that whatever comes back can be undone without memory. A service URI can carry no path
-    (`rosproxy.ros1.protocol.uris`): it is known by its port.
+    stand-in, at a port of the proxy's choice, and inside is told that port instead,
+    ``http://PROXY:PORT/``: by it what comes back from inside is undone.
   * The master's host name leads to the proxy (a network alias of Docker, so that ``ROS_MASTER_URI``
     need not change). The nodes on the master's host give that very name in their URIs, which lead
     to the proxy, too. So the same port numbers stand in for theirs, and the URIs stay as they are.
@@ -24,14 +22,12 @@ kernel forwards (`rosproxy.forwarding.kernel`).
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from urllib.parse import quote, unquote
 
 from rosproxy.net.addresses import HostPort, is_address, is_loopback
 from rosproxy.ros1.protocol.uris import (
     LONGEST_URI,
     parse_service_uri,
     parse_slave_uri,
-    path_of,
     service_uri,
     slave_uri,
 )
@@ -47,7 +43,8 @@ TRIES = 16
 """How many ports are tried for a URI."""
 MOST_TOPICS = 512
 """How many topics of a node are remembered with their port."""
-_PREFIX = "/outside/"
+MOST_FORMER = 2048
+"""How many ports that stand in no more are remembered with what they stood for."""
 
 
 @dataclass(slots=True, eq=False)
@@ -129,7 +126,7 @@ class StandIn:
             return self.uri
         if parse_service_uri(self.uri):
             return service_uri(self.local)
-        return slave_uri(self.local, _PREFIX + quote(self.uri, safe=""))
+        return slave_uri(self.local)
 
 
 class StandIns:
@@ -145,6 +142,8 @@ class StandIns:
         self.by_local: dict[HostPort, StandIn] = {}
         """The one that was of no use for longest first."""
         self._by_uri: dict[tuple[str, str], StandIn] = {}
+        self._former: dict[HostPort, str] = {}
+        """URIs by where something stood in for them, longest ago first."""
         self.by_port: dict[int, StandIn] = {}
         """Those with a fast port, by that."""
 
@@ -204,11 +203,15 @@ class StandIns:
         """Take in one that listens now."""
         self.by_local[stand_in.local] = stand_in
         self._by_uri[stand_in.local.host, stand_in.uri] = stand_in
+        self._former.pop(stand_in.local, None)
 
     def remove(self, stand_in: StandIn) -> None:
         """Forget one that listens no more."""
         del self.by_local[stand_in.local]
         del self._by_uri[stand_in.local.host, stand_in.uri]
+        self._former[stand_in.local] = stand_in.uri
+        if len(self._former) > MOST_FORMER:
+            del self._former[next(iter(self._former))]
         self.note_fast_port(stand_in, None)
 
     def note_fast_port(self, stand_in: StandIn, port: int | None) -> None:
@@ -244,10 +247,15 @@ class StandIns:
         """The URI of outside that inside nodes were once told this one for; None if it is none."""
         if not self.both or len(uri) > LONGEST_URI:
             return None
-        if where := parse_service_uri(uri):
-            found = self.at(where)
-            return found.uri if found else None
-        return _original(uri)
+        service = parse_service_uri(uri)
+        where = service or parse_slave_uri(uri)
+        if where is None:
+            return None
+        stand_in = self.at(where)
+        original = stand_in.uri if stand_in else self._former.get(where)
+        if original is None or bool(parse_service_uri(original)) is not bool(service):
+            return None
+        return original
 
 
 def aliased_host(master_uri: str) -> str | None:
@@ -273,12 +281,3 @@ def obstacle(port: int, settings: Settings) -> str | None:
 def _number(text: str) -> int:
     """A number that follows from a text, and looks like any other."""
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "big")
-
-
-def _original(uri: str) -> str | None:
-    """What the path of a slave URI carries; None if it carries no URI."""
-    if parse_slave_uri(uri) is None:
-        return None
-    path = path_of(uri)
-    original = unquote(path.removeprefix(_PREFIX)) if path.startswith(_PREFIX) else ""
-    return original if parse_slave_uri(original) else None
