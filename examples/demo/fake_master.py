@@ -193,6 +193,7 @@ class FakeMaster:
             "setParam": self._set_param,
             "getParam": self._get_param,
             "deleteParam": self._delete_param,
+            "hasParam": lambda _, key: (1, key, key in self.params),
             "getParamNames": lambda _: (1, "parameter names", sorted(self.params)),
         }
 
@@ -252,6 +253,10 @@ class FakeMaster:
         return 1, f"parameter {key} set", 0
 
     def _get_param(self, _caller: str, key: str) -> Triple:
+        within = f"{key.rstrip('/')}/"
+        names = {n.removeprefix(within): n for n in self.params if n.startswith(within)}
+        if names:
+            return 1, key, {name: self.params[full] for name, full in names.items()}
         return (1, key, self.params[key]) if key in self.params else (-1, "not set", 0)
 
     def _delete_param(self, _caller: str, key: str) -> Triple:

@@ -4,12 +4,13 @@ That a node was unregistered at once is shown by the controller's log: it told t
 that still to do. The proxy alone does it some 30 seconds later, and then it had not.
 """
 
+import json
 import re
 import time
 
 import pytest
 
-from tests.docker.controller import Controller, proxies, the_proxy
+from tests.docker.controller import Controller, Proxy, proxies, the_proxy
 from tests.docker.engine import docker, pause, wait_until
 from tests.docker.inside import Container, Inside
 from tests.docker.nodes import LIBRARIES
@@ -157,7 +158,7 @@ def test_container_of_two_networks(controller: Controller, net: Inside, named: R
         proxy = the_proxy()
         assert proxy.networks == {one, other}
 
-        docker("network", "disconnect", proxy_free_network(node, named, one, other), node.name)
+        docker("network", "disconnect", proxy_free_network(node, proxy, one, other), node.name)
 
         wait_until(lambda: len(proxy.networks) == 1, 60, lambda: str(proxy.networks))
         ear.wait_for("inside", since=time.time())
@@ -165,9 +166,11 @@ def test_container_of_two_networks(controller: Controller, net: Inside, named: R
         named.end("ear")
 
 
-def proxy_free_network(node: Container, robot: Robot, *networks: str) -> str:
+def proxy_free_network(node: Container, proxy: Proxy, *networks: str) -> str:
     """The network by which the proxy does not reach the node."""
-    address = robot.uri(node.node).rstrip("/").rsplit("/", 1)[1]
+    status = json.loads(docker("exec", proxy.name, "rosproxy", "status", "--json"))
+    (lease,) = (lease for lease in status["nodes"] if f"/{node.node}" in lease["nodes"])
+    address = lease["address"].rpartition(":")[0]
     return next(network for network in networks if node.address(network) != address)
 
 

@@ -388,11 +388,8 @@ def test_a_container_that_has_moved(
         for peer, mark in zip(peers, marks, strict=True):
             peer.wait_for_count("^got ", 3, since=mark)
         measure("moved: heard again", time.time() - moved)
-        after = lab.node_uri(name)
         assert before is not None
-        assert after is not None
-        assert before.split("/")[2] == after.split("/")[2], "another port"
-        assert after.endswith(f"/{place.address}/")
+        assert lab.node_uri(name) == before
         more.touch()
         for role in ("out", "c2"):
             lab.node(library, role, "sub", topic=f"/{name}/b").wait_for_count("^got ", 3)
@@ -400,7 +397,7 @@ def test_a_container_that_has_moved(
             word = lab.unique("word")
             lab.node(library, role, "pub", topic=f"/{name}/c", word=word)
             receiver.wait_for_count(f"^got {word} ", 3)
-        assert lab.node_uri(name) == after
+        assert lab.node_uri(name) == before
         assert lab.tell("/containers", moved={old: place.address})["moved"] == 0
         assert node.stop() == 0
         lab.wait_unregistered(name, timeout=2)  # by itself, before --cleanup-after 3

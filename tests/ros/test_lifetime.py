@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -96,8 +97,8 @@ def test_nodes_ended_by_sigkill_are_cleaned_up(lab: Lab, library: str, measure: 
 def test_a_node_answers_over_one_connection_until_it_ends(lab: Lab, library: str) -> None:
     """As it is asked by the proxy while it is well."""
     node, name = start(lab, library, "pub")
-    port = (lab.node_uri(name) or "").split("/")[3].rpartition(":")[2]
-    where = HostPort(lab.place("c1").address, int(port))
+    own = lab.ask_master("lookupNode", f"/{name}", role="c1")
+    where = HostPort(lab.place("c1").address, urlsplit(own).port)
     with lab.place("host").entered():
         asyncio.run(asked_until_it_ends(where, node))
 

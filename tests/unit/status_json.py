@@ -51,7 +51,7 @@ def make_node(name: str = "/talker", port: int = 45000, **changes: Any) -> dict[
         "nodes": [name],
         "uri": f"http://{address}/",
         "address": address,
-        "advertised_uri": f"http://{HOST}:{port}/{address}/",
+        "advertised_uri": f"http://{HOST}:{port}/",
         "port": port,
         "state": "ok",
         "publishes": ["/chatter"],

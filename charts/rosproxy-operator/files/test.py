@@ -1,6 +1,7 @@
 """Outside: a node that is not proxied sends a message to one that is, and waits for the answer."""
 
 import os
+import re
 import sys
 import time
 import uuid
@@ -39,9 +40,10 @@ def wait_for(found, what, advice):
 
 
 def proxied_address():
-    """Where outside finds the echo node; a proxy adds the node's own address as a path."""
+    """Where outside finds the echo node; each proxy notes its ports in a parameter."""
     uri = urlsplit(master.lookupNode(ECHO))
-    return uri.netloc if uri.path.strip("/") else None
+    noted = "\n".join(map(str, master.getParam("/rosproxy").values()))
+    return uri.netloc if re.search(r"^%s /" % uri.port, noted, re.MULTILINE) else None
 
 
 def hear_answer():

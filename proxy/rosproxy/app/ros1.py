@@ -34,6 +34,7 @@ from rosproxy.net.sockets import Acceptor
 from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
 from rosproxy.ros1.servers.judge import PolicyJudge
@@ -42,6 +43,7 @@ from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.standins.ports import TIDY_INTERVAL, StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
+from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, Enforced, PolicyEnforcer
@@ -79,26 +81,23 @@ class Ros1:
         self._callers = Callers(context)
         self.stand_ins = StandInPorts(context, self._callers, self.tcpros, judge, plane)
         self._matchmaker = matchmaker = Matchmaker(context, self.stand_ins)
-        self.registrar = registrar = Registrar(context, matchmaker)
+        self._memory = LeaseMemory(context)
+        self.registrar = registrar = Registrar(context, matchmaker, self._memory)
         self._resubscriber = Resubscriber(
             context, registrar, matchmaker, self.tcpros, plane, self.stand_ins
         )
-        self.leases = leases = Leases(
-            context.registry,
-            settings.bind,
-            plane.syncer,
-            self._resubscriber.watch,
-            context.tasks,
-            context.problems,
-            context.gate,
+        self.leases = leases = self._make_leases()
+        self._recovery = Recovery(
+            context, leases, registrar, self._resubscriber, plane, judge, self._memory
         )
-        self._recovery = Recovery(context, leases, registrar, self._resubscriber, plane, judge)
         self._enforcer = PolicyEnforcer(
             context, leases, registrar, self._recovery, self.tcpros, plane, judge, self.stand_ins
         )
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
-        self.master_monitor = monitor = MasterMonitor(context, self._recovery, registrar)
+        self.master_monitor = monitor = MasterMonitor(
+            context, self._recovery, registrar, self._memory
+        )
         self._state = ProxyState(context, monitor, self.tcpros, self.stand_ins, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
@@ -106,8 +105,30 @@ class Ros1:
         )
         self._servers = [slave.server, self.stand_ins.server]
         self._acceptors: list[Acceptor] = []
-        self._containers = ContainerEvents(
-            context, leases, registrar, self._adopter, self._recovery, self.tcpros, plane
+        self._containers = self._make_containers()
+
+    def _make_leases(self) -> Leases[Endpoint]:
+        context = self.context
+        return Leases(
+            context.registry,
+            self.settings.bind,
+            self.plane.syncer,
+            self._resubscriber.watch,
+            context.tasks,
+            context.problems,
+            context.gate,
+        )
+
+    def _make_containers(self) -> ContainerEvents:
+        return ContainerEvents(
+            self.context,
+            self.leases,
+            self.registrar,
+            self._adopter,
+            self._recovery,
+            self._resubscriber,
+            self.tcpros,
+            self.plane,
         )
 
     def _make_master_api(self) -> MasterApi:
@@ -121,6 +142,7 @@ class Ros1:
             self._matchmaker,
             self._enforcer,
             ServiceFinder(self.context),
+            self._memory,
         )
 
     async def start(self) -> None:
@@ -210,7 +232,9 @@ class Ros1:
     async def _retire(self, body: Any) -> dict[str, Any]:
         """``POST /retire``: how many nodes were unregistered."""
         read_body(body, Nothing)
-        return {"unregistered": await self._containers.retire()}
+        count = await self._containers.retire()
+        await self._memory.write()
+        return {"unregistered": count}
 
     async def _set_master_address(self, body: Any) -> dict[str, Any]:
         """``POST /master-address``: where the master is looked for from now on."""

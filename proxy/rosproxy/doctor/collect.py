@@ -42,6 +42,7 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import CALLER_ID, MasterClient, MasterError, Unreachable
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
+from rosproxy.ros1.registry.memory import NAMESPACE, lease_at
 from rosproxy.telemetry.metrics import Metrics
 
 PARALLEL = 32
@@ -219,7 +220,8 @@ class _Collector:
         graph = system_state(await self._master.call_master("getSystemState"))
         names = sorted(graph.names())
         uris = await self._master.look_up("lookupNode", names)
-        nodes = {name: NodeFacts(name, uris.get(name, "")) for name in names}
+        _, leases = await _tried(self._master.call_master("getParam", NAMESPACE))
+        nodes = {name: _node_facts(name, uris.get(name, ""), leases) for name in names}
         facts = replace(
             facts,
             graph=graph,
@@ -263,8 +265,7 @@ class _Collector:
         if where is None or facts.lease(where):
             return node
         if facts.ours(where):
-            inside = parse_inside_path(node.uri)
-            places = [where, *([inside.slave] if inside else [])]
+            places = [where, *([node.inside] if node.inside else [])]
             async with self._limit:
                 tries = [await self._ask_pid(place) for place in places]
             found = next((one for one in tries if one.reach is Reach.ANSWERED), None)
@@ -368,6 +369,14 @@ async def _exchange(where: HostPort, header: Mapping[str, str]) -> dict[str, str
         return decode_header(await reader.readexactly(length))
     finally:
         writer.close()
+
+
+def _node_facts(name: str, uri: str, leases: object) -> NodeFacts:
+    """A node as the master tells of it; ``leases`` is what all proxies remember there."""
+    where = parse_slave_uri(uri)
+    lease = lease_at(leases, where) if where else None
+    inside = parse_inside_path(uri) or (lease.node if lease else None)
+    return NodeFacts(name, uri, inside.slave if inside else None)
 
 
 async def _tried(question: Awaitable[Any]) -> tuple[Attempt, Any]:

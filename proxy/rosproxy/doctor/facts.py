@@ -136,12 +136,14 @@ def _items(value: Any) -> list[Any]:
 class NodeFacts(msgspec.Struct, frozen=True):
     """A node that the master knows.
 
-    ``uri`` is what the master says, empty if it says nothing. A ``report`` is only there for nodes
-    that were asked for and could be asked.
+    ``uri`` is what the master says, empty if it says nothing. ``inside`` is where the node is, if
+    it registered through a rosproxy, as that one has the master remember it. A ``report`` is only
+    there for nodes that were asked for and could be asked.
     """
 
     name: str
     uri: str = ""
+    inside: HostPort | None = None
     addresses: tuple[str, ...] = ()
     attempt: Attempt = Attempt()
     report: SlaveReport | None = None

@@ -298,16 +298,20 @@ async def container(make_proxy: MakeProxy, make_node: MakeNode) -> Container:
     return moved
 
 
-async def test_a_container_that_has_moved(container: Container, master: FakeMaster) -> None:
+async def test_a_container_that_has_moved(
+    container: Container, master: FakeMaster, make_node: MakeNode
+) -> None:
     proxy, node = container.proxy, container.node
-    lease, before = proxy.lease(node), proxy.uri(node)
+    robot = await make_node("/robot", OUTSIDE)
+    await robot.subscribe(master.uri)
+    lease, uri = proxy.lease(node), proxy.uri(node)
     await container.move(OTHER_NODE)
     assert await news(proxy, moved={NODE: OTHER_NODE}) == (0, 1, 0)
-    after = proxy.uri(node)
-    assert proxy.lease(node) == lease
-    assert after != before
+    assert (proxy.lease(node), proxy.uri(node)) == (lease, uri)
     for kind, name in [("publishers", "/chatter"), ("subscribers", "/back"), ("params", "/rate")]:
-        assert master.holds(kind, name) == [after]
+        assert master.holds(kind, name) == [uri]
+    # rospy and roscpp connect to a URI again only if it was gone meanwhile.
+    await until(lambda: robot.updates()[-2:] == [[], [uri]], "outside is told to connect anew")
     assert master.holds("services", "/add") == [f"rosrpc://{lease[0]}:{lease[1]}"]
     assert (await greet(lease, topic_header()))["callerid"] == "/talker"
     assert (await greet(lease, service_header()))["callerid"] == "/talker"

@@ -88,10 +88,9 @@ async def test_a_sound_system(
 
 async def test_it_leaves_nothing_behind(proxy: Proxy, node: FakeNode, master: FakeMaster) -> None:
     await node.publish(proxy.master)
-    before = deepcopy(master.tables["publishers"]), dict(master.nodes)
+    before = deepcopy((master.tables["publishers"], master.nodes, master.params))
     await examine(proxy, "/chatter")
-    assert (deepcopy(master.tables["publishers"]), dict(master.nodes)) == before
-    assert not master.params
+    assert (master.tables["publishers"], master.nodes, master.params) == before
 
 
 async def test_a_node_that_has_ended(make_proxy: MakeProxy, node: FakeNode) -> None:

@@ -58,7 +58,7 @@ async def test_each_sees_itself_literally_and_the_other_through_the_proxy(proxy,
     await second.publish(proxy.master)
     seen = (await second.subscribe(proxy.master))[2]
     port = proxy.endpoint(first).port
-    relayed = f"http://{PROXY}:{port}/localhost:{first.slave.address[1]}/{NODE}/"
+    relayed = f"http://{PROXY}:{port}/"
     assert seen == [relayed, second.uri]
     asked = await rpc(relayed, "requestTopic", "/second", "/chatter", [["TCPROS"]], source=NODE)
     assert asked[2] == ["TCPROS", PROXY, port]
@@ -140,7 +140,7 @@ async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_p
     proxy = await make_proxy(ports=1, linger=0.0)
     former, next_ = await make_node("/former"), await make_node("/next", OTHER_NODE)
     await former.publish(proxy.master)
-    old, lease = proxy.uri(former), proxy.lease(former)
+    lease, former_path = proxy.lease(former), f"/{NODE}:{former.slave.address[1]}/"
     async with connect(lease) as kept:
         await kept.send(post(xml("getPid", "/outside")))
         await kept.reply()
@@ -149,10 +149,12 @@ async def test_a_call_for_a_former_node_of_a_port_does_not_reach_the_next(make_p
         assert await kept.end() in ("closed", "reset")
     await next_.publish(proxy.master)
     assert proxy.lease(next_) == lease
-    path = old.partition(str(lease[1]))[2]
-    assert await knock(lease, post(xml("shutdown", "/master", "moved"), path=path)) == "reset"
+    reason = "[/former] Reason: new node registered with same name"
+    assert await rpc(lease, "shutdown", "/master", reason) == [1, "", 0]
+    # Former versions of the proxy handed out URIs with a path.
+    shutdown = post(xml("shutdown", "/master", "moved"), path=former_path)
+    assert await knock(lease, shutdown) == "reset"
     assert "shutdown" not in dict(next_.calls)
-    # roscpp gives no path: then the port alone counts.
     assert (await rpc(lease, "getPid", "/outside"))[2] == next_.pid
 
 
@@ -162,7 +164,7 @@ async def test_outside_nodes_are_never_touched(proxy, master, node, make_node):
     far = stranger.uri
     await rpc(master.uri, "registerPublisher", "/far", "/chatter", "std_msgs/String", far)
     await rpc(master.uri, "registerService", "/far", "/far/add", f"rosrpc://{OUTSIDE}:5", far)
-    near_miss = f"http://{HOST}:{proxy.settings.ports.listen.first}/elsewhere/"
+    near_miss = f"http://{HOST}:{proxy.settings.ports.listen.last}/"  # nobody's
     await rpc(master.uri, "registerPublisher", "/odd", "/chatter", "std_msgs/String", near_miss)
     assert (await node.subscribe(proxy.master))[2] == [far, near_miss]
     assert (await node.call(proxy.master, "lookupNode", "/far"))[2] == far

@@ -174,11 +174,43 @@ async def test_a_topic_that_has_no_port_is_refused(proxy, node):
     assert "has no topic /none" in (await greeted(proxy, node, topic_header("/none")))["error"]
 
 
+async def test_ports_of_services_survive_a_restart(proxy, master, node):
+    await on_own_ports(node, "/rosout", "/out", "/add", "/sub")
+    await populate(proxy, node)
+    await node.serve(proxy.master, "/sub")
+    uri = master.nodes[node.name]
+    for _ in range(2):
+        await proxy.restart()
+        await until(partial(answers, uri), "it is served")
+        for service in ("/sub", "/add"):
+            found = await greeted(proxy, node, service_header(service))
+            assert found["callerid"] == node.name
+
+
+async def test_a_node_that_only_serves_is_found_by_its_service(proxy, master, node):
+    lack(node, "goroslib", *CALLS)
+    node.published.clear()
+    await on_own_ports(node, "/add")
+    await node.serve(proxy.master)
+    uri = master.nodes[node.name]
+    await proxy.restart()
+    await until(partial(answers, uri), "it is served")
+    assert (await greeted(proxy, node, service_header("/add")))["callerid"] == node.name
+
+
 async def test_a_service_of_unknown_port_is_refused_and_leads_nowhere_else(proxy, master, node):
+    """Somebody has deleted what the proxy has the master remember."""
     await on_own_ports(node, "/rosout", "/out", "/add")
     await populate(proxy, node)
     uri = master.nodes[node.name]
-    await proxy.restart()
+    (name,) = master.params
+
+    async def lose() -> None:
+        master.params[name] = "\n".join(
+            " ".join(line.split(" ")[:2]) for line in master.params[name].splitlines()
+        )
+
+    await proxy.restart(lose)
     await until(partial(answers, uri), "it is served")
     with pytest.raises((EOFError, ConnectionResetError)):
         await greeted(proxy, node, service_header("/add"))

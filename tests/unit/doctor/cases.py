@@ -15,10 +15,12 @@ from rosproxy.doctor.facts import (
     SlaveReport,
     SystemState,
 )
+from rosproxy.net.addresses import HostPort
 from tests.unit.status_json import HOST, make_node, make_status
 
 ANSWERED = Attempt(Reach.ANSWERED)
-INSIDE_URI = f"http://{HOST}:45000/10.0.0.5:40001/"
+INSIDE_URI = f"http://{HOST}:45000/"
+INSIDE = HostPort("10.0.0.5", 40001)
 OUTSIDE_URI = "http://192.168.0.9:35001/"
 PROBE = {"port": 45001, "advertised": f"{HOST}:45001", "from_proxy": "ok", "from_master": "ok"}
 
@@ -82,7 +84,8 @@ def talker(**changes: Any) -> NodeFacts:
     report = SlaveReport(
         {"/chatter": "std_msgs/String"}, {}, frozenset({("o", "/chatter", "/listener")})
     )
-    return NodeFacts(**{"name": "/talker", "uri": INSIDE_URI, "report": report, **changes})
+    known = {"name": "/talker", "uri": INSIDE_URI, "inside": INSIDE, "report": report}
+    return NodeFacts(**{**known, **changes})
 
 
 def listener(**changes: Any) -> NodeFacts:

@@ -12,7 +12,7 @@ from rosproxy.page.measures import STALLED, Measures
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 
 KEY = ("/chatter", "/talker", "/listener")
-URI = "http://robot-host:45000/10.0.0.5:40001/"
+URI = "http://robot-host:45000/"
 
 
 def facts(sent: int | None, got: int | None, at: float) -> DoctorFacts:

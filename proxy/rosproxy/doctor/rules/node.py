@@ -11,7 +11,7 @@ from rosproxy.admin.status_document import EndpointStatus
 from rosproxy.doctor.facts import DoctorFacts, NodeFacts, Reach
 from rosproxy.doctor.rules.proxy import local_master
 from rosproxy.net.addresses import HostPort, is_inside, is_loopback, parse_host_port
-from rosproxy.ros1.protocol.uris import parse_inside_path, parse_service_uri, parse_slave_uri
+from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri
 
 INSIDE, OUTSIDE, STALE = "inside node", "node", "stale registration"
 TWO_PROXIES = "two proxies"
@@ -122,7 +122,7 @@ def _leased(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     elif lease is None:
         text = f"registered as {node.uri}, a port that no node holds any more"
         yield error(STALE, node.name, text, CLEANUP)
-    elif lease.advertised_uri != node.uri and node.name not in lease.nodes:
+    elif node.name not in lease.nodes:
         holder = ", ".join(lease.nodes) or lease.uri
         text = f"registered as {node.uri}, a port that {holder} holds by now"
         yield error(STALE, node.name, text, f"restart it, or {CLEANUP}")
@@ -139,7 +139,7 @@ def _elsewhere(facts: DoctorFacts, node: NodeFacts) -> Iterator[DoctorFinding]:
     if where is None:
         text = f"the master gives no usable address for it: {node.uri!r}"
         yield error(OUTSIDE, node.name, text, "restart it")
-    elif node.attempt.failed and parse_inside_path(node.uri):
+    elif node.attempt.failed and node.inside:
         text = f"registered through a rosproxy as {node.uri}: {reach.value}"
         yield error(OUTSIDE, node.name, text, _fix_proxied(facts, node, where))
     elif is_loopback(where.host) and not (local_master(facts) and not node.attempt.failed):

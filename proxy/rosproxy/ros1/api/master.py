@@ -35,6 +35,7 @@ from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
+from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -54,6 +55,7 @@ class MasterApi:
     _matchmaker: Matchmaker
     _enforcer: PolicyEnforcer
     _services: ServiceFinder
+    _memory: LeaseMemory
 
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
@@ -115,10 +117,12 @@ class MasterApi:
             self._note(exported.facts(), request.asker.address)
             if exported.body is None:
                 return exported.local_reply()
+            await self._memory.write()
             limits = request.reply_limits
             answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_calls.read_reply(exported, answer)
             self._note(reply.facts(self._context.now()), request.asker.address)
+            await self._memory.write()
             await self._stand_ins.listen_for(reply.uris(), request.asker)
             if self._context.policy.version != version:
                 self._enforcer.look_again()

@@ -1,11 +1,10 @@
 """The addresses in ROS URIs: slave URIs (``http://host:port/``) and service URIs (``rosrpc://``).
 
-An *advertised* URI carries the inside address in its path, ``http://HOST:PORT/10.0.0.5:40001/``.
-Where the node calls itself by a name, a second segment holds the address that it was found at:
-``http://HOST:PORT/c1:40001/10.0.0.5/``. Where its own URI has a path, as one has that another proxy
-behind this one advertises, a third segment holds that. roscpp drops
-the path and rospy sends it back; the port alone always suffices. The path is what lets a
-restarted proxy rebuild its table from what the master holds.
+An *advertised* URI is ``http://HOST:PORT/`` with a port of the range, which says all that others
+need. Where the node is is remembered elsewhere (`rosproxy.ros1.registry.memory`), in the form of a
+path, in which former versions advertised it: ``/10.0.0.5:40001/``. Where the node calls itself by a
+name, a second segment holds the address that it was found at: ``/c1:40001/10.0.0.5/``. Where its
+own URI has a path, a third one holds that.
 """
 
 import re
@@ -26,7 +25,7 @@ _UNQUOTED = re.compile(r"[A-Za-z0-9_.:\[\]-]*")
 
 
 class InsidePath(msgspec.Struct, frozen=True):
-    """What an advertised URI says: the node's own host, port and path, and its address."""
+    """Where a node is: its own host, port and path, and its address if that is another."""
 
     node: HostPort
     address: str | None = None
@@ -75,12 +74,12 @@ def path_of(uri: str) -> str:
         return "/"
 
 
-def inside_path(uri: str, node: HostPort, address: str) -> str:
-    """The path that carries a node's own URI and its address; see the module's text."""
-    segments, path = [_quoted(str(node))], path_of(uri)
-    carried = path if len(path) <= LONGEST_PATH else "/"
-    if node.host != address or carried != "/":
-        segments.append(_quoted(address))
+def inside_path(inside: InsidePath) -> str:
+    """What is remembered of where a node is, in the form of a path; see the module's text."""
+    carried = inside.path if len(inside.path) <= LONGEST_PATH else "/"
+    segments = [_quoted(str(inside.node))]
+    if inside.address is not None or carried != "/":
+        segments.append(_quoted(inside.slave.host))
     if carried != "/":
         segments.append(quote(carried, safe=""))
     return f"/{'/'.join(segments)}/"
@@ -88,7 +87,7 @@ def inside_path(uri: str, node: HostPort, address: str) -> str:
 
 @cached
 def parse_inside_path(uri: str) -> InsidePath | None:
-    """The inside address in the path of an advertised URI, or None if it carries none.
+    """Where the node of an advertised URI with a path is; None if the path does not tell.
 
     An address segment must be an IP address; a name there is refused.
     """

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import parse_slave_uri
+from rosproxy.ros1.protocol.uris import InsidePath, parse_slave_uri, path_of
 from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
 
@@ -17,6 +17,11 @@ MOST_CHARACTERS = 2_000_000
 a large system are 1,000,000."""
 LONGEST_REGISTRATION = 8192
 """Characters of one registration: three names and a URI, the topic's name with its namespace."""
+MOST_SERVICE_PORTS = 16
+"""TCPROS ports of services that are remembered for one endpoint. rospy and roscpp have one for all
+topics and services; of a node with more the rest is asked for nothing after a restart."""
+MOST_FORMER_CALLERS = 64
+"""Names that were registered at an endpoint and are no longer."""
 MOST_NAMED = 3
 """Node names of one endpoint that a message gives: one as a rule, several where a port was used
 again by another node."""
@@ -101,6 +106,10 @@ class Endpoint:
     callers: dict[str, int] = field(default_factory=dict)
     characters: int = 0
     topic_ports: dict[str, int] = field(default_factory=dict)
+    service_ports: dict[int, None] = field(default_factory=dict)
+    """Those at which it has registered services, oldest first."""
+    former_callers: dict[str, None] = field(default_factory=dict)
+    """Names that were registered here and are no longer, oldest first; `Registry` keeps them."""
     connections: int = 0
     pending: int = 0
     idle_since: float | None = None
@@ -160,6 +169,13 @@ class Endpoint:
         """Note a URI by which the master may have known the node."""
         self.former_uris.add(uri)
 
+    def note_former_caller(self, caller_id: str) -> None:
+        """Note that a name is no longer registered here."""
+        self.former_callers.pop(caller_id, None)
+        self.former_callers[caller_id] = None
+        while len(self.former_callers) > MOST_FORMER_CALLERS:
+            del self.former_callers[next(iter(self.former_callers))]
+
     def note_moved(self, before: str, now: str) -> None:
         """Note that the advertised URI has changed, and that the master has the former one yet."""
         self.former_uris.add(before)
@@ -188,6 +204,15 @@ class Endpoint:
             self.topic_ports[topic] = port
         else:
             self.topic_ports.pop(topic, None)
+
+    def note_service_port(self, port: int) -> bool:
+        """Note a TCPROS port at which the node has a service; whether that is news."""
+        if port in self.service_ports:
+            return False
+        self.service_ports[port] = None
+        while len(self.service_ports) > MOST_SERVICE_PORTS:
+            del self.service_ports[next(iter(self.service_ports))]
+        return True
 
     def replace_topic_ports(self, ports: Mapping[str, int]) -> None:
         """Note the TCPROS ports that another process names, in place of all before."""
@@ -255,6 +280,12 @@ class Endpoint:
     def direct(self) -> bool:
         """Whether the node registered around the proxy, so that it may do so again."""
         return any(parse_slave_uri(uri) == self.node for uri in self.former_uris)
+
+    @property
+    def inside_path(self) -> InsidePath:
+        """What is remembered of where it is."""
+        address = None if self.node.host == self.address else self.address
+        return InsidePath(self.node, address, path_of(self.uri))
 
     @property
     def slave(self) -> HostPort:

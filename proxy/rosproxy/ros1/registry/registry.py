@@ -31,7 +31,7 @@ class Registry:
 
     ``by_port``, ``by_slave``, ``by_caller``, ``services`` and ``hidden`` (what the master does not
     know, by kind and name) are for others to read only. ``changes`` grows with each registration
-    that comes or goes.
+    that comes or goes, ``lease_changes`` with whatever is to be remembered of leases.
     """
 
     def __init__(self, ports: PortRange) -> None:
@@ -41,7 +41,7 @@ class Registry:
         self.by_caller: dict[str, Endpoint] = {}
         self.services: dict[str, tuple[Endpoint, Registration]] = {}
         self.hidden: dict[tuple[Kind, str], dict[str, Endpoint]] = {}
-        self.changes = 0
+        self.changes = self.lease_changes = 0
         self._by_node: dict[HostPort, dict[int, Endpoint]] = {}
         self._admitted: dict[tuple[HostPort, str], Endpoint] = {}
         self._last_port: dict[HostPort, int] = {}
@@ -86,6 +86,7 @@ class Registry:
             self._forget_node(endpoint)
             endpoint.uri, endpoint.node, endpoint.place = uri, node, place
             self._by_node.setdefault(node, {})[endpoint.port] = endpoint
+            self.lease_changes += 1
         self._admit(endpoint, node, source)
         return endpoint
 
@@ -102,6 +103,7 @@ class Registry:
         """Forget an endpoint with all its registrations and give its port back."""
         for key in list(endpoint.registrations):
             self._drop(endpoint, key)
+        self.lease_changes += 1
         del self.by_port[endpoint.port], self.by_slave[endpoint.slave]
         for admission in endpoint.admissions:
             del self._admitted[admission]
@@ -120,6 +122,7 @@ class Registry:
         they are; the others are returned.
         """
         moved = self._movable(places)
+        self.lease_changes += 1
         for endpoint in moved:
             del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
@@ -188,6 +191,9 @@ class Registry:
             if before and before[1].key != held.key:
                 self._drop(before[0], before[1].key)
             self.services[held.name] = (endpoint, held)
+            where = parse_service_uri(held.service_api or "")
+            if where is not None and endpoint.note_service_port(where.port):
+                self.lease_changes += 1
         if held.key not in endpoint.registrations:
             endpoint.callers[held.caller_id] = endpoint.callers.get(held.caller_id, 0) + 1
         endpoint.characters += held.characters - (former.characters if former else 0)
@@ -261,6 +267,7 @@ class Registry:
 
     def _add(self, uri: str, node: HostPort, place: Place, port: int, source: str) -> Endpoint:
         endpoint = Endpoint(uri, node, place, port, source=source)
+        self.lease_changes += 1
         self._unproven.setdefault(source, {})[endpoint] = None
         self.by_port[port] = self.by_slave[endpoint.slave] = endpoint
         self._remember(endpoint)
@@ -317,3 +324,4 @@ class Registry:
         endpoint.callers[caller_id] -= 1
         if not endpoint.callers[caller_id]:
             del endpoint.callers[caller_id], self.by_caller[caller_id]
+            endpoint.note_former_caller(caller_id)

@@ -12,8 +12,6 @@ import msgspec
 from rosproxy.leases.ports import PortMap
 from rosproxy.net.addresses import HostPort, Network, is_inside
 from rosproxy.ros1.protocol.uris import (
-    InsidePath,
-    inside_path,
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
@@ -21,7 +19,7 @@ from rosproxy.ros1.protocol.uris import (
     service_uri,
     slave_uri,
 )
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 
@@ -53,20 +51,26 @@ class Addressing:
     ports: PortMap
     stand_ins: StandIns
     networks: Sequence[Network] = field(default_factory=tuple)
-    _advertised: dict[int, tuple[str, Place, str]] = field(default_factory=dict)
-    """What `advertised_uri` said last of each port, and what it was made of."""
+    _advertised: dict[int, str] = field(default_factory=dict)
 
     def outside(self, port: int) -> HostPort:
         """What outside sees of a port that the proxy listens on."""
         return HostPort(self.host, self.ports.advertised(port))
 
     def advertised_uri(self, endpoint: Endpoint) -> str:
-        """The slave URI that stands for an endpoint at the master and outside."""
-        own, place, uri = self._advertised.get(endpoint.port, ("", None, ""))
-        if own != endpoint.uri or place is not endpoint.place:
-            uri = slave_uri(self.outside(endpoint.port), self._path(endpoint))
-            self._advertised[endpoint.port] = endpoint.uri, endpoint.place, uri
+        """The slave URI that stands for an endpoint at the master and outside.
+
+        It has no path: some client libraries take that for a malformed URI, or for a port.
+        """
+        uri = self._advertised.get(endpoint.port)
+        if uri is None:
+            uri = self._advertised[endpoint.port] = slave_uri(self.outside(endpoint.port))
         return uri
+
+    def uris_at_master(self, endpoint: Endpoint) -> list[str]:
+        """The slave URIs by which the master may have an endpoint: a former version's, too."""
+        former = [uri for uri in endpoint.former_uris if self.lease_of(uri) == endpoint.port]
+        return list(dict.fromkeys([self.advertised_uri(endpoint), *former]))
 
     def advertised_service(self, endpoint: Endpoint) -> str:
         """The service URI that stands for an endpoint's services outside."""
@@ -133,10 +137,9 @@ class Addressing:
         """Whether outside finds one of this proxy's own ports at a host and port."""
         return self._listening(where) is not None
 
-    def identify(self, uri: str) -> tuple[int, InsidePath] | None:
-        """The listening port and inside address of an advertised slave URI of this proxy."""
-        port, path = self._listening(parse_slave_uri(uri)), parse_inside_path(uri)
-        return (port, path) if port and path else None
+    def lease_of(self, uri: str) -> int | None:
+        """The listening port of an advertised slave URI of this proxy."""
+        return self._listening(parse_slave_uri(uri))
 
     def _import_foreign(self, uri: str, asker: Asker) -> str:
         return self.stand_ins.import_uri(uri, asker.proxy) if self.foreign(uri) else uri
@@ -144,7 +147,7 @@ class Addressing:
     def _import(self, endpoint: Endpoint, asker: Asker) -> str:
         if self._direct(endpoint, asker) and self._own(endpoint.node, asker) is endpoint:
             return endpoint.uri
-        return slave_uri(HostPort(asker.proxy, endpoint.port), self._path(endpoint))
+        return slave_uri(HostPort(asker.proxy, endpoint.port))
 
     def _direct(self, endpoint: Endpoint, asker: Asker) -> bool:
         if endpoint is asker.endpoint:
@@ -154,13 +157,17 @@ class Addressing:
         shared = [n for n in self.networks if is_inside(asker.address, [n])]
         return endpoint.place.named and is_inside(endpoint.place.address, shared)
 
-    def _path(self, endpoint: Endpoint) -> str:
-        return inside_path(endpoint.uri, endpoint.node, endpoint.place.address)
-
     def stands_for(self, uri: str) -> Endpoint | None:
-        """The endpoint that an advertised slave URI stands for."""
+        """The endpoint that an advertised slave URI stands for.
+
+        Those of former versions carry the inside address in their path: another one means another
+        node, which had the port before.
+        """
         endpoint = self._endpoint_at(parse_slave_uri(uri))
-        return endpoint if endpoint and self.advertised_uri(endpoint) == uri else None
+        inside = parse_inside_path(uri)
+        if endpoint is None or inside is None or inside.slave == endpoint.slave:
+            return endpoint
+        return None
 
     def _endpoint_at(self, where: HostPort | None) -> Endpoint | None:
         port = self._listening(where)

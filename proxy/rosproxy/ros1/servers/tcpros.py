@@ -208,12 +208,12 @@ class InsideNodes:
 
         No node can be asked where its services are. In rospy and roscpp it is where its topics are.
         """
-        registered = self._context.registry.service_port(endpoint, service)
-        ports = endpoint.node_ports | {registered}
-        if ports == {None}:
+        ports = [*endpoint.node_ports, *endpoint.service_ports]
+        if not ports:
             topic = next(iter(endpoint.names(Kind.PUBLISHER)), ROSOUT)
-            ports = {await self._learn_port(endpoint, "topic", topic)}
-        for port in sorted(port for port in ports if port):
+            port = await self._learn_port(endpoint, "topic", topic)
+            ports = [port] if port else []
+        for port in dict.fromkeys(ports):
             where = HostPort(endpoint.address, port)
             if await self._context.nodes.provider(where, service) in endpoint.callers:
                 self._context.registry.note_service_port(endpoint, service, port)

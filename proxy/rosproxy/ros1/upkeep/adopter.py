@@ -91,11 +91,14 @@ class Adopter:
     async def absorb_shutdown(self, endpoint: Endpoint, caller_id: str, reason: str) -> bool:
         """Keep a ``shutdown`` from a node that no other has replaced; whether that is so.
 
-        What the node registered around the proxy is then registered anew.
+        What the node registered around the proxy is then registered anew. Nor is it meant for one
+        that never had the name: another had this port before.
         """
         name = policy.renamed_node(caller_id, reason)
-        if name is None or name not in endpoint.caller_ids:
+        if name is None:
             return False
+        if name not in endpoint.callers:
+            return name not in endpoint.former_callers
         try:
             async with asyncio.timeout(SHUTDOWN_TIMEOUT):
                 uri = await self._look_up(name)

@@ -26,6 +26,7 @@ from rosproxy.ros1.upkeep.policy import liveness
 from rosproxy.ros1.upkeep.policy.adoption import Container
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
+from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ class ContainerEvents:
     registrar: Registrar
     adopter: Adopter
     recovery: Recovery
+    resubscriber: Resubscriber
     tcpros: TcprosServer
     plane: KernelPlane
     _one_at_a_time: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -140,6 +142,7 @@ class ContainerEvents:
         for endpoint in there:
             self._settle(endpoint, before[endpoint], infos[endpoint])
         await self.registrar.resettle(there)
+        await self.resubscriber.announce(there)  # their URI is as before, their connections not
         for endpoint in set(infos) - set(there):
             # The node has registered from its new address already, and holds another port there.
             there_now = HostPort(places[endpoint].address, endpoint.node.port)
@@ -154,7 +157,8 @@ class ContainerEvents:
         """What the node of an endpoint says, if it is the one that answers at another address."""
         held = list(endpoint.registrations.values())
         where = HostPort(address, endpoint.node.port)
-        info, borne_out = await Verifier(self.context.nodes).ask(where, held)
+        ports = list(endpoint.service_ports)
+        info, borne_out = await Verifier(self.context.nodes).ask(where, held, ports)
         known = endpoint.health.pid
         if info is None or not liveness.is_same_process(known, info.pid, borne_out):
             return None

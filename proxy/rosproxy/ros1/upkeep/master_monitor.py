@@ -11,6 +11,7 @@ import logging
 
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
+from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 
@@ -29,8 +30,11 @@ class MasterMonitor:
     in seconds. ``answered`` is set once the master has answered.
     """
 
-    def __init__(self, context: Context, recovery: Recovery, registrar: Registrar) -> None:
+    def __init__(
+        self, context: Context, recovery: Recovery, registrar: Registrar, memory: LeaseMemory
+    ) -> None:
         self._context, self._recovery, self._registrar = context, recovery, registrar
+        self._memory = memory
         self._looks = 0
         self.up: bool | None = None
         self.answered = asyncio.Event()
@@ -50,7 +54,9 @@ class MasterMonitor:
             restarted = not self.up or pid != self.pid
             self.pid = pid
             self._looks += 1
+            await self._memory.write()
             if restarted or self._looks % LOOKS_PER_CHECK == 0:
+                await self._memory.look()  # before what is registered, which it is needed for
                 await self._registrar.register_lost()
             self._mark(True)
         except (Unreachable, MasterError) as error:

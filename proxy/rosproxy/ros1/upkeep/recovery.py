@@ -1,8 +1,9 @@
 """After a start: finding at the master which nodes are behind this proxy, and on which ports.
 
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
-graph once, finds the URIs that this proxy advertised (`policy.claims`), and rebuilds the endpoints
-on the ports that they had. Calls that register wait for it: a node that registered before would
+graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
+advertised (`policy.claims`), and rebuilds the endpoints on the ports that they had. Calls that
+register wait for it: a node that registered before would
 get another port, and the master would shut it down for having moved. Before that an operator's
 policy is waited for (``--await-policy``), or what it denies would be registered for a moment.
 
@@ -20,8 +21,9 @@ If ports are others after a start, look here: the log names each claim that was 
 """
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rosproxy.forwarding.kernel.plane import KernelPlane
 from rosproxy.leases.leases import Leases
@@ -29,10 +31,11 @@ from rosproxy.net.addresses import is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.selection import Standing
 from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.policy import recovery as policy
 from rosproxy.ros1.upkeep.policy.recovery import Claim
 from rosproxy.ros1.upkeep.registrar import Registrar
@@ -65,9 +68,10 @@ class Recovery:
         resubscriber: Resubscriber,
         plane: KernelPlane,
         judge: PolicyJudge,
+        memory: LeaseMemory,
     ) -> None:
         self._context, self._leases, self._plane = context, leases, plane
-        self._verifier = Verifier(context.nodes)
+        self._verifier, self._memory = Verifier(context.nodes), memory
         self._judge = judge
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
@@ -137,15 +141,17 @@ class Recovery:
 
     async def _recover(self) -> None:
         self._context.refresh_networks()
+        memory = await self._memory.read()
         graph = await self._context.upstream.read_graph()
-        found = policy.claims(graph, self._context.addressing)
+        found, forgotten = policy.claims(graph, self._context.addressing, memory)
         restored = [(claim, self._restore(claim)) for claim in await self._settle(found)]
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served = {id(claim) for claim, endpoint in restored if endpoint is not None}
         left = [claim for claim in found if id(claim) not in served]
         self._plane.recovered([e for e in endpoints if self._judge.may_bypass(e)])
-        if left and self._context.settings.cleanup_after:
-            self._context.tasks.spawn(self._sweep(left), "taking back what former proxies left")
+        if (left or forgotten) and self._context.settings.cleanup_after:
+            sweep = self._sweep(left, forgotten)
+            self._context.tasks.spawn(sweep, "taking back what former proxies left")
         self.verifying |= set(endpoints)
         if endpoints:
             log.info("recovering %d nodes from the master", len(endpoints))
@@ -177,6 +183,10 @@ class Recovery:
             return None
         for held in claim.registrations:
             registry.register(endpoint, held)
+        for port in claim.service_ports:
+            endpoint.note_service_port(port)
+        if claim.advertised != self._context.addressing.advertised_uri(endpoint):
+            endpoint.note_former_uri(claim.advertised)  # that of a former version
         return endpoint
 
     async def _resume(self, endpoints: Sequence[Endpoint]) -> None:
@@ -187,7 +197,9 @@ class Recovery:
         except (Unreachable, MasterError) as error:
             log.warning("recovery is incomplete: %s", error)
 
-    async def _sweep(self, left: Sequence[Claim]) -> None:
+    async def _sweep(
+        self, left: Sequence[Claim], forgotten: Mapping[str, Sequence[Registration]]
+    ) -> None:
         """Take back at the master what nobody stands for, after the time for nodes that are gone.
 
         A node that bears out what the master says of it is not: it gets its port if that is free
@@ -196,6 +208,9 @@ class Recovery:
         """
         await asyncio.sleep(self._context.settings.cleanup_after)
         self._context.refresh_networks()
+        for uri, held in forgotten.items():
+            with contextlib.suppress(Unreachable):
+                await self._registrar.take_back(uri, held)
         for claim in left:
             try:
                 borne_out = await self._is_borne_out(claim)
@@ -214,14 +229,16 @@ class Recovery:
         """
         if self._context.standing(claim.slave.host) is Standing.OUTSIDE:
             return False
-        info, borne_out = await self._verifier.ask(claim.slave, claim.registrations)
+        held, ports = claim.registrations, claim.service_ports
+        info, borne_out = await self._verifier.ask(claim.slave, held, ports)
         return False if info is None else borne_out
 
     async def _verify(self, endpoint: Endpoint) -> None:
         self._inspecting.add(endpoint)
         held = list(endpoint.registrations.values())
         try:
-            info, borne_out = await self._verifier.ask(endpoint.slave, held)
+            ports = list(endpoint.service_ports)
+            info, borne_out = await self._verifier.ask(endpoint.slave, held, ports)
         finally:
             self._inspecting.discard(endpoint)
         if endpoint.trusted or self._context.registry.by_port.get(endpoint.port) is not endpoint:
@@ -247,6 +264,10 @@ class Recovery:
         addresses = await resolve(host, address)
         if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
+        if len(self._context.addressing.uris_at_master(endpoint)) > 1:
+            held_now = list(endpoint.registrations.values())
+            await self._registrar.register([(endpoint, one) for one in held_now])
+            endpoint.former_uris.clear()
         await self._registrar.register_missing(endpoint, info)
 
     def _note_doubt(self, endpoint: Endpoint) -> None:

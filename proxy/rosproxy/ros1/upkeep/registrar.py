@@ -21,6 +21,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.rewriting.policing import KINDS, prefix
+from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy import registration as policy
 
@@ -37,8 +38,8 @@ SETTLE_TIME = 2.0
 class Registrar:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, matchmaker: Matchmaker) -> None:
-        self._context, self._matchmaker = context, matchmaker
+    def __init__(self, context: Context, matchmaker: Matchmaker, memory: LeaseMemory) -> None:
+        self._context, self._matchmaker, self._memory = context, matchmaker, memory
         self._complete: tuple[bytes, int, frozenset[int]] = b"", -1, frozenset()
         """The master's state, our own and the ports of nodes that answered, when nothing of theirs
         was missing."""
@@ -236,10 +237,9 @@ class Registrar:
     async def _take_back(self, held: Iterable[Held]) -> None:
         addressing = self._context.addressing
         calls = [
-            policy.unregister_call(
-                one, addressing.advertised_uri(e), addressing.advertised_service(e)
-            )
+            policy.unregister_call(one, uri, addressing.advertised_service(e))
             for e, one in held
+            for uri in addressing.uris_at_master(e)
         ]
         await self._context.upstream.multicall(calls)
 
@@ -260,6 +260,7 @@ class Registrar:
             )
             for e, one in wanted
         ]
+        await self._memory.write()
         values = await self._context.upstream.multicall(calls)
         for endpoint, one in wanted:
             if one.hidden and endpoint.registrations.get(one.key) is one:
@@ -297,7 +298,7 @@ class Registrar:
         direct: dict[str, tuple[Endpoint, str]] = {}
         for name, (endpoint, uri) in former.items():
             endpoint.note_former_uri(uri)
-            if addressing.identify(uri) is None:
+            if addressing.lease_of(uri) is None:
                 direct[name] = endpoint, uri
                 endpoint.expect_updates(self._context.now() + SETTLE_TIME)
             else:

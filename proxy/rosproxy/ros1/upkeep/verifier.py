@@ -8,7 +8,7 @@ that, and is called there by a name that is registered, it is the one; so it is 
 a service under that name.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from rosproxy.net.addresses import HostPort
@@ -27,29 +27,40 @@ class Verifier:
     _nodes: NodeClient
 
     async def ask(
-        self, where: HostPort, held: Collection[Registration]
+        self,
+        where: HostPort,
+        held: Collection[Registration],
+        service_ports: Iterable[int] = (),
     ) -> tuple[NodeInfo | None, bool | None]:
         """What the node at an address says of itself, and whether it is the one that registered.
 
         The second is None if it can't be told; the first is, if nothing answers there.
+        ``service_ports`` are TCPROS ports at which it may have services.
         """
         info = await self._nodes.inspect(where)
-        return (None, None) if info is None else (info, await self.judge(where, held, info))
+        if info is None:
+            return None, None
+        return info, await self.judge(where, held, info, service_ports)
 
     async def judge(
-        self, where: HostPort, held: Collection[Registration], info: NodeInfo
+        self,
+        where: HostPort,
+        held: Collection[Registration],
+        info: NodeInfo,
+        service_ports: Iterable[int] = (),
     ) -> bool | None:
         """The same of a node that has said something of itself."""
         borne_out = policy.confirmed_by(held, info)
-        if borne_out is None and await self._answers_for(where, held, info):
+        ports = {*info.topic_ports.values(), *service_ports}
+        if borne_out is None and await self._answers_for(where, held, info, ports):
             return True
         return borne_out
 
     async def _answers_for(
-        self, where: HostPort, held: Collection[Registration], info: NodeInfo
+        self, where: HostPort, held: Collection[Registration], info: NodeInfo, ports: set[int]
     ) -> bool:
         """Whether it answers for a topic or service, by a name that has registered it."""
-        callers, ports = {one.caller_id for one in held}, set(info.topic_ports.values())
+        callers = {one.caller_id for one in held}
         topics, services = policy.to_ask(held)
         for topic in topics:
             port = info.topic_ports.get(topic) or await self._port(where, topic)

@@ -24,7 +24,7 @@ from tests.unit.builders import (
     python_values,
 )
 
-OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/10.0.0.5:40001/"
+OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/"
 SERVICE, OUT_SERVICE = "rosrpc://10.0.0.5:50001", "rosrpc://robot-host:45000"
 FULL = "http://full:40001/"
 NODE = make_asker("10.0.0.5", master=MASTER)

@@ -18,6 +18,7 @@ from rosproxy.ros1.protocol.uris import (
     parse_inside_path,
     parse_service_uri,
     parse_slave_uri,
+    path_of,
     placed,
     service_uri,
     slave_uri,
@@ -131,14 +132,15 @@ def test_any_text_is_parsed_without_raising(text: str) -> None:
     ],
 )
 def test_the_inside_address_in_a_path(node: HostPort, address: str, path: str) -> None:
-    assert inside_path(slave_uri(node), node, address) == path
-    held = None if node.host == address else address
-    assert parse_inside_path(f"http://robot-host:45000{path}") == InsidePath(node, held)
+    inside = InsidePath(node, None if node.host == address else address)
+    assert inside_path(inside) == path
+    assert parse_inside_path(f"http://robot-host:45000{path}") == inside
 
 
 @given(PLACES, ADDRESSES, PLACES)
 def test_inside_paths_round_trip(node: HostPort, address: str, outside: HostPort) -> None:
-    uri = slave_uri(outside, inside_path(slave_uri(node), node, address))
+    held = None if node.host == address else address
+    uri = slave_uri(outside, inside_path(InsidePath(node, held)))
     found = parse_inside_path(uri)
     assert found is not None
     assert (found.node, found.address or found.node.host) == (node, address)
@@ -150,8 +152,8 @@ def test_the_uri_that_another_proxy_advertises_is_kept(
     node: HostPort, first: HostPort, second: HostPort
 ) -> None:
     """Of two proxies in a row the outer one's URI carries the inner one's, with all it carries."""
-    inner = slave_uri(first, inside_path(slave_uri(node), node, "10.0.0.5"))
-    outer = slave_uri(second, inside_path(inner, first, "10.0.0.9"))
+    inner = slave_uri(first, inside_path(InsidePath(node, "10.0.0.5")))
+    outer = slave_uri(second, inside_path(InsidePath(first, "10.0.0.9", path_of(inner))))
     found = parse_inside_path(outer)
     assert found is not None
     assert slave_uri(found.node, found.path) == inner
@@ -160,7 +162,7 @@ def test_the_uri_that_another_proxy_advertises_is_kept(
 
 def test_a_path_that_is_too_long_is_not_carried() -> None:
     node = HostPort("10.0.0.5", 40001)
-    assert inside_path(slave_uri(node, f"/{'x' * 600}"), node, "10.0.0.5") == "/10.0.0.5:40001/"
+    assert inside_path(InsidePath(node, None, f"/{'x' * 600}")) == "/10.0.0.5:40001/"
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ SAMPLES = [
     py_call("registerPublisher", "/a", "/b", "t/T", "http://10.0.0.5:40001/"),
     cpp_call("registerService", "/a", "/b", "rosrpc://10.0.0.5:4", "http://10.0.0.5:40001/"),
     py_call("system.multicall", [{"methodName": "lookupNode", "params": ["/a", "/b"]}] * 2),
-    cpp_call("publisherUpdate", "/master", "/b", ["http://robot-host:45000/10.0.0.5:40001/"] * 2),
+    cpp_call("publisherUpdate", "/master", "/b", ["http://robot-host:45000/"] * 2),
     py_reply([1, "ready on 10.0.0.5:5", ["TCPROS", "10.0.0.5", 5]]),
     cpp_reply([1, "", [[1, "http://10.0.0.5:40001/", "i", "TCPROS", "/b", True, "é & ü"]]]),
     b"<?xml version='1.0' encoding='iso-8859-1'?><methodCall><methodName>m</methodName><params>"

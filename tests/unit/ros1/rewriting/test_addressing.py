@@ -4,72 +4,81 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import InsidePath
 from rosproxy.ros1.registry.endpoint import Place
 from rosproxy.ros1.rewriting.addressing import Addressing
 from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_asker
 
 LITERAL = "http://10.0.0.5:40001/"
-OUTSIDE = "http://robot-host:45000/10.0.0.5:40001/"
-RELAYED = f"http://{PROXY}:45000/10.0.0.5:40001/"
+OUTSIDE = "http://robot-host:45000/"
+RELAYED = f"http://{PROXY}:45000/"
 
 NEIGHBOUR = make_asker("10.0.0.6")
 STRANGER = make_asker("172.20.0.9")  # inside, in a network from which the node can't be reached
 
 
 @pytest.mark.parametrize(
-    ("uri", "address", "advertised"),
+    ("uri", "address"),
     [
-        (LITERAL, None, OUTSIDE),
-        ("http://c5:40001/", "10.0.0.5", "http://robot-host:45000/c5:40001/10.0.0.5/"),
-        (
-            "http://localhost:40001/",
-            "10.0.0.5",
-            "http://robot-host:45000/localhost:40001/10.0.0.5/",
-        ),
-        (
-            "http://127.0.0.1:40001/",
-            "10.0.0.5",
-            "http://robot-host:45000/127.0.0.1:40001/10.0.0.5/",
-        ),
-        ("http://[fd00::5]:40001/", None, "http://robot-host:45000/[fd00::5]:40001/"),
-        ("http://c5:40001/", "fd00::5", "http://robot-host:45000/c5:40001/fd00::5/"),
-        ("http://10.0.0.5:40001", None, OUTSIDE),
+        (LITERAL, None),
+        ("http://c5:40001/", "10.0.0.5"),
+        ("http://localhost:40001/", "10.0.0.5"),
+        ("http://127.0.0.1:40001/", "10.0.0.5"),
+        ("http://[fd00::5]:40001/", None),
+        ("http://c5:40001/", "fd00::5"),
+        ("http://10.0.0.5:40001", None),
+        ("http://10.0.0.5:40001/of/another/proxy/", None),
     ],
 )
-def test_advertised_uris(uri: str, address: str | None, advertised: str) -> None:
+def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -> None:
+    """Some client libraries take a path for a malformed URI, or for a port."""
     addressing = make_addressing()
     endpoint = add_node(addressing, uri, address)
-    assert addressing.advertised_uri(endpoint) == advertised
+    assert addressing.advertised_uri(endpoint) == OUTSIDE
     assert addressing.advertised_service(endpoint) == "rosrpc://robot-host:45000"
-    inside = InsidePath(endpoint.node, address)
-    assert addressing.identify(advertised) == (45000, inside)
-    assert addressing.export_slave(uri, make_asker(endpoint.place.address)) == advertised
+    assert addressing.lease_of(OUTSIDE) == 45000
+    assert addressing.stands_for(OUTSIDE) is endpoint
+    assert addressing.export_slave(uri, make_asker(endpoint.place.address)) == OUTSIDE
+
+
+@pytest.mark.parametrize(
+    ("path", "stands"),
+    [
+        ("/", True),
+        ("", True),
+        ("/RPC2", True),
+        ("/10.0.0.5:40001/", True),  # as former versions advertised it
+        ("/10.0.0.5:40009/", False),  # whoever had the port before
+        ("/c5:40001/10.0.0.6/", False),
+    ],
+)
+def test_a_uri_of_a_former_version_means_the_node_that_it_names(path: str, stands: bool) -> None:
+    addressing = make_addressing()
+    endpoint = add_node(addressing)
+    found = addressing.stands_for(f"http://robot-host:45000{path}")
+    assert found is (endpoint if stands else None)
 
 
 def test_advertised_ports_have_an_offset() -> None:
     addressing = make_addressing(advertise=(30000, 30009))
     endpoint = add_node(addressing)
-    outside = "http://robot-host:30000/10.0.0.5:40001/"
+    outside = "http://robot-host:30000/"
     assert addressing.outside(45009) == HostPort("robot-host", 30009)
     assert addressing.advertised_uri(endpoint) == outside
     assert addressing.import_slave(outside, STRANGER) == RELAYED
     assert addressing.export_slave(RELAYED, STRANGER) == outside
-    assert (
-        addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE
-    )  # a port that means nothing outside
-    assert addressing.identify(OUTSIDE) is None
+    assert addressing.import_slave(OUTSIDE, STRANGER) == OUTSIDE  # nobody's port outside
+    assert addressing.lease_of(OUTSIDE) is None
 
 
 def test_an_advertised_ipv6_host_has_brackets() -> None:
     addressing = make_addressing(host="fd00::1", networks=["fd01::/64"])
     endpoint = add_node(addressing, "http://[fd01::5]:40001/")
-    outside = "http://[fd00::1]:45000/[fd01::5]:40001/"
+    outside = "http://[fd00::1]:45000/"
     assert addressing.advertised_uri(endpoint) == outside
     assert addressing.advertised_service(endpoint) == "rosrpc://[fd00::1]:45000"
     assert addressing.import_slave(outside, make_asker("fd01::6")) == "http://[fd01::5]:40001/"
     far = make_asker("fd02::6", proxy="fd02::1")
-    relayed = "http://[fd02::1]:45000/[fd01::5]:40001/"
+    relayed = "http://[fd02::1]:45000/"
     assert addressing.import_slave(outside, far) == relayed
     assert addressing.export_slave(relayed, far) == outside
 
@@ -111,7 +120,7 @@ def test_a_name_that_leads_to_the_node_is_given_to_neighbours() -> None:
     endpoint = add_node(addressing, "http://c5:40001/", "10.0.0.5", named=True)
     outside = addressing.advertised_uri(endpoint)
     assert addressing.import_slave(outside, NEIGHBOUR) == "http://c5:40001/"
-    assert addressing.import_slave(outside, STRANGER) == f"http://{PROXY}:45000/c5:40001/10.0.0.5/"
+    assert addressing.import_slave(outside, STRANGER) == RELAYED
 
 
 @pytest.mark.parametrize(
@@ -140,8 +149,6 @@ UNTOUCHED = [
     "http://robot-host:11311/",
     "http://robot-host:45001/10.0.0.5:40001/",  # another port of ours, which nobody has
     "http://robot-host:45000/10.0.0.5:40009/",  # a left-over of whoever had the port before
-    "http://robot-host:45000/",
-    "http://robot-host:45000",
     "http://ROBOT-HOST:45000/10.0.0.5:40001/",
     "https://robot-host:45000/10.0.0.5:40001/",
     "rosrpc://robot-host:45000",
@@ -170,12 +177,12 @@ def two_with_the_same_uri() -> tuple[Addressing, str, str]:
 @pytest.mark.parametrize(
     ("asker", "first", "second"),
     [
-        ("10.0.0.5", "http://node:40001/", f"http://{PROXY}:45001/node:40001/10.0.0.6/"),
-        ("10.0.0.6", f"http://{PROXY}:45000/node:40001/10.0.0.5/", "http://node:40001/"),
+        ("10.0.0.5", "http://node:40001/", f"http://{PROXY}:45001/"),
+        ("10.0.0.6", f"http://{PROXY}:45000/", "http://node:40001/"),
         (
             "10.0.0.7",
-            f"http://{PROXY}:45000/node:40001/10.0.0.5/",
-            f"http://{PROXY}:45001/node:40001/10.0.0.6/",
+            f"http://{PROXY}:45000/",
+            f"http://{PROXY}:45001/",
         ),
     ],
 )
@@ -195,7 +202,7 @@ def test_a_uri_that_an_asker_would_take_for_its_own_is_not_given_to_it() -> None
     add_node(addressing, uri, "10.0.0.6")
     outside, asker = addressing.advertised_uri(resolvable), make_asker("10.0.0.6")
     given = addressing.import_slave(outside, asker)
-    assert given == f"http://{PROXY}:45000/node:40001/10.0.0.5/"
+    assert given == f"http://{PROXY}:45000/"
     assert addressing.export_slave(given, asker) == outside
 
 
@@ -215,9 +222,9 @@ def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> 
     addressing = make_addressing()
     endpoint = add_node(addressing)
     addressing.registry.move({endpoint: Place("10.0.0.9", named=False, stale=True)})
-    outside = "http://robot-host:45000/10.0.0.5:40001/10.0.0.9/"
+    outside = "http://robot-host:45000/"
     assert addressing.advertised_uri(endpoint) == outside
-    relayed = f"http://{PROXY}:45000/10.0.0.5:40001/10.0.0.9/"
+    relayed = f"http://{PROXY}:45000/"
     for asker in (NEIGHBOUR, make_asker("10.0.0.9"), make_asker("10.0.0.5"), STRANGER):
         assert addressing.import_slave(outside, asker) == relayed
     assert addressing.import_slave(outside, make_asker("10.0.0.9", endpoint=endpoint)) == LITERAL
@@ -236,7 +243,7 @@ def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_els
         assert addressing.export_slave(OUTSIDE, asker) == OUTSIDE
     add_node(addressing, "http://10.0.0.7:40001/")
     assert addressing.export_slave(LITERAL, NEIGHBOUR) == LITERAL
-    assert addressing.import_slave(OUTSIDE, NEIGHBOUR) == OUTSIDE
+    assert addressing.import_slave(OUTSIDE, NEIGHBOUR) == "http://10.0.0.7:40001/"
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.memory import remembered, to_remember
 from rosproxy.ros1.rewriting.addressing import Addressing, Asker
 from tests.unit.builders import make_addressing
 
@@ -156,10 +157,12 @@ def test_the_master_can_be_asked_for_all_that_a_restarted_proxy_needs(
     topology: tuple[Addressing, list[Endpoint]],
 ) -> None:
     addressing, endpoints = topology
+    text = to_remember(endpoints, addressing.ports)
+    memory = remembered(text, addressing.ports)
     for endpoint in endpoints:
-        found = addressing.identify(addressing.advertised_uri(endpoint))
-        assert found
-        port, inside = found
+        port = addressing.lease_of(addressing.advertised_uri(endpoint))
         assert port == endpoint.port
+        inside = memory[port].node
+
         assert inside.node == endpoint.node
-        assert (inside.address or inside.node.host) == endpoint.place.address
+        assert inside.slave == endpoint.slave

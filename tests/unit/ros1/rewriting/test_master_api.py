@@ -25,14 +25,14 @@ from tests.unit.builders import (
 
 ID, TOPIC, TYPE = "/ns/talker", "/chatter", "std_msgs/String"
 OWN = "http://10.0.0.5:40001/"
-OUT = "http://robot-host:45000/10.0.0.5:40001/"
+OUT = "http://robot-host:45000/"
 SERVICE, OUT_SERVICE = "rosrpc://10.0.0.5:50001", "rosrpc://robot-host:45000"
 LAPTOP = "http://laptop:33445/"
 OTHER = "http://10.0.0.6:40001/"
-OTHER_OUT = "http://robot-host:45001/10.0.0.6:40001/"
+OTHER_OUT = "http://robot-host:45001/"
 FAR = "http://172.20.0.7:40001/"
-FAR_OUT = "http://robot-host:45002/172.20.0.7:40001/"
-FAR_RELAYED = f"http://{PROXY}:45002/172.20.0.7:40001/"
+FAR_OUT = "http://robot-host:45002/"
+FAR_RELAYED = f"http://{PROXY}:45002/"
 NODE = make_asker("10.0.0.5", master=MASTER)
 
 

@@ -23,10 +23,10 @@ from tests.unit.builders import (
     python_values,
 )
 
-OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/10.0.0.5:40001/"
-OTHER, OTHER_OUT = "http://10.0.0.6:40001/", "http://robot-host:45001/10.0.0.6:40001/"
-FAR_OUT = "http://robot-host:45002/172.20.0.7:40001/"
-FAR_RELAYED = f"http://{PROXY}:45002/172.20.0.7:40001/"
+OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/"
+OTHER, OTHER_OUT = "http://10.0.0.6:40001/", "http://robot-host:45001/"
+FAR_OUT = "http://robot-host:45002/"
+FAR_RELAYED = f"http://{PROXY}:45002/"
 LAPTOP = "http://laptop:33445/"
 MASTER = "http://robot:11311/"
 OUTSIDE = HostPort("robot-host", 45000)

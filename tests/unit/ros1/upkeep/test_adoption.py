@@ -189,7 +189,7 @@ def test_whose_uri_has_changed(caller_id: str, reason: str, name: str | None) ->
     assert policy.renamed_node(caller_id, reason) == name
 
 
-LITERAL, ADVERTISED = "http://c1:40001/", "http://robot-host:45000/c1:40001/10.0.0.5/"
+LITERAL, ADVERTISED = "http://c1:40001/", "http://robot-host:45000/"
 NAMES = [
     # registered around the proxy before? what the master has, whether no other has its name
     (False, ADVERTISED, True),

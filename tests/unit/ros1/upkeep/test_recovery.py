@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rosproxy.net.addresses import HostPort, is_inside
 from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
 from rosproxy.ros1.upkeep.policy import recovery as policy
@@ -26,32 +27,42 @@ def graph(uris: dict[str, str]) -> Graph:
     return Graph({node: [held("/a", node)] for node in uris}, uris)
 
 
+MEMORY = memory.remembered(
+    "45003 /10.0.0.5:40001/\n"
+    "45004 /c5:40001/10.0.0.5/ 41234 41235\n"
+    "45005 /127.0.0.1:40001/10.0.0.5/\n"
+    "45009 /[fd00::5]:40001/\n",
+    make_addressing().ports,
+)
 URIS = [
     # what the master has for a node, the claim: port, what it calls itself, where it is looked for
-    ("http://robot-host:45003/10.0.0.5:40001/", (45003, "10.0.0.5:40001", "10.0.0.5")),
-    ("http://robot-host:45003/c5:40001/10.0.0.5/", (45003, "c5:40001", "10.0.0.5")),
-    ("http://robot-host:45003/127.0.0.1:40001/10.0.0.5/", (45003, "127.0.0.1:40001", "10.0.0.5")),
-    ("http://robot-host:45009/[fd00::5]:40001/", (45009, "[fd00::5]:40001", "fd00::5")),
+    ("http://robot-host:45003/", (45003, "10.0.0.5:40001", "10.0.0.5")),
+    ("http://robot-host:45003", (45003, "10.0.0.5:40001", "10.0.0.5")),
+    ("http://robot-host:45003/RPC2", (45003, "10.0.0.5:40001", "10.0.0.5")),
+    ("http://robot-host:45004/", (45004, "c5:40001", "10.0.0.5")),
+    ("http://robot-host:45005/", (45005, "127.0.0.1:40001", "10.0.0.5")),
+    ("http://robot-host:45009/", (45009, "[fd00::5]:40001", "fd00::5")),
+    # of a former version
+    ("http://robot-host:45003/10.0.0.7:40001/", (45003, "10.0.0.7:40001", "10.0.0.7")),
+    ("http://robot-host:45001/c5:40001/10.0.0.5/", (45001, "c5:40001", "10.0.0.5")),
     ("http://robot-host:45003/c5:40001/", (45003, "c5:40001", "c5")),  # refused by address
-    ("http://robot-host:45003/", None),
-    ("http://robot-host:45003", None),
-    ("http://robot-host:45003/RPC2", None),
     ("http://robot-host:45010/10.0.0.5:40001/", None),
     ("http://robot-host:44999/10.0.0.5:40001/", None),
-    ("http://another-host:45003/10.0.0.5:40001/", None),
+    ("http://another-host:45003/", None),
     ("http://laptop:33445/", None),
-    ("rosrpc://robot-host:45003/10.0.0.5:40001/", None),
+    ("rosrpc://robot-host:45003", None),
     ("nonsense", None),
     ("", None),
 ]
 
 
 @pytest.mark.parametrize(("uri", "expected"), URIS)
-def test_claims_are_read_from_advertised_uris(
+def test_claims_are_read_from_advertised_uris_and_what_is_remembered(
     uri: str, expected: tuple[int, str, str] | None
 ) -> None:
-    found = policy.claims(graph({"/n": uri}), make_addressing())
+    found, forgotten = policy.claims(graph({"/n": uri}), make_addressing(), MEMORY)
     claims = [(one.port, one.uri, str(one.slave), one.topics) for one in found]
+    assert forgotten == {}
     if expected is None:
         assert claims == []
     else:
@@ -59,27 +70,38 @@ def test_claims_are_read_from_advertised_uris(
         assert claims == [(port, f"http://{node}/", str(HostPort(address, 40001)), {"/a"})]
 
 
+def test_the_ports_of_services_are_remembered() -> None:
+    uris = {"/n": "http://robot-host:45004/", "/m": "http://robot-host:45003/"}
+    found, _ = policy.claims(graph(uris), make_addressing(), MEMORY)
+    assert [claim.service_ports for claim in found] == [(41234, 41235), ()]
+
+
+def test_of_some_nothing_is_remembered() -> None:
+    uri = "http://robot-host:45008/"
+    found, forgotten = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
+    assert found == []
+    assert {one.caller_id for one in forgotten[uri]} == {"/n", "/m"}
+
+
 def test_claims_in_an_advertised_range_with_an_offset_are_for_the_port_that_listens() -> None:
     addressing = make_addressing(advertise=(30000, 30009))
-    uris = {
-        "/n": "http://robot-host:30003/10.0.0.5:1/",
-        "/m": "http://robot-host:45003/10.0.0.5:1/",
-    }
-    assert [claim.port for claim in policy.claims(graph(uris), addressing)] == [45003]
+    uris = {"/n": "http://robot-host:30003/", "/m": "http://robot-host:45003/"}
+    kept = memory.remembered("30003 /10.0.0.5:1/\n", addressing.ports)
+    assert [claim.port for claim in policy.claims(graph(uris), addressing, kept)[0]] == [45003]
 
 
 def test_names_that_share_a_uri_are_one_claim() -> None:
-    uri = "http://robot-host:45003/10.0.0.5:40001/"
-    (claim,) = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing())
+    uri = "http://robot-host:45003/"
+    (claim,), _ = policy.claims(graph({"/n": uri, "/m": uri}), make_addressing(), MEMORY)
     assert {one.caller_id for one in claim.registrations} == {"/n", "/m"}
 
 
 def test_a_node_without_registrations_or_without_a_uri() -> None:
     addressing = make_addressing()
-    uri = "http://robot-host:45003/10.0.0.5:40001/"
-    (claim,) = policy.claims(Graph({}, {"/n": uri}), addressing)
+    uri = "http://robot-host:45003/"
+    (claim,), _ = policy.claims(Graph({}, {"/n": uri}), addressing, MEMORY)
     assert claim.registrations == []
-    assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing) == []
+    assert policy.claims(Graph({"/n": [held("/a")]}, {}), addressing, MEMORY) == ([], {})
 
 
 def claim(

@@ -1,20 +1,22 @@
 """Rebuilding the registry from what the master holds, after a start without memory.
 
-The advertised URIs at the master carry the inside addresses. Anybody can write such a URI to the
-master, so what is found there is only a claim. Where several claim one port, or one node, the one
+The advertised URIs at the master tell the ports, and what the proxy remembers where their nodes
+are; those of former versions carry that in their path. Anybody can write both to the master, so
+what is found there is only a claim. Where several claim one port, or one node, the one
 that its node bears out best is kept (`settle`); the node of one that is kept is asked before it is
 served (`confirmed_by`).
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.protocol.uris import slave_uri
+from rosproxy.ros1.protocol.uris import parse_inside_path, slave_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
+from rosproxy.ros1.registry.memory import Remembered
 from rosproxy.ros1.rewriting.addressing import Addressing
 
 NO_MERIT = -(10**9)
@@ -38,6 +40,7 @@ class Claim:
     said: NodeInfo | None = None
     advertised: str = ""
     path: str = "/"
+    service_ports: tuple[int, ...] = ()
 
     @property
     def topics(self) -> set[str]:
@@ -50,15 +53,27 @@ class Claim:
         return slave_uri(self.node, self.path)
 
 
-def claims(graph: Graph, addressing: Addressing) -> list[Claim]:
-    """The endpoints of this proxy among the nodes of a master."""
-    found: dict[str, Claim] = {}
+def claims(
+    graph: Graph, addressing: Addressing, memory: Mapping[int, Remembered]
+) -> tuple[list[Claim], dict[str, list[Registration]]]:
+    """The endpoints of this proxy among the nodes of a master, by what it remembers of each port.
+
+    Second what the master has by advertised URIs of which nothing is remembered.
+    """
+    found, forgotten = dict[str, Claim](), dict[str, list[Registration]]()
     for node, uri in graph.uris.items():
-        if ours := addressing.identify(uri):
-            port, inside = ours
-            claim = Claim(port, inside.node, inside.slave, advertised=uri, path=inside.path)
-            found.setdefault(uri, claim).registrations += graph.held.get(node, [])
-    return list(found.values())
+        port = addressing.lease_of(uri)
+        if port is None:
+            continue
+        lease, held = memory.get(port), graph.held.get(node, [])
+        inside = parse_inside_path(uri) or (lease.node if lease else None)
+        if inside is None:
+            forgotten.setdefault(uri, []).extend(held)
+            continue
+        claim = Claim(port, inside.node, inside.slave, advertised=uri, path=inside.path)
+        claim.service_ports = lease.service_ports if lease else ()
+        found.setdefault(uri, claim).registrations += held
+    return list(found.values()), forgotten
 
 
 def contested(found: Sequence[Claim]) -> list[Claim]:

@@ -1,0 +1,79 @@
+"""Having the master keep what is to outlast the proxy: where the node of each lease is.
+
+It is written before a node is registered for the first time, and before a service's registration is
+answered: whatever the master knows of, the next process of the proxy can find. All who wait at once
+are served by one write. Once in a while it is looked after: the master may have lost it, and what
+nobody needs any more is taken back. What is kept, and how: `rosproxy.ros1.registry.memory`.
+"""
+
+import asyncio
+from collections.abc import Mapping
+
+from rosproxy.ros1.clients.master import MasterError
+from rosproxy.ros1.context import Context
+from rosproxy.ros1.registry import memory
+from rosproxy.ros1.registry.memory import Remembered
+
+REFUSED = (
+    "the master does not keep this parameter ({}): nodes have to be restarted after a restart of "
+    "the proxy. Allow its setting, if another proxy with a policy is in between"
+)
+
+
+class LeaseMemory:
+    """Reads and writes the parameter of this proxy."""
+
+    def __init__(self, context: Context) -> None:
+        self._context, self._one_at_a_time = context, asyncio.Lock()
+        settings = context.settings
+        self.parameter = memory.parameter_of(settings.advertise_host, settings.ports)
+        self._written = -1
+        self._kept: object = None
+        """What the master has, as far as is known."""
+
+    async def read(self) -> Mapping[int, Remembered]:
+        """What a former process has left, by port. Raises Unreachable."""
+        self._kept = await self._read()
+        return memory.remembered(self._kept, self._context.settings.ports)
+
+    async def write(self) -> None:
+        """Have the master keep what is known of all leases, unless it does. Raises Unreachable."""
+        registry = self._context.registry
+        while self._written != registry.lease_changes:
+            async with self._one_at_a_time:
+                changes = registry.lease_changes
+                if self._written != changes:
+                    await self._write(memory.to_remember(registry, self._context.settings.ports))
+                    self._written = changes
+
+    async def look(self) -> None:
+        """Write it again if the master has lost it, or if somebody else has written there.
+
+        Raises Unreachable.
+        """
+        async with self._one_at_a_time:
+            kept = await self._read()
+            if kept != self._kept:
+                self._kept, self._written = kept, -1
+        await self.write()
+
+    async def _read(self) -> object:
+        try:
+            return await self._context.upstream.call_master("getParam", self.parameter)
+        except MasterError:  # it has none
+            return ""
+
+    async def _write(self, text: str) -> None:
+        if text == self._kept:
+            return
+        upstream, problems = self._context.upstream, self._context.problems
+        try:
+            if text:
+                await upstream.call_master("setParam", self.parameter, text)
+                problems.solved(self.parameter)
+            else:
+                await upstream.call_master("deleteParam", self.parameter)
+        except MasterError as error:
+            if text:  # nothing else depends on it; to delete what is not there is refused as well
+                problems.add(self.parameter, REFUSED.format(error))
+        self._kept = text

@@ -1,0 +1,123 @@
+"""What the proxy has the master remember of its leases: kept up, bounded, and only a claim."""
+
+from functools import partial
+
+import pytest
+
+from examples.demo.fake_http import value
+from examples.demo.fake_master import FakeMaster
+from examples.demo.fake_node import FakeNode
+from tests.integration.conftest import MakeNode
+from tests.integration.net import HOST, NODE, OTHER_NODE, looks, refuses, rpc, until
+from tests.integration.proxy import Proxy
+
+
+def parameter(proxy: Proxy) -> str:
+    return f"/rosproxy/leases_{HOST.replace('.', '_')}_{proxy.settings.ports.listen.first}"
+
+
+def line(proxy: Proxy, node: FakeNode) -> str:
+    return f"{proxy.lease(node)[1]} /{node.address}:{node.slave.address[1]}/"
+
+
+async def test_it_is_there_before_the_master_knows_the_node(
+    proxy: Proxy, master: FakeMaster, node: FakeNode
+) -> None:
+    await node.publish(proxy.master)
+    methods = [method for method, _ in master.calls]
+    assert methods.index("setParam") < methods.index("registerPublisher")
+    assert master.params == {parameter(proxy): f"{line(proxy, node)}\n"}
+
+
+async def test_it_goes_with_the_last_lease(
+    proxy: Proxy, master: FakeMaster, node: FakeNode
+) -> None:
+    await node.publish(proxy.master)
+    await node.call(proxy.master, "unregisterPublisher", "/chatter", node.uri)
+    await until(lambda: not master.params, "it is deleted")
+
+
+@pytest.mark.parametrize("written", ["", "nonsense", "1 /127.0.2.99:1/\n", 7, ["x"], None])
+async def test_what_others_do_to_it_is_undone(
+    proxy: Proxy, master: FakeMaster, node: FakeNode, written: object
+) -> None:
+    await node.publish(proxy.master)
+    kept = dict(master.params)
+    master.params.clear()
+    if written is not None:
+        await rpc(master.uri, "setParam", "/somebody", parameter(proxy), written)
+    await until(lambda: master.params == kept, "it is written again")
+
+
+@pytest.mark.parametrize("written", ["", "nonsense\n" * 1000, 7, ["x"], {"a": "b"}])
+async def test_a_node_that_nothing_is_remembered_of_registers_again(
+    proxy: Proxy, master: FakeMaster, node: FakeNode, written: object
+) -> None:
+    await node.publish(proxy.master)
+
+    async def overwrite() -> None:
+        master.params[parameter(proxy)] = written
+
+    await proxy.restart(overwrite)
+    await node.publish(proxy.master)
+    assert await proxy.serves(node)
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+
+
+async def test_a_node_is_believed_for_itself_alone(
+    proxy: Proxy, master: FakeMaster, node: FakeNode, make_node: MakeNode
+) -> None:
+    """Somebody has the master remember another node at the port of one."""
+    other = await make_node("/other", OTHER_NODE)
+    other.published = {"/rosout": "rosgraph_msgs/Log", "/else": "std_msgs/String"}
+    await node.publish(proxy.master)
+    lease = proxy.lease(node)
+
+    async def forge() -> None:
+        master.params[parameter(proxy)] = f"{lease[1]} /{OTHER_NODE}:{other.slave.address[1]}/\n"
+
+    await proxy.restart(forge)
+    await until(partial(refuses, lease), "the port refuses")
+    await looks(master)
+    assert await refuses(lease)
+
+
+async def test_a_master_that_does_not_keep_it_is_told_of(
+    proxy: Proxy, master: FakeMaster, node: FakeNode
+) -> None:
+    """Another proxy is in between, with a policy."""
+    master.answers["setParam"] = value([-1, "denied", 0])
+    assert (await node.publish(proxy.master))[0] == 1
+    assert await proxy.serves(node)
+    (problem,) = proxy.app.status()["problems"]
+    assert problem["subject"] == parameter(proxy)
+    assert "denied" in problem["text"]
+    del master.answers["setParam"]
+    await until(lambda: parameter(proxy) in master.params, "it is kept")
+    assert not proxy.app.status()["problems"]
+
+
+async def test_a_former_versions_uris_are_found_and_registered_anew(
+    proxy: Proxy, master: FakeMaster, node: FakeNode
+) -> None:
+    await node.publish(proxy.master)
+    await node.serve(proxy.master)
+    lease = proxy.lease(node)
+    former = f"http://{HOST}:{lease[1]}/{NODE}:{node.slave.address[1]}/"
+
+    async def turn_back() -> None:
+        master.params.clear()
+        for method, names in (
+            ("registerPublisher", ["/chatter", "std_msgs/String"]),
+            ("registerService", ["/add", f"rosrpc://{HOST}:{lease[1]}"]),
+        ):
+            await rpc(master.uri, method, node.name, *names, former)
+
+    await proxy.restart(turn_back)
+    await until(
+        lambda: master.nodes.get(node.name) == f"http://{HOST}:{lease[1]}/", "it has no path"
+    )
+    assert proxy.lease(node) == lease
+    assert await proxy.serves(node)
+    assert master.holds("publishers", "/chatter") == [proxy.uri(node)]
+    assert not [call for call in node.calls if call[0] == "shutdown"]
