@@ -132,7 +132,7 @@ def main() -> None:
 @click.option(
     "--port-window",
     type=PORT_RANGE,
-    default="11400-65535",
+    default="11412-65535",
     metavar="A-B",
     help="Where ranges of ports are looked for.",
 )

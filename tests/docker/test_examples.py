@@ -99,7 +99,7 @@ def test_example_with_labels(named: Robot, images: dict[str, str], tmp_path: Pat
         assert the_proxy().name in status
         assert "talker" in status
         assert "listener" in status
-        assert 11400 in the_proxy().ports
+        assert 11412 in the_proxy().ports
 
         found.compose("rm", "--stop", "--force", "talker", "listener")
         wait_until(lambda: not the_proxy().networks, 5, "the proxy has left the network")

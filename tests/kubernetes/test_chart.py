@@ -132,7 +132,7 @@ BAD: list[tuple[Json, str]] = [
     ({"master": {"uri": "http://r", "address": "1.2.3.256"}}, "an IP address such as"),
     ({"master": {"service": {"name": "m"}, "address": "1.2.3.4"}}, "a service needs none"),
     ({"master": {"service": {"name": "m"}, "publish": 11311}}, "the proxy's own ports"),
-    ({"master": {"service": {"name": "m"}, "publish": 11400}}, "lies in portWindow"),
+    ({"master": {"service": {"name": "m"}, "publish": 11412}}, "lies in portWindow"),
     ({"master": {"uri": "http://r", "publish": 11300}}, "is outside already"),
     ({"master": {"uri": "http://r"}, "portWindow": {"last": 70000}}, "portWindow.last"),
     ({"master": {"uri": "http://r"}, "dataPlane": "kernel"}, "dataPlane"),

@@ -102,5 +102,5 @@ def test_versions_of_ros_are_taken(spec: dict[str, Any], net: Namespace) -> None
 def test_defaults_are_filled_in(net: Namespace) -> None:
     spec = rosproxy(net.name, master=GOOD).body["spec"]
     assert spec["ports"] == 32
-    assert spec["portWindow"] == {"first": 11400, "last": 29999}
+    assert spec["portWindow"] == {"first": 11412, "last": 29999}
     assert spec["advertise"] == "InternalIP"

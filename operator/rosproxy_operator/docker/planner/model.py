@@ -23,8 +23,8 @@ NOWHERE = "none"
 """What stands for no LAN."""
 STARTED_LABEL = "io.rosproxy.started"
 """On a redirect's container: when the one was started whose network it is in."""
-WINDOW = PortRange(11400, 65535)
-"""Where ports are looked for: above the master's and the admin endpoint's."""
+WINDOW = PortRange(11412, 65535)
+"""Where ports are looked for: above the master's, the admin endpoint's, and rosserial's (11411)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -207,7 +207,7 @@ def _glob(given: Field, ros_name: bool) -> str:
 
 
 def _window(given: Field, ports: int) -> PortRange:
-    window = PortRange(given["first"].number(11400, *_HIGH), given["last"].number(29999, *_HIGH))
+    window = PortRange(given["first"].number(11412, *_HIGH), given["last"].number(29999, *_HIGH))
     if window.last - window.first + 1 < ports:
         raise InvalidField(
             f"{given.path}: {window} has not the {ports} ports that spec.ports asks for: make the "

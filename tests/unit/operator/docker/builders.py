@@ -36,7 +36,7 @@ ROBOT = "http://robot:11311"
 HERE = "192.0.2.10"
 KEY = Key(ROBOT, HERE)
 RANGE = PortRange(11400, 11431)
-SETTINGS = PlanSettings(advertise_host=HERE)
+SETTINGS = PlanSettings(advertise_host=HERE, port_window=PortRange(11400, 65535))
 IMAGE = "sha256:1"
 SECRET = "what tokens are made of"
 EPHEMERAL = PortRange(32768, 60999)

@@ -21,7 +21,7 @@ def test_the_least_that_one_needs_gets_the_defaults_of_the_crd():
     assert (found.id, found.uid, found.generation) == (Name(NAMESPACE, "arm"), "uid-arm", 3)
     spec = found.spec
     assert spec.master == MasterSpec(uri="http://robot:11311")
-    assert (spec.ports, spec.window) == (32, PortRange(11400, 29999))
+    assert (spec.ports, spec.window) == (32, PortRange(11412, 29999))
     assert (spec.pod_selector, spec.node_selector, spec.tolerations) == (None, {}, ())
     assert (spec.advertise, spec.slave_control) == (Advertise.INTERNAL_IP, "any")
     assert (spec.cleanup_after, spec.grace, spec.data_plane) == (30.0, 60.0, "auto")
