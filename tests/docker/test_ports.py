@@ -122,7 +122,10 @@ def test_range_taken_by_another_while_the_proxy_was_down(
     )
     the_proxy(40)
     wait_until(lambda: "HAS LEFT ITS PORTS" in controller.logs(), 40, controller.logs)
+    left = named.uri(node.node)
     docker("restart", "--time", "0", node.name)
+    # roscpp takes what the reply to its subscription says, also if it is older than an update.
+    wait_until(lambda: named.uri(node.node) not in ("", left), 60, node.log.read)
     ear = named.node("ear", "roscpp", "sub", "--topic", "/out")
     try:
         ear.wait_for("inside")
