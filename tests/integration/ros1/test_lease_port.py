@@ -224,6 +224,7 @@ async def test_bus_info_and_master_uri_are_exported(proxy, make_node):
 async def test_only_the_master_may_control_nodes_where_policy_says_so(make_proxy, node):
     proxy = await make_proxy(slave_control="master")
     await node.publish(proxy.master)
+    await node.call(proxy.master, "subscribeParam", node.uri, "/chatter")
     lease, controls = proxy.uri(node), ("shutdown", "publisherUpdate", "paramUpdate")
     for method in controls:
         assert (await rpc(lease, method, "/evil", "/chatter", []))[0] == -1

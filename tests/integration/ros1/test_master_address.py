@@ -108,7 +108,7 @@ async def test_only_the_master_may_control_nodes_and_it_is_known_by_its_address(
     proxy = await make_proxy(
         master_uri=uri_by_name(master), master_address=MASTER, slave_control="master"
     )
-    await node.publish(proxy.master)
+    await node.call(proxy.master, "subscribeParam", node.uri, "/x")
     assert (await rpc(proxy.lease(node), "paramUpdate", "/master", "/x", 1, source=MASTER))[0] == 1
     assert (await rpc(proxy.lease(node), "paramUpdate", "/x", "/x", 1, source=OUTSIDE))[0] == -1
 

@@ -124,6 +124,41 @@ async def test_a_parameter_reaches_its_subscriber(proxy, node):
     assert node.calls[-1] == ("paramUpdate", ("/master", "/p", {"a": [1, 2.5, True]}))
 
 
+async def test_a_parameter_reaches_who_subscribed_to_a_namespace_it_is_in(proxy, node):
+    await node.call(proxy.master, "subscribeParam", node.uri, "/robot")
+    await rpc(proxy.uri(node), "paramUpdate", "/master", "/robot/arm/speed/", 1)
+    assert node.calls[-1] == ("paramUpdate", ("/master", "/robot/arm/speed/", 1))
+    reply = await rpc(proxy.uri(node), "paramUpdate", "/master", "/robots/", 1)
+    assert reply == [-1, f"rosproxy: /talker ({node.uri}) has not subscribed to /robots/", 0]
+
+
+async def test_a_node_is_not_told_of_what_the_one_before_at_its_port_subscribed_to(proxy, node):
+    """The master calls at a URI, and forgets nobody who has subscribed with it."""
+    await node.publish(proxy.master)
+    assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == -1
+    assert "paramUpdate" not in [name for name, _ in node.calls]
+
+
+async def test_a_recovered_node_is_told_of_parameters(proxy, node):
+    await node.publish(proxy.master)
+    await node.call(proxy.master, "subscribeParam", node.uri, "/p")
+    await proxy.restart()
+    await until(lambda: len(proxy.ros1.context.registry), "it is found at the master")
+    await until(lambda: proxy.endpoint(node).trusted, "it is recovered")
+    assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == 1
+    assert node.calls[-1] == ("paramUpdate", ("/master", "/p/", 1))
+
+
+async def test_an_update_of_a_parameter_does_not_overtake_the_subscription(proxy, master, node):
+    await node.publish(proxy.master)
+    master.delay = 0.2
+    subscribing = asyncio.create_task(node.call(proxy.master, "subscribeParam", node.uri, "/p"))
+    await until(lambda: proxy.endpoint(node).pending, "the subscription is on its way")
+    assert (await rpc(proxy.uri(node), "paramUpdate", "/master", "/p/", 1))[0] == 1
+    assert subscribing.done()
+    await subscribing
+
+
 async def test_an_update_does_not_overtake_the_registration_before_it(proxy, master, node):
     await node.subscribe(proxy.master, "/other")
     uri, master.delay = proxy.uri(node), 0.2

@@ -92,10 +92,12 @@ class SlaveApi:
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The node's reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         endpoint, method = self._endpoint(call), long_call.method
-        caller_id = next(iter(passing.first_strings(call.body, 1)), None)
+        caller_id, parameter, *_ = *passing.first_strings(call.body, 2), None, None
         why = await self._why_not(endpoint, method, caller_id or "", call.source)
         if why is None and caller_id is None and not self._judge.idle:
             why = NO_CALLER_ID
+        if why is None and method == "paramUpdate":
+            why = await self._not_subscribed(endpoint, parameter)
         if why is not None:
             return self._refused(method, why)
         reply = self._pass(endpoint, long_call)
@@ -141,6 +143,8 @@ class SlaveApi:
         """The reply to one call, whose document is ``body``, of those that came as ``call``."""
         caller_id = parsed.string(0) or ""
         why = await self._why_not(endpoint, parsed.method, caller_id, call.source)
+        if why is None and parsed.method == "paramUpdate":
+            why = await self._not_subscribed(endpoint, parsed.string(1))
         if why is not None:
             return self._refused(parsed.method, why)
         if too_long := too_long_to_ask(parsed):
@@ -244,6 +248,18 @@ class SlaveApi:
         if not await self._is_for(method, source):
             return NOT_THE_MASTER
         return await self._judge.outside_may_not_call(method, endpoint, source, caller_id)
+
+    async def _not_subscribed(self, endpoint: Endpoint, parameter: str | None) -> str | None:
+        """Why a node is not told of a parameter; None if it may have subscribed to it.
+
+        rosmaster never forgets the subscriptions of nodes that have ended, and some libraries leave
+        them behind (rosrust, to every parameter), so it calls who has the port by now. rosnodejs
+        never answers that, and rosmaster tells it of no publishers meanwhile.
+        """
+        await self._context.after_registration(endpoint)
+        if parameter is None or endpoint.may_hear_of(parameter):
+            return None
+        return f"{endpoint.label} has not subscribed to {parameter}"
 
     async def _is_for(self, method: str, source: str) -> bool:
         """Whether ``--slave-control`` lets a source call a method."""

@@ -82,3 +82,8 @@ def resolve_name(name: str, caller_id: str) -> str:
     else:
         resolved = f"{caller_id.rpartition('/')[0]}/{name}"
     return "/" + "/".join(part for part in resolved.split("/") if part)
+
+
+def prefix(name: str) -> str:
+    """What all names below a parameter's begin with."""
+    return name if name.endswith("/") else f"{name}/"

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.master_methods import Kind, prefix
 from rosproxy.ros1.protocol.uris import InsidePath, parse_slave_uri, path_of
 from rosproxy.ros1.registry.health import Health, ProbeResult
 from rosproxy.telemetry.text import listed
@@ -324,6 +324,18 @@ class Endpoint:
     def publishes(self, topic: str) -> bool:
         """Whether a topic is registered as published."""
         return any((Kind.PUBLISHER, topic, name) in self.registrations for name in self.callers)
+
+    def may_hear_of(self, parameter: str) -> bool:
+        """Whether the node may have subscribed to a parameter, or to a namespace that it is in.
+
+        After a recovery that can't be told: the master lists no parameter subscriptions.
+        """
+        changed = prefix(parameter)
+        return self.restored or any(
+            changed.startswith(prefix(registration.name))
+            for registration in self.registrations.values()
+            if registration.kind is Kind.PARAM
+        )
 
     @property
     def topics(self) -> set[str]:

@@ -59,11 +59,6 @@ def param_use_of(call: Call) -> ParamUse | None:
     return param_use(call.method, call.string(0) or "", call.string(place))
 
 
-def prefix(name: str) -> str:
-    """What all names below a parameter's begin with."""
-    return name if name.endswith("/") else f"{name}/"
-
-
 def hidden_registration(
     held: Registration, endpoint: Endpoint, asker: Asker, addressing: Addressing
 ) -> Answered:

@@ -13,7 +13,7 @@ from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
-from rosproxy.ros1.protocol.master_methods import Kind, row
+from rosproxy.ros1.protocol.master_methods import Kind, prefix, row
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -265,7 +265,7 @@ class PolicyJudge:
         found = [self._policy.judge(use.kind, name, [caller_id], source) for name in use.names]
         if use.below:
             found += [
-                self._policy.judge_below(use.kind, policing.prefix(name), caller_id, source)
+                self._policy.judge_below(use.kind, prefix(name), caller_id, source)
                 for name in use.names
             ]
         return strictest(found)
@@ -284,7 +284,7 @@ class PolicyJudge:
         )
         if sets_more or not all(one.allowed for one in own):
             return self._judge_use(use, caller_id, source)
-        starts = tuple(map(policing.prefix, use.names))
+        starts = tuple(map(prefix, use.names))
         below = [name for name in await params.names() if name.startswith(starts)]
         found = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
         return strictest([*own, *found])

@@ -16,11 +16,11 @@ from dataclasses import replace
 from rosproxy.access.layers import Verdict
 from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import Kind
+from rosproxy.ros1.protocol.master_methods import Kind, prefix
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.rewriting.policing import KINDS, prefix
+from rosproxy.ros1.rewriting.policing import KINDS
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy import registration as policy
