@@ -11,6 +11,8 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.http_client import HttpClient, LongReply
+from rosproxy.net.late_answers import LATE_TIMEOUT
+from tests.clock import pass_time
 from tests.integration.net import MASTER, until
 
 REPLY = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
@@ -101,6 +103,60 @@ async def test_no_more_calls_are_under_way_than_allowed(client, peer):
     assert peer.accepted == 4
 
 
+@pytest.fixture
+def answer(peer: Peer) -> asyncio.Event:
+    """When the peer answers what it was asked; then it waits for the end of the connection."""
+    event = asyncio.Event()
+
+    async def late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await peer.request(reader)
+        due, ended = asyncio.create_task(event.wait()), asyncio.create_task(reader.read())
+        await asyncio.wait([due, ended], return_when=asyncio.FIRST_COMPLETED)
+        writer.write(REPLY)
+        due.cancel()
+        await ended
+
+    peer.serve = late
+    return event
+
+
+async def give_up(client: HttpClient, peer: Peer) -> None:
+    with pytest.raises(TimeoutError):
+        await post(client, peer, within=0.1)
+
+
+async def test_a_peer_that_answers_late_finds_its_caller_on_the_connection(client, peer, answer):
+    await give_up(client, peer)
+    assert (peer.open, len(client.late)) == (1, 1)
+    answer.set()
+    await until(lambda: not peer.open, "the connection is closed once it has its answer")
+    assert len(client.late) == 0
+
+
+async def test_a_peer_that_never_answers_loses_its_caller_in_the_end(client, peer, answer):
+    await give_up(client, peer)
+    await pass_time(LATE_TIMEOUT)
+    await until(lambda: not peer.open, "the connection is closed")
+    assert len(client.late) == 0
+    peer.serve = peer.answer_always
+    assert await post(client, peer) == b"ok"
+
+
+async def test_no_more_answers_are_waited_for_than_allowed(client, peer, answer, monkeypatch):
+    monkeypatch.setattr("rosproxy.net.late_answers.MOST_LATE", 2)
+    await asyncio.gather(*(give_up(client, peer) for _ in range(4)))
+    assert len(client.late) == 2
+    await until(lambda: peer.open == 2, "the others are closed")
+    await client.close()
+    assert len(client.late) == 0
+
+
+async def test_what_is_left_after_the_end_is_closed_at_once(client, peer, answer):
+    await client.late.end()
+    await give_up(client, peer)
+    assert len(client.late) == 0
+
+
 @pytest.mark.parametrize("reset", [False, True], ids=["closed", "reset"])
 @pytest.mark.parametrize("when", ["between", "in the call"])
 async def test_a_kept_connection_that_ends_costs_one_more_try(client, peer, reset, when):
@@ -140,18 +196,6 @@ async def test_a_new_connection_that_is_closed_is_not_tried_again(client, peer):
     with pytest.raises(aiohttp.ServerDisconnectedError):
         await post(client, peer)
     assert peer.accepted == 1
-
-
-async def test_a_call_that_timed_out_leaves_no_connection(client, peer):
-    async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.read()
-
-    peer.serve = silent
-    with pytest.raises(TimeoutError):
-        await post(client, peer, within=0.1)
-    await until(lambda: peer.open == 0, "the connection is closed")
-    peer.serve = peer.answer_always
-    assert await post(client, peer) == b"ok"
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ write does not read, so that they take some 100 KiB whatever their length.
 import asyncio
 import errno
 import re
+import socket
 from collections.abc import AsyncIterator, Callable, Mapping
 from functools import partial
 from typing import Protocol
@@ -21,6 +22,7 @@ from aiohttp.http import StreamWriter
 
 from rosproxy.net import resolver
 from rosproxy.net.addresses import HostPort
+from rosproxy.net.late_answers import LateAnswers
 from rosproxy.net.sockets import dial
 
 MAX_BODY = 64 * 1024 * 1024
@@ -71,9 +73,9 @@ class HttpClient:
     """Calls one kind of peer.
 
     ``headers`` are sent with each call. A connection that is not used for ``keepalive`` seconds is
-    closed; there are never more than ``most`` in use, those of long bodies apart. No body is longer
-    than ``longest`` bytes. ``source`` is who gives the peers' names (see `resolver`). ``last`` is
-    the address reached last.
+    closed; there are never more than ``most`` in use, those of long bodies apart, and those in
+    ``late``, which have been given up. No body is longer than ``longest`` bytes. ``source`` is who
+    gives the peers' names (see `resolver`). ``last`` is the address reached last.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class HttpClient:
         self._longest = longest
         self._idle: dict[HostPort, list[tuple[float, ResponseHandler]]] = {}
         self._used: set[ResponseHandler] = set()
+        self.late = LateAnswers()
         self._sweeper: asyncio.TimerHandle | None = None
         self._closed = False
 
@@ -153,7 +156,12 @@ class HttpClient:
         for handler in [*self._used, *(one for idle in self._idle.values() for _, one in idle)]:
             handler.close()
         self._idle.clear()
+        await self.late.end()
         await asyncio.sleep(0)
+
+    def leave(self, sock: socket.socket) -> None:
+        """Close a connection that is not of this client once it has its answer."""
+        self.late.wait(partial(_rest, sock), sock.close)
 
     def _head(self, path: str, host: str, size: int) -> bytes:
         if not (_SENDABLE.fullmatch(path) and _SENDABLE.fullmatch(host)):
@@ -186,6 +194,10 @@ class HttpClient:
             for piece in pieces(head, body):
                 handler.transport.write(piece)
             return await _answer(handler)
+        except asyncio.CancelledError:  # too late, or nobody wants it any more
+            self._used.discard(handler)
+            self.late.wait(partial(_late_answer, handler), handler.close)
+            raise
         except BaseException:
             self._drop(handler)
             raise
@@ -335,6 +347,18 @@ async def _answer(handler: ResponseHandler) -> tuple[aiohttp.StreamReader, int |
         raise BadResponse("the body is compressed")
     length = None if message.chunked else message.headers.get("Content-Length")
     return payload, int(length) if length else None
+
+
+async def _late_answer(handler: ResponseHandler) -> None:
+    stream, _ = await _answer(handler)
+    while not stream.at_eof():
+        await stream.readany()
+
+
+async def _rest(sock: socket.socket) -> None:
+    """Take all that comes on a connection until it is ended."""
+    while await asyncio.get_running_loop().sock_recv(sock, LONG):
+        pass
 
 
 def is_plain(headers: Mapping[str, str]) -> bool:

@@ -1,6 +1,7 @@
 """Nodes that are well are asked over one connection that is kept; what becomes of it is noticed."""
 
 import os
+import socket
 from collections import Counter
 from collections.abc import AsyncIterator
 
@@ -10,6 +11,7 @@ from examples.demo.fake_http import End, ok, value
 from examples.demo.fake_node import FakeNode
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.clients.kept import KeptConnections
+from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.runtime import Runtime
@@ -83,6 +85,20 @@ async def test_a_node_that_hangs_is_silent_after_its_time(kept: Kept, node: Fake
     await until(lambda: len(node.requests) == 2, "it was asked")
     assert kept.collect(25.0) == {}
     assert kept.collect(25.1) == {NAME: ProbeResult.SILENT}
+
+
+async def test_a_node_that_hangs_finds_its_caller_when_it_answers(
+    kept: Kept, node: FakeNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = list[socket.socket]()
+    monkeypatch.setattr(NodeClient, "leave", lambda _nodes, sock: left.append(sock))
+    node.hang = True
+    ask(kept, node, 20.0)
+    await until(lambda: len(node.requests) == 1, "it was asked")
+    assert kept.collect(25.1) == {NAME: ProbeResult.SILENT}
+    assert [sock.getpeername() for sock in left] == [node.slave.address]
+    assert kept.collect(25.2) == {}
+    left.pop().close()
 
 
 @pytest.mark.parametrize(

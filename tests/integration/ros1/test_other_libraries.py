@@ -240,7 +240,7 @@ async def test_a_uri_without_a_slash_at_the_end_is_the_same_after_a_restart(prox
 
 
 async def test_a_uri_without_a_host_is_at_the_callers_address(proxy, master, node, make_node):
-    """As roslisp gives it where it has ROS_IP alone."""
+    """As roslisp gives it where ROS_HOSTNAME is set to nothing."""
     node.uri_form = f"http://:{node.slave.address[1]}"
     await populate(proxy, node)
     uri = master.nodes[node.name]

@@ -106,6 +106,8 @@ class KeptConnections(Generic[_K]):
         for who, result in found.items():
             if result is ProbeResult.ANSWERED:
                 del self._waiting[who]
+            elif result is ProbeResult.SILENT:
+                self._leave(who)
             else:
                 self.close(who)
         return found
@@ -122,6 +124,13 @@ class KeptConnections(Generic[_K]):
         if kept is not None:
             del self._by_number[kept.sock.fileno()]
             kept.sock.close()
+
+    def _leave(self, who: _K) -> None:
+        """Give up a connection on which an answer is due."""
+        kept = self._kept.pop(who)
+        del self._waiting[who], self._by_number[kept.sock.fileno()]
+        self._ended.unregister(kept.sock)
+        self._nodes.leave(kept.sock)
 
     def close_all(self) -> None:
         """Close all connections, for good."""

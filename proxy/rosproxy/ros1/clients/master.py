@@ -8,6 +8,7 @@ the ROS triple ``[1, message, value]`` in the reply; ``multicall`` makes many to
 """
 
 import asyncio
+import socket
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -218,6 +219,10 @@ class MasterClient:
         """The value of the proxy's own call to a node. Raises Unreachable, MasterError."""
         body = xmlrpc.dump_call(method, CALLER_ID, *params)
         return read_value(method, await self.post_to_node(where, body, within))
+
+    def leave_node(self, sock: socket.socket) -> None:
+        """Close a connection to a node on which an answer is due, once that has come."""
+        self._nodes.leave(sock)
 
     def node_request(self, where: HostPort, body: bytes) -> bytes:
         """A call to a node as HTTP, for whoever has a connection of his own."""

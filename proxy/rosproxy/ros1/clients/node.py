@@ -66,6 +66,10 @@ class NodeClient:
         """A connection to the slave API at an address that is about to be made. Raises OSError."""
         return sockets.begin_to_dial(self._upstream.reach(where))
 
+    def leave(self, sock: socket.socket) -> None:
+        """Close such a connection once the answer that is due on it has come."""
+        self._upstream.leave_node(sock)
+
     def pid_question(self, where: HostPort) -> bytes:
         """The HTTP request by which the node at an address is asked for its pid."""
         return self._upstream.node_request(where, _PID_CALL)

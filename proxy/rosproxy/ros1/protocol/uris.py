@@ -50,7 +50,7 @@ def parse_service_uri(uri: str) -> HostPort | None:
 def placed(uri: str, address: str) -> str:
     """A URI with the address that it came from where it names no host, as ``http://:41063``.
 
-    roslisp says so where it has ROS_IP alone, and rosmaster takes it.
+    roslisp says so where ROS_HOSTNAME is set to nothing, and rosmaster takes it.
     """
     found = _NO_HOST.fullmatch(uri)
     return f"{found[1]}{HostPort(address, int(found[2]))}{found[3]}" if found else uri

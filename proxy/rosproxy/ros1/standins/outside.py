@@ -18,6 +18,7 @@ from rosproxy.net.resolver import NODES, resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
+from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.judge import PolicyJudge
 
@@ -34,10 +35,17 @@ class Outside:
     def __init__(self, context: Context, note_refused: Callable[[StandIn], None]) -> None:
         self._context, self._note_refused = context, note_refused
 
-    async def refuses(self, where: HostPort) -> bool:
-        """Whether nobody listens at a port outside."""
+    async def refuses(self, uri: str, where: HostPort) -> bool:
+        """Whether nobody listens for the URI of a node outside, or of a service there.
+
+        A node is asked something: roslisp ends if it is connected to and then told nothing.
+        """
         try:
-            (await self._dial(where, LOOK_TIMEOUT)).close()
+            reached = await self.reach(where)
+            if not parse_service_uri(uri):
+                answer = await self._context.nodes.probe(reached, LOOK_TIMEOUT)
+                return answer.probe is ProbeResult.REFUSED
+            (await sockets.dial(reached, LOOK_TIMEOUT)).close()
         except ConnectionRefusedError:
             return True
         except OSError as error:

@@ -94,7 +94,7 @@ class StandInPorts:
         if not wanted:
             return
         again = self._refused.keys() & wanted.keys()
-        still = await asyncio.gather(*(self._refuses(wanted[uri]) for uri in again))
+        still = await asyncio.gather(*(self._refuses(uri, wanted[uri]) for uri in again))
         for uri, gone in zip(again, still, strict=True):
             if not gone:
                 self._refused.pop(uri, None)
@@ -137,7 +137,7 @@ class StandInPorts:
                 if parse_service_uri(uri):
                     ended = time.time() - problem.when > SERVICE_PROBLEM
                 else:
-                    ended = await self._outside.refuses(where)
+                    ended = await self._outside.refuses(uri, where)
                 if ended:
                     self._context.problems.solved(uri)
 
@@ -329,9 +329,9 @@ class StandInPorts:
         if len(self._refused) > stand_ins.MOST_STAND_INS:
             del self._refused[next(iter(self._refused))]
 
-    async def _refuses(self, where: HostPort) -> bool:
+    async def _refuses(self, uri: str, where: HostPort) -> bool:
         async with self._trying:
-            return await self._outside.refuses(where)
+            return await self._outside.refuses(uri, where)
 
     def _connections(self) -> Counter[int]:
         counts = Counter(relay.port for relay in self._tcpros.relays if relay.inside_asks)
