@@ -18,10 +18,11 @@ CAP_NET_ADMIN = 1 << 12
 CAP_SYS_ADMIN = 1 << 21
 ALL, MARKED, NONE = "all", "marked", "none"
 
-ROS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
+ROS, CLIENTS, CHROMIUM, JAZZY, ROS2, NODES, ENGINE, COMPOSE, PROMETHEUS, KUBERNETES, IMAGES = (
     PREPARATIONS
 ) = (
     "install-ros",
+    "install-clients",
     "install-browser",
     "install-jazzy",
     "install-ros2",
@@ -158,6 +159,9 @@ ISOLATED = Layer(
 All of tests/ros may run so, which takes as long again. What is left out is the same in `ros`, or
 rests on what runs here.
 """
+ROS1_CLIENTS = Layer(
+    "clients", setup=(ROS, NODES, CLIENTS), workers=2, obstacle=debian_root_obstacle
+)
 ROS2_NODES = Layer("ros2", MARKED, (ROS2,), (JAZZY,), 2, debian_root_obstacle)
 BROWSER = Layer("browser", setup=(ROS, NODES, CHROMIUM), obstacle=debian_root_obstacle)
 DOCKER_ENGINE = Layer(
@@ -182,12 +186,12 @@ ROS2_CLUSTER = Layer(
 )
 LAYERS = (
     *(UNIT, INTEGRATION, ABUSE, CHART, IMAGE),
-    *(ROS_NODES, ISOLATED, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
+    *(ROS_NODES, ISOLATED, ROS1_CLIENTS, ROS2_NODES, BROWSER, DOCKER_ENGINE, CLUSTER, ROS2_CLUSTER),
 )
 
 BESIDE_PREPARATION = (UNIT,)
 ALONE_FIRST = (INTEGRATION,)
 LONGEST = (DOCKER_ENGINE, CLUSTER)
-SIDE_BY_SIDE = (ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, BROWSER, CHART)
+SIDE_BY_SIDE = (ROS_NODES, IMAGE, ROS2_NODES, ISOLATED, ROS1_CLIENTS, BROWSER, CHART)
 ALONE_LAST = (ABUSE, ROS2_CLUSTER)
 """When which layers run, in this order; LONGEST and SIDE_BY_SIDE begin together."""

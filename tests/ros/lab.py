@@ -59,6 +59,7 @@ class Lab:
         self.proxy_options: tuple[str, ...] = ()
         self.proxy_prefix: tuple[str, ...] = ()
         self.proxy_path = SYSTEM_PATH
+        self.programs = {"rospy": ("node.py",), "roscpp": (str(compiled_node()),)}
         self.master: Process | None = None
         self.proxy: Process | None = None
         self.nodes: list[Process] = []
@@ -158,15 +159,14 @@ class Lab:
     def node(
         self, library: str, role: str, kind: str, name: str = "", env: Any = None, **options: Any
     ) -> Process:
-        """Starts a test node: `library` is rospy or roscpp, `kind` one of its roles.
+        """Starts a test node: `library` is one of `programs`, `kind` one of its roles.
 
         Remappings go in through an option named `remap`, as a list of words.
         """
         words = [*options.pop("remap", []), f"__name:={name or self.unique(kind)}"]
         for option, value in options.items():
             words += [f"--{option.replace('_', '-')}", str(value)]
-        program = {"rospy": "node.py", "roscpp": str(compiled_node())}[library]
-        return self.start(role, program, kind, *words, env=env)
+        return self.start(role, *self.programs[library], kind, *words, env=env)
 
     def start(self, role: str, *argv: str, env: Mapping[str, str] | None = None) -> Process:
         """Starts any program on a machine; it is ended with the test."""

@@ -1,0 +1,35 @@
+"""Which client libraries there are, what each can't do without a proxy either, and the cases.
+
+What LIMITS has is left out of the matrix; test_limits.py shows it without a proxy.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+LIBRARIES = ("goroslib", "rosrust", "roslibrust", "rosnodejs", "foxglove", "roslisp")
+PEERS = ("rospy", "roscpp")
+SIDES = {"inside": ("c1", "out"), "outside": ("out", "c1")}
+"""Where the library's node runs, and where its peers do."""
+
+SERVE, SERVE_ON, CALL, CALL_ON = "serve", "serve persistently", "call", "call persistently"
+PARAMETERS = "parameters"
+LIMITS: dict[str, tuple[str, ...]] = {
+    "rosrust": (SERVE_ON, CALL_ON),
+    "roslibrust": (PARAMETERS,),
+    "foxglove": (SERVE, SERVE_ON, CALL, CALL_ON),
+    "roslisp": (SERVE_ON,),
+}
+"""What a library can't do."""
+
+
+def able(*needs: str) -> list[str]:
+    """The libraries that can do all of something."""
+    return [name for name in LIBRARIES if not {*LIMITS.get(name, ())} & {*needs}]
+
+
+def each_client(*needs: str) -> pytest.MarkDecorator:
+    """Every library that can do what a test needs, inside and outside."""
+    names = able(*needs)
+    rows = {f"{name}-{side}": (name, *ways) for name in names for side, ways in SIDES.items()}
+    return pytest.mark.parametrize(("library", "side", "across"), rows.values(), ids=rows.keys())
