@@ -7,7 +7,7 @@ import pytest
 from examples.demo.fake_http import value
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from tests.integration.conftest import MakeNode
+from tests.integration.conftest import MakeNode, MakeProxy
 from tests.integration.net import HOST, NODE, OTHER_NODE, looks, refuses, rpc, until
 from tests.integration.proxy import Proxy
 
@@ -80,6 +80,50 @@ async def test_a_node_is_believed_for_itself_alone(
     await until(partial(refuses, lease), "the port refuses")
     await looks(master)
     assert await refuses(lease)
+
+
+async def leave_behind(master: FakeMaster, uri: str) -> None:
+    """What a node has at the master that had the port of a slave URI before, and is gone."""
+    await rpc(master.uri, "registerPublisher", "/former", "/former/topic", "x/Y", uri)
+    service = uri.replace("http://", "rosrpc://").rstrip("/")
+    await rpc(master.uri, "registerService", "/former", "/former/service", service, uri)
+
+
+@pytest.mark.parametrize("serves", [False, True], ids=["has a topic", "only serves"])
+async def test_a_node_does_not_answer_for_the_one_before_at_its_port(
+    proxy: Proxy, master: FakeMaster, node: FakeNode, serves: bool
+) -> None:
+    """The URI of both is the same."""
+    await (node.serve(proxy.master) if serves else node.publish(proxy.master))
+    uri = proxy.uri(node)
+    await leave_behind(master, uri)
+    await proxy.restart()
+    await until(lambda: "/former" not in master.nodes, "the other is taken back")
+    assert set(master.nodes) == {node.name}
+    assert await proxy.serves(node)
+    reason = "[/former] Reason: new node registered with same name"
+    assert (await rpc(uri, "shutdown", "/master", reason))[0] == 1
+    assert "shutdown" not in [method for method, _ in node.calls]
+
+
+async def test_what_was_left_at_a_port_is_taken_back_though_another_node_has_it(
+    make_proxy: MakeProxy, master: FakeMaster, node: FakeNode
+) -> None:
+    proxy = await make_proxy(cleanup_after=0.3)
+    await node.publish(proxy.master)
+    uri = proxy.uri(node)
+
+    async def forget() -> None:
+        await node.call(master.uri, "unregisterPublisher", "/chatter", uri)
+        await leave_behind(master, uri)
+        master.params.clear()
+
+    await proxy.restart(forget)
+    await node.publish(proxy.master)
+    assert proxy.uri(node) == uri
+    await until(lambda: set(master.nodes) == {node.name}, "it is taken back")
+    assert master.tables["services"] == {}
+    assert await proxy.serves(node)
 
 
 async def test_a_master_that_does_not_keep_it_is_told_of(

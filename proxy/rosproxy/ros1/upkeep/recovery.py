@@ -264,6 +264,7 @@ class Recovery:
         addresses = await resolve(host, address)
         if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
+        await self._registrar.disown(endpoint, policy.others(held, info))
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             held_now = list(endpoint.registrations.values())
             await self._registrar.register([(endpoint, one) for one in held_now])

@@ -131,20 +131,35 @@ class Registrar:
             await self.clean_up(endpoint)
 
     async def take_back(self, uri: str, held: Sequence[Registration]) -> None:
-        """Unregister what names hold by an advertised URI that no endpoint stands for.
+        """Unregister what names hold by an advertised URI that are at no endpoint.
 
         Names that have another URI by now are left alone. Raises Unreachable.
         """
         addressing, upstream = self._context.addressing, self._context.upstream
         known = await upstream.look_up("lookupNode", {one.caller_id for one in held})
         where = parse_slave_uri(uri)
-        if where is None or addressing.stands_for(uri):
+        if where is None:
             return
-        left = [one for one in held if known.get(one.caller_id) == uri]
+        endpoint = addressing.stands_for(uri)  # of another node, which has the port by now
+        names = endpoint.callers if endpoint else ()
+        left = [
+            one for one in held if known.get(one.caller_id) == uri and one.caller_id not in names
+        ]
         service = service_uri(where)
         await upstream.multicall([policy.unregister_call(one, uri, service) for one in left])
         if left:
             log.info("took back %d registrations that a former proxy left for %s", len(left), uri)
+
+    async def disown(self, endpoint: Endpoint, registrations: Sequence[Registration]) -> None:
+        """Unregister names that are not its node's: they had the port before. Raises Unreachable.
+
+        They are no former names of the node either, at which the master's ``shutdown`` is meant
+        for it (`Adopter.absorb_shutdown`).
+        """
+        current = [one for one in registrations if endpoint.registrations.get(one.key) is one]
+        await self._forget(endpoint, current)
+        for registration in current:
+            endpoint.former_callers.pop(registration.caller_id, None)
 
     async def come_back(self, endpoint: Endpoint, pid: int | None) -> None:
         """Register a node again that was cleaned up and answers after all, as process ``pid``.

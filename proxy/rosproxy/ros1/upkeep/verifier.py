@@ -49,12 +49,16 @@ class Verifier:
         info: NodeInfo,
         service_ports: Iterable[int] = (),
     ) -> bool | None:
-        """The same of a node that has said something of itself."""
-        borne_out = policy.confirmed_by(held, info)
-        ports = {*info.topic_ports.values(), *service_ports}
-        if borne_out is None and await self._answers_for(where, held, info, ports):
+        """The same of a node that has said something of itself: one of the names is enough."""
+        names = policy.by_name(held)
+        verdicts = {name: policy.confirmed_by(names[name], info) for name in names}
+        if True in verdicts.values():
             return True
-        return borne_out
+        untold = [one for one in held if verdicts[one.caller_id] is None]
+        ports = {*info.topic_ports.values(), *service_ports}
+        if await self._answers_for(where, untold, info, ports):
+            return True
+        return None if untold or not held else False
 
     async def _answers_for(
         self, where: HostPort, held: Collection[Registration], info: NodeInfo, ports: set[int]

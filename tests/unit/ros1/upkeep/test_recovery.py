@@ -230,6 +230,14 @@ def test_a_node_bears_out_what_the_master_says_of_it(
     assert policy.confirmed_by(endpoint.registrations.values(), said) is confirmed
 
 
+def test_names_that_are_not_the_node_s_are_told_apart() -> None:
+    own, former = held("/a", "/own"), held("/b", "/former")
+    service = Registration(SRV, "/s", "/former")
+    everything = [own, former, service, Registration(SRV, "/t", "/untold"), held("/c", "/own")]
+    assert policy.others(everything, NodeInfo(7, {"/a": "t"}, {})) == [former, service]
+    assert policy.others(everything, NodeInfo(7, {"/a": "t"}, None)) == []
+
+
 def test_a_node_is_asked_for_a_few_of_its_topics_and_services() -> None:
     topics = [held(name) for name in ("/rosout", "/d", "/c", "/b", "/a")]
     services = [Registration(SRV, name, "/n") for name in ("/y", "/x")]

@@ -114,6 +114,24 @@ def confirmed_by(held: Iterable[Registration], info: NodeInfo) -> bool | None:
     return False if told and None not in told else None
 
 
+def by_name(registrations: Iterable[Registration]) -> dict[str, list[Registration]]:
+    """Registrations by the node names that have made them.
+
+    Several names at one slave URI are several processes, as a rule: a port is used again, and the
+    master keeps what the one before had until it is taken back.
+    """
+    names: dict[str, list[Registration]] = {}
+    for registration in registrations:
+        names.setdefault(registration.caller_id, []).append(registration)
+    return names
+
+
+def others(registrations: Iterable[Registration], info: NodeInfo) -> list[Registration]:
+    """What names have registered that the node which says this of itself does not bear out."""
+    names = by_name(registrations).values()
+    return [one for own in names if confirmed_by(own, info) is False for one in own]
+
+
 def to_ask(held: Iterable[Registration]) -> tuple[list[str], list[Registration]]:
     """The topics and services by which a node can show that it is the one that registered them.
 
