@@ -154,6 +154,21 @@ async def test_a_node_that_is_gone_refuses_until_it_is_back(proxy: Proxy, robot:
     assert (await rpc(at, "getPid", "/tool", source=NODE))[2] == robot.pid
 
 
+async def test_a_node_with_a_problem_is_asked_whether_it_lives(
+    proxy: Proxy, robot: FakeNode
+) -> None:
+    """roslisp ends if it is connected to and told nothing."""
+    await look_up(proxy, robot)
+    proxy.ros1.context.problems.add(robot.uri, "a topic can't be reached")
+    robot.calls.clear()
+    await proxy.ros1.stand_ins.tidy()
+    assert [method for method, _ in robot.calls] == ["getPid"]
+    assert proxy.app.status()["problems"]
+    await robot.stop()
+    await proxy.ros1.stand_ins.tidy()
+    assert not proxy.app.status()["problems"]
+
+
 async def test_denied_topics_and_services_are_not_reached_by_an_address_that_is_known(
     make_proxy: MakeProxy, robot: FakeNode
 ) -> None:
