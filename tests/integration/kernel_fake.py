@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from rosproxy.forwarding.kernel import plane, syncer
-from rosproxy.forwarding.kernel.policy import HostForwarding
+from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 
 PAIRS = ("marks", "hosts4", "hosts6", "ports")

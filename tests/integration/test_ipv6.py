@@ -87,7 +87,7 @@ async def test_both_stacks_on_the_same_ports(proxy6: Proxy, make_node: Any) -> N
     proxy6.master = PROXY, proxy6.settings.master_port
     await four.publish(proxy6.master)
     endpoint = proxy6.endpoint(four)
-    assert (endpoint.place.address, endpoint.place.named) == (NODE, True)
+    assert (endpoint.location.address, endpoint.location.named) == (NODE, True)
     assert (await other.subscribe(proxy6.master))[2] == [four.uri]
     for host in ("::1", HOST):
         assert (await rpc((host, endpoint.port), "getPid", "/outside"))[2] == four.pid

@@ -330,7 +330,7 @@ async def test_odd_host_names_are_placed_at_their_source(proxy, node):
     for host in ("a" * 300, "é.invalid", "-", "_", "x.", "127.1", "0x7f.1"):
         uri = f"http://{host}:5/"
         assert (await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri))[0] == 1, uri
-    assert {e.place.address for e in proxy.ros1.context.registry} == {NODE}
+    assert {e.location.address for e in proxy.ros1.context.registry} == {NODE}
 
 
 async def test_multicalls_with_odd_elements_keep_their_order(proxy, node):

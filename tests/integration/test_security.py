@@ -97,7 +97,7 @@ async def test_a_forged_caller_api_does_not_open_a_door_to_an_ordinary_service(
     uri = f"http://{OTHER_NODE}:{victim.port}/"
     await node.call(proxy.master, "registerPublisher", "/t", "x/Y", uri)
     (endpoint,) = proxy.ros1.context.registry
-    assert endpoint.place.address == NODE
+    assert endpoint.location.address == NODE
     probes = len(victim.seen)
     lease = HOST, endpoint.port
     for data in (post(xml("getBusStats", "/outside")), topic_header("/t")):

@@ -12,12 +12,12 @@ from rosproxy.leases.ports import PortMap, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri, slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 from rosproxy.ros1.rewriting import master_api, master_calls
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.master_calls import Admission, Noted, Refusal
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.ros1.rewriting.master_calls import CallOutcome, Refusal, RegistryChange
 from rosproxy.settings import Settings
 
 HOST = "robot-host"
@@ -126,9 +126,9 @@ def make_stand_ins(ports: PortMap | None = None, **options: Any) -> StandIns:
     return StandIns(settings)
 
 
-def make_asker(address: str, proxy: str = PROXY, **more: Any) -> Asker:
+def make_caller(address: str, proxy: str = PROXY, **more: Any) -> Caller:
     """A caller at an inside address."""
-    return Asker(address, proxy, **more)
+    return Caller(address, proxy, **more)
 
 
 def add_node(
@@ -141,8 +141,9 @@ def add_node(
     """Admit a node; its ``address`` is the host in its URI unless given."""
     node = parse_slave_uri(uri)
     assert node
-    place = Place(address or node.host, named if named is not None else address is None, confirmed)
-    return addressing.registry.admit(uri, node, place, place.address)
+    is_named = named if named is not None else address is None
+    location = NodeLocation(address or node.host, is_named, confirmed)
+    return addressing.registry.admit(uri, node, location, location.address)
 
 
 def add_registration(
@@ -161,7 +162,7 @@ class Exchange:
 
     sent: bytes
     received: bytes
-    facts: list[Noted] = field(default_factory=list)
+    facts: list[RegistryChange] = field(default_factory=list)
 
 
 Refuse = Callable[[str], bool]
@@ -169,15 +170,15 @@ Refuse = Callable[[str], bool]
 
 def exchange(
     addressing: Addressing,
-    asker: Asker,
+    caller: Caller,
     body: bytes,
     reply: bytes,
     refuse: Refuse = lambda uri: False,
 ) -> Exchange:
     """What the shell does with a call: admit, export, ask the master, note, import."""
-    request = master_calls.read_request(body, asker)
+    request = master_calls.read_request(body, caller)
     admissions = [
-        _admit(addressing, master_calls.registering_uri(call), asker, refuse)
+        _admit(addressing, master_calls.registering_uri(call), caller, refuse)
         for call in request.calls
     ]
     exported = master_api.export_request(request, admissions, addressing)
@@ -190,7 +191,7 @@ def exchange(
     return Exchange(exported.body, master_api.import_reply(answer, addressing), facts)
 
 
-def note(registry: Registry, fact: Noted) -> None:
+def note(registry: Registry, fact: RegistryChange) -> None:
     """Take a fact into the registry."""
     held = fact.registration
     if fact.endpoint:
@@ -199,15 +200,15 @@ def note(registry: Registry, fact: Noted) -> None:
         registry.unregister(held.kind, held.name, held.caller_id)
 
 
-def _admit(addressing: Addressing, uri: str | None, asker: Asker, refuse: Refuse) -> Admission:
+def _admit(addressing: Addressing, uri: str | None, caller: Caller, refuse: Refuse) -> CallOutcome:
     node = parse_slave_uri(uri) if uri else None
     if uri is None or node is None:
         return None
     if refuse(uri):
         return Refusal("rosproxy: no port is left")
     named = node.host.startswith("10.")
-    place = Place(node.host if named else asker.address, named)
-    return addressing.registry.admit(uri, node, place, asker.address)
+    location = NodeLocation(node.host if named else caller.address, named)
+    return addressing.registry.admit(uri, node, location, caller.address)
 
 
 def own_uri(address: str, port: int = 40001) -> str:

@@ -35,9 +35,9 @@ from rosproxy.ros1.api.master import MasterApi, PublishedMaster
 from rosproxy.ros1.api.slave import SlaveApi
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
 from rosproxy.ros1.servers.callers import Callers
-from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import RATE_INTERVAL, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import Guard, XmlRpcServer
 from rosproxy.ros1.standins.ports import TIDY_INTERVAL, StandInPorts
@@ -45,9 +45,9 @@ from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.containers import ContainerEvents
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
 from rosproxy.ros1.upkeep.master_monitor import MasterMonitor
-from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import ENFORCE_TICK, Enforced, PolicyEnforcer
 from rosproxy.ros1.upkeep.prober import PROBE_TICK, Prober
+from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import RESUBSCRIBE_TICK, Resubscriber
@@ -69,7 +69,7 @@ class Ros1:
     def __init__(self, runtime: Runtime) -> None:
         self.settings = settings = runtime.settings
         self.context = context = Context(runtime)
-        self._judge = judge = PolicyJudge(
+        self._access = access = AccessChecks(
             context.policy, context.registry, context.addressing, context.upstream
         )
         self.tcpros = TcprosServer(context)
@@ -79,19 +79,19 @@ class Ros1:
             settings, holders, context.tasks, context.problems, context.now, table, context.near
         )
         self._callers = Callers(context)
-        self.stand_ins = StandInPorts(context, self._callers, self.tcpros, judge, plane)
-        self._matchmaker = matchmaker = Matchmaker(context, self.stand_ins)
+        self.stand_ins = StandInPorts(context, self._callers, self.tcpros, access, plane)
+        self._publisher_updates = publisher_updates = PublisherUpdates(context, self.stand_ins)
         self._memory = LeaseMemory(context)
-        self.registrar = registrar = Registrar(context, matchmaker, self._memory)
+        self.registrar = registrar = Registrar(context, publisher_updates, self._memory)
         self._resubscriber = Resubscriber(
-            context, registrar, matchmaker, self.tcpros, plane, self.stand_ins
+            context, registrar, publisher_updates, self.tcpros, plane, self.stand_ins
         )
         self.leases = leases = self._make_leases()
         self._recovery = Recovery(
-            context, leases, registrar, self._resubscriber, plane, judge, self._memory
+            context, leases, registrar, self._resubscriber, plane, access, self._memory
         )
         self._enforcer = PolicyEnforcer(
-            context, leases, registrar, self._recovery, self.tcpros, plane, judge, self.stand_ins
+            context, leases, registrar, self._recovery, self.tcpros, plane, access, self.stand_ins
         )
         self._admission = NodeAdmission(context, leases, registrar, self._recovery)
         self.prober = Prober(context, leases, registrar, self._resubscriber, self._recovery)
@@ -101,7 +101,7 @@ class Ros1:
         self._state = ProxyState(context, monitor, self.tcpros, self.stand_ins, plane)
         self._adopter = Adopter(context, leases, self._admission, registrar)
         leases.server = slave = SlaveApi(
-            context, leases, self.stand_ins, self._adopter, self.tcpros, judge
+            context, leases, self.stand_ins, self._adopter, self.tcpros, access
         )
         self._servers = [slave.server, self.stand_ins.server]
         self._acceptors: list[Acceptor] = []
@@ -138,8 +138,8 @@ class Ros1:
             self.stand_ins,
             self._recovery,
             self._adopter,
-            self._judge,
-            self._matchmaker,
+            self._access,
+            self._publisher_updates,
             self._enforcer,
             ServiceFinder(self.context),
             self._memory,

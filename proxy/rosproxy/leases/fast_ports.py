@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar, cast
 from rosproxy.leases.ports import PortPool, PortRange
 
 
-class Holder(Protocol):
+class LeaseHolder(Protocol):
     """Who has a port that the kernel may forward, as the kernel plane needs it.
 
     An endpoint or stand-in of ROS 1 (`rosproxy.ros1.registry`), or a lease of ROS 2
@@ -61,11 +61,11 @@ class Holder(Protocol):
         """The names of the nodes there; one, as a rule."""
 
 
-_H = TypeVar("_H", bound=Holder)
-_H_co = TypeVar("_H_co", bound=Holder, covariant=True)
+_H = TypeVar("_H", bound=LeaseHolder)
+_H_co = TypeVar("_H_co", bound=LeaseHolder, covariant=True)
 
 
-class Holders(Protocol[_H_co]):
+class LeaseHolders(Protocol[_H_co]):
     """All endpoints, and the range that their ports are of."""
 
     @property
@@ -83,21 +83,23 @@ class Holders(Protocol[_H_co]):
 class BothSides:
     """The endpoints inside and the stand-ins for nodes outside, which share no port."""
 
-    def __init__(self, inside: Holders[Holder], outside: Mapping[int, Holder]) -> None:
+    def __init__(
+        self, inside: LeaseHolders[LeaseHolder], outside: Mapping[int, LeaseHolder]
+    ) -> None:
         self._inside, self._outside = inside, outside
 
     @property
-    def by_port(self) -> Mapping[int, Holder]:
+    def by_port(self) -> Mapping[int, LeaseHolder]:
         """All by their leases, or the ports that stand in for them."""
         views = (self._inside.by_port, self._outside)
-        return ChainMap(*(cast(dict[int, Holder], view) for view in views))  # it is only read
+        return ChainMap(*(cast(dict[int, LeaseHolder], view) for view in views))  # it is only read
 
     @property
     def pool(self) -> PortPool:
         """The ports of the range, which are for the endpoints inside."""
         return self._inside.pool
 
-    def __iter__(self) -> Iterator[Holder]:
+    def __iter__(self) -> Iterator[LeaseHolder]:
         """All; safe against changes while iterating."""
         return chain(self._inside, list(self._outside.values()))
 
@@ -115,7 +117,7 @@ def partner(ports: PortRange, port: int) -> int | None:
     return port + half if index < half else port - half
 
 
-def claim(pool: PortPool, endpoint: Holder) -> bool:
+def claim(pool: PortPool, endpoint: LeaseHolder) -> bool:
     """Give an endpoint its fast port; False if that is not free. One that has it keeps it."""
     if endpoint.fast_port is not None:
         return True
@@ -126,7 +128,7 @@ def claim(pool: PortPool, endpoint: Holder) -> bool:
     return True
 
 
-def give_back(pool: PortPool, endpoint: Holder, blocked: bool = False) -> None:
+def give_back(pool: PortPool, endpoint: LeaseHolder, blocked: bool = False) -> None:
     """Take an endpoint's fast port away; ``blocked``: another program holds that port."""
     if endpoint.fast_port is None:
         return
@@ -145,7 +147,7 @@ def to_give_back(holders: Iterable[_H]) -> _H | None:
     return min(found, key=lambda e: e.fast_connections, default=None)
 
 
-def why_none(pool: PortPool, endpoint: Holder) -> str:
+def why_none(pool: PortPool, endpoint: LeaseHolder) -> str:
     """Why an endpoint that could have a fast port has none."""
     port = partner(pool.range, endpoint.port)
     if port is None:
@@ -155,11 +157,11 @@ def why_none(pool: PortPool, endpoint: Holder) -> str:
     return f"port {port}, which goes with its port {endpoint.port}, is in use"
 
 
-def held(holders: Iterable[Holder]) -> int:
+def held(holders: Iterable[LeaseHolder]) -> int:
     """How many ports are fast ports now."""
     return sum(endpoint.fast_port is not None for endpoint in holders)
 
 
-def left(pool: PortPool, holders: Iterable[Holder]) -> int:
+def left(pool: PortPool, holders: Iterable[LeaseHolder]) -> int:
     """How many ports are left for nodes: those that are free, and fast ports."""
     return pool.free + held(holders)

@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager
 from typing import Generic, Protocol, TypeVar
 
 from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.net.gate import Gate
 from rosproxy.net.sockets import Acceptor, Handler, listen_on, reserve
 from rosproxy.net.tasks import Tasks
@@ -25,11 +25,11 @@ from rosproxy.telemetry.problems import Problems
 log = logging.getLogger(__name__)
 
 RANGE_OPTION = "--port-range"
-_H = TypeVar("_H", bound=Holder)
-_H_contra = TypeVar("_H_contra", bound=Holder, contravariant=True)
+_H = TypeVar("_H", bound=LeaseHolder)
+_H_contra = TypeVar("_H_contra", bound=LeaseHolder, contravariant=True)
 
 
-class LeaseBook(Holders[_H], Protocol[_H]):
+class LeaseBook(LeaseHolders[_H], Protocol[_H]):
     """All endpoints, to be kept in step with what listens."""
 
     def remove(self, endpoint: _H, /) -> None:
@@ -52,19 +52,19 @@ class HolderServer(Protocol[_H_contra]):
 class KernelPorts(Protocol):
     """What the kernel forwards; see `rosproxy.forwarding.kernel.syncer`."""
 
-    def note_change(self, endpoint: Holder, /) -> None:
+    def note_change(self, endpoint: LeaseHolder, /) -> None:
         """Note that an endpoint's ports or its node have changed."""
 
-    def may_forward(self, endpoint: Holder, /) -> bool:
+    def may_forward(self, endpoint: LeaseHolder, /) -> bool:
         """Whether an endpoint's topics could be forwarded if it had a fast port."""
 
-    async def forwards(self, endpoint: Holder, tcpros_port: int, /) -> bool:
+    async def forwards(self, endpoint: LeaseHolder, tcpros_port: int, /) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port; waits a moment."""
 
     async def cleared(self, port: int, /) -> None:
         """Wait a moment until a port is not forwarded any more."""
 
-    def log_reason(self, endpoint: Holder, /) -> None:
+    def log_reason(self, endpoint: LeaseHolder, /) -> None:
         """Log why an endpoint's topics are not forwarded."""
 
 

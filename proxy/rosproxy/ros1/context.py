@@ -16,9 +16,9 @@ from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.protocol.xmlrpc import limits
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.registry import Registry
-from rosproxy.ros1.registry.selection import Standing, standing
+from rosproxy.ros1.registry.selection import ClientKind, client_kind
 from rosproxy.ros1.registry.stand_ins import StandIns
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.runtime import Runtime
 from rosproxy.settings import MEBIBYTE
 
@@ -30,8 +30,8 @@ MANY_VALUES = 100
 """Values from which on a document is large; registrations have six."""
 MOST_PASSING = 256
 """Calls and replies that pass unread at once; each takes a thread of the master's."""
-MOST_STANDINGS = 4096
-"""Addresses whose standing is remembered."""
+MOST_CLIENTS = 4096
+"""Addresses whose kind is remembered."""
 PASSING_SHARE = 64
 """Those of them from one source."""
 
@@ -79,7 +79,7 @@ class Context:
         self.retired = False
         self._selected: frozenset[str] | None = None
         self._towards: dict[str, str] = {}
-        self._standings: dict[str, Standing] = {}
+        self._client_kinds: dict[str, ClientKind] = {}
         """Of addresses that have called since networks and selection were taken in."""
         self._near: list[Network] | None = None
         self.read_networks()
@@ -92,7 +92,7 @@ class Context:
         """Seconds since the proxy was made."""
         return self._runtime.uptime()
 
-    async def take_turn(self) -> None:
+    async def yield_to_others(self) -> None:
         """Wait for one's turn to read or rewrite a document of more than MANY_VALUES.
 
         All connections are looked at in between. Else many large documents that come together
@@ -109,17 +109,17 @@ class Context:
     @selected.setter
     def selected(self, addresses: frozenset[str]) -> None:
         self._selected = addresses
-        self._standings.clear()
+        self._client_kinds.clear()
         self._near = None
 
-    def standing(self, address: str) -> Standing:
+    def client_kind(self, address: str) -> ClientKind:
         """Whether an address may use the proxy as its master, as far as is known now."""
-        known = self._standings.get(address)
+        known = self._client_kinds.get(address)
         if known is None:
-            if len(self._standings) >= MOST_STANDINGS:
-                self._standings.clear()
-            known = standing(address, self.addressing.networks, self.selected)
-            self._standings[address] = known
+            if len(self._client_kinds) >= MOST_CLIENTS:
+                self._client_kinds.clear()
+            known = client_kind(address, self.addressing.networks, self.selected)
+            self._client_kinds[address] = known
         return known
 
     def near(self) -> Sequence[Network]:
@@ -156,18 +156,18 @@ class Context:
     def read_networks(self) -> None:
         """The same at once."""
         self._towards.clear()
-        self._standings.clear()
+        self._client_kinds.clear()
         self._near = None
         self._networks_read = self.now()
         given, both = self.settings.inside_networks, self.stand_ins.both
         self.addressing.networks = given or interface_networks(without_uplink=both)
 
-    def node_asker(self, endpoint: Endpoint) -> Asker:
+    def caller_at(self, endpoint: Endpoint) -> Caller:
         """The node of an endpoint as somebody who is given addresses.
 
         The proxy's own address that it sees is looked up as often as the networks are.
         """
-        address, name = endpoint.place.address, min(endpoint.callers, default="")
+        address, name = endpoint.location.address, min(endpoint.callers, default="")
         if address not in self._towards:
             self._towards[address] = address_towards(address)
-        return Asker(address, self._towards[address], name, "", endpoint)
+        return Caller(address, self._towards[address], name, "", endpoint)

@@ -8,8 +8,8 @@ have these as fields of their own beside ``time`` (ISO 8601, UTC), ``level``, ``
 Messages quote what nodes, labels and documents say, and those may be hostile. So this is the one
 place that makes them harmless, whoever logs: a message is one line of at most LONGEST characters
 without anything that moves a cursor or reorders text (`harmless`); and who makes the proxy say the
-same again and again does not fill the disk (`Floods`). Tracebacks stay as they are, but for the
-texts of the exceptions in them.
+same again and again does not fill the disk (`LogRateLimit`). Tracebacks stay as they are, but for
+the texts of the exceptions in them.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ class _Bucket:
     left_out: int = 0
 
 
-class Floods(logging.Filter):
+class LogRateLimit(logging.Filter):
     """Leaves out messages that come too often, and says in the next of their kind how many.
 
     Messages are of one kind if they come from the same call: logger, level and template are the
@@ -160,7 +160,7 @@ def set_up(form: str, level: str) -> None:
     """Log to standard error in ``form`` (text or json) from ``level`` on."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLines() if form == "json" else TextLines())
-    handler.addFilter(Floods())
+    handler.addFilter(LogRateLimit())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     # Strangers that speak no HTTP are not errors of ours.
     logging.getLogger("aiohttp.server").setLevel(logging.CRITICAL)

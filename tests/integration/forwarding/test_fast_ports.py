@@ -6,10 +6,9 @@ import pytest
 
 from examples.demo.fake_http import Where
 from rosproxy.app import ros1 as app
+from rosproxy.forwarding.kernel import decisions, syncer
 from rosproxy.forwarding.kernel import plane as kernel_plane
-from rosproxy.forwarding.kernel import policy as decisions
-from rosproxy.forwarding.kernel import syncer
-from rosproxy.forwarding.kernel.policy import HostForwarding
+from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import Tools
 from tests.integration.admin_calls import tell
 from tests.integration.kernel_fake import FakeTools

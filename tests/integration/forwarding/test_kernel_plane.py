@@ -15,7 +15,7 @@ from rosproxy.leases import fast_ports
 from rosproxy.leases.fast_ports import BothSides
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.runtime import Runtime
 from tests.integration.kernel_fake import FakeTools, clear_the_way
@@ -68,7 +68,9 @@ class Bench:
 
     def node(self, number: int = 0, tcpros_port: int | None = 50000) -> Endpoint:
         node = HostPort(NODE, 40000 + number)
-        endpoint = self.context.registry.admit(f"http://{node}/", node, Place(NODE, True), NODE)
+        endpoint = self.context.registry.admit(
+            f"http://{node}/", node, NodeLocation(NODE, True), NODE
+        )
         endpoint.topic_ports = {"/a": tcpros_port} if tcpros_port else {}
         return endpoint
 
@@ -159,7 +161,7 @@ async def test_only_those_that_changed_are_gone_through(bench: Bench) -> None:
 
 async def test_a_node_on_the_proxys_own_machine_is_not_forwarded(bench: Bench) -> None:
     endpoint = bench.node()
-    endpoint.place = Place("127.0.0.1", True)
+    endpoint.location = NodeLocation("127.0.0.1", True)
     assert not bench.plane.syncer.may_forward(endpoint)
     assert not await bench.plane.syncer.forwards(endpoint, 50000)
     assert "the proxy itself" in bench.plane.status_of(endpoint)["reason"]
@@ -298,7 +300,7 @@ async def test_what_a_killed_process_left_goes_on_until_it_is_known_whose_it_is(
     await asyncio.sleep(0.05)
     assert later.tools.forwards == {45002: (NODE, 50000)}
     node = HostPort(NODE, 40000)
-    place = Place(NODE, True, confirmed=False)
+    place = NodeLocation(NODE, True, confirmed=False)
     endpoint = later.context.registry.restore(f"http://{node}/", node, place, 45000)
     assert endpoint is not None
     later.plane.recovered([endpoint])

@@ -8,7 +8,7 @@ import pytest
 
 from rosproxy.forwarding.kernel import preflight
 from rosproxy.forwarding.kernel import tools as kernel_tools
-from rosproxy.forwarding.kernel.policy import HostForwarding
+from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from tests.integration.kernel_fake import FakeTools
 from tests.integration.net import until

@@ -11,7 +11,7 @@ import pytest
 from examples.demo.fake_http import End, Where, ok, value, where
 from examples.demo.fake_master import FakeMaster
 from examples.demo.fake_node import FakeNode
-from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers import callers
 from rosproxy.settings import hash_token
 from tests.integration.admin.test_admin import metrics
@@ -514,7 +514,7 @@ async def test_a_proxy_that_stops_ends_connections_and_ports(proxy: Proxy, robot
         assert await caller.outcome() in _CLOSED
     assert await refuses(slave(robot), NODE)
     assert await refuses(service(robot), OTHER_NODE)
-    await proxy.ros1.stand_ins.listen_for([robot.uri], Asker(NODE, PROXY))
+    await proxy.ros1.stand_ins.listen_for([robot.uri], Caller(NODE, PROXY))
     assert await refuses(slave(robot), NODE)
 
 

@@ -56,7 +56,7 @@ def problems(proxy: Proxy) -> dict[str, str]:
 
 def address_of(proxy: Proxy, name: str) -> str:
     """Where the proxy takes a node to be."""
-    return proxy.ros1.context.registry.by_caller[name].place.address
+    return proxy.ros1.context.registry.by_caller[name].location.address
 
 
 # Who may use the proxy as its master
@@ -407,7 +407,7 @@ async def test_stale_claims_do_not_keep_a_port_from_a_node_that_lives(
     kind: str,
 ) -> None:
     """Eight registrations of dead nodes held eight ports; the next node got none, for ever."""
-    monkeypatch.setattr("rosproxy.ros1.upkeep.recovery.HASTE", 0.2)
+    monkeypatch.setattr("rosproxy.ros1.upkeep.recovery.CLAIM_GRACE", 0.2)
     former = await make_proxy()
     await former.stop()
     ports = former.settings.ports.listen

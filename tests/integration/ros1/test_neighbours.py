@@ -67,9 +67,9 @@ async def test_each_sees_itself_literally_and_the_other_through_the_proxy(proxy,
 
 async def test_a_service_of_a_neighbour_without_a_usable_name_is_relayed(proxy, twins, make_node):
     first, _ = twins
-    asker = await make_node("/asker", THIRD_NODE)
+    caller = await make_node("/caller", THIRD_NODE)
     await first.serve(proxy.master)
-    found = await asker.call(proxy.master, "lookupService", "/add")
+    found = await caller.call(proxy.master, "lookupService", "/add")
     assert found[2] == f"rosrpc://{PROXY}:{proxy.endpoint(first).port}"
     assert (await first.call(proxy.master, "lookupService", "/add"))[2] == first.service_api
 

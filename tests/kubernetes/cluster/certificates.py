@@ -34,7 +34,7 @@ _API_NAMES = ("kubernetes", "kubernetes.default", "kubernetes.default.svc", "loc
 
 
 @dataclass(frozen=True)
-class Holder:
+class LeaseHolder:
     """Somebody with a key and a certificate, as files ``NAME.key`` and ``NAME.crt``."""
 
     name: str
@@ -96,7 +96,7 @@ def write_kubeconfig(file: Path, holder: str) -> None:
     file.chmod(0o600)
 
 
-def _authority() -> Holder:
+def _authority() -> LeaseHolder:
     key = _new_key()
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rosproxy test cluster")])
     usage = x509.KeyUsage(
@@ -109,11 +109,11 @@ def _authority() -> Holder:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
     )
-    return Holder("ca", builder.sign(key, hashes.SHA256()), key)
+    return LeaseHolder("ca", builder.sign(key, hashes.SHA256()), key)
 
 
 def _issue(
-    authority: Holder, name: str, common_name: str, organization: str = "",
+    authority: LeaseHolder, name: str, common_name: str, organization: str = "",
     names: tuple[str, ...] = (),
 ) -> None:  # fmt: skip
     key = _new_key()
@@ -125,7 +125,7 @@ def _issue(
         builder = builder.add_extension(
             x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False
         )
-    Holder(name, builder.sign(authority.key, hashes.SHA256()), key).write()
+    LeaseHolder(name, builder.sign(authority.key, hashes.SHA256()), key).write()
 
 
 def _general_name(name: str) -> x509.GeneralName:

@@ -13,13 +13,13 @@ from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 
 
 def holder(registry: Registry, number: int) -> Endpoint:
     node = HostPort(f"10.0.0.{number}", 40000)
-    endpoint = registry.admit(f"http://{node}/", node, Place(node.host, True), node.host)
+    endpoint = registry.admit(f"http://{node}/", node, NodeLocation(node.host, True), node.host)
     registry.register(endpoint, Registration(Kind.PUBLISHER, "/t", f"/node{number}"))
     assert fast_ports.claim(registry.pool, endpoint)
     return endpoint
@@ -33,7 +33,7 @@ def a_book(holders: int) -> tuple[Registry, KernelAccounts, list[Endpoint]]:
 
 
 def open_flow(endpoint: Endpoint, port: int, peer: str = "192.0.2.1") -> Flow:
-    return Flow("ESTABLISHED", HostPort(peer, 1), port, HostPort(endpoint.place.address, 50000))
+    return Flow("ESTABLISHED", HostPort(peer, 1), port, HostPort(endpoint.location.address, 50000))
 
 
 STEPS = st.tuples(st.integers(0, 1000), st.integers(0, 1000), st.integers(0, 10))

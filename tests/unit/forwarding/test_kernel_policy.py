@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosproxy.forwarding.kernel.policy import (
+from rosproxy.forwarding.kernel.decisions import (
     LONGEST_PAUSE,
     HostForwarding,
     Pauses,
@@ -16,7 +16,7 @@ from rosproxy.forwarding.kernel.policy import (
     unchanged,
 )
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.health import ProbeResult
 
 NODE = "10.0.0.5"
@@ -25,7 +25,7 @@ THERE, THERE_SIX = HostPort(NODE, 50000), HostPort("fd00::5", 50000)
 
 def an_endpoint(address: str = NODE, **changed: Any) -> Endpoint:
     node = HostPort(address, 40001)
-    made = Endpoint(f"http://{node}/", node, Place(address, True), 45000)
+    made = Endpoint(f"http://{node}/", node, NodeLocation(address, True), 45000)
     made.topic_ports = {"/a": 50000}
     for name, value in changed.items():
         setattr(made, name, value)

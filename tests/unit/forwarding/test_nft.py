@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosproxy.forwarding.kernel.decisions import Changes
 from rosproxy.forwarding.kernel.nft import (
     Counts,
     Marks,
@@ -19,7 +20,6 @@ from rosproxy.forwarding.kernel.nft import (
     Transport,
     dropping_chains,
 )
-from rosproxy.forwarding.kernel.policy import Changes
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 

@@ -6,13 +6,13 @@ from hypothesis import strategies as st
 from rosproxy.leases import fast_ports
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.registry import Registry
 
 
 def admitted(registry: Registry, number: int) -> Endpoint:
     node = HostPort("10.0.0.5", 40000 + number)
-    return registry.admit(f"http://{node}/", node, Place(node.host, True), node.host)
+    return registry.admit(f"http://{node}/", node, NodeLocation(node.host, True), node.host)
 
 
 def one_admitted(ports: int) -> tuple[Registry, Endpoint]:

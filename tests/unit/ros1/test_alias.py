@@ -14,7 +14,7 @@ from rosproxy.settings import Settings
 from tests.unit.builders import (
     DIALECTS,
     make_addressing,
-    make_asker,
+    make_caller,
     make_stand_ins,
     py_call,
     py_reply,
@@ -49,7 +49,7 @@ def handed(calls: list[tuple[str, list[Any]]], reply: bytes, multicall: bool = F
     body = [{"methodName": method, "params": params} for method, params in calls]
     method, params = calls[0]
     text = py_call("system.multicall", body) if multicall else py_call(method, *params)
-    request = master_calls.read_request(text, make_asker("10.0.0.5"))
+    request = master_calls.read_request(text, make_caller("10.0.0.5"))
     exported = master_api.export_request(request, [None] * len(request.calls), make_addressing())
     return list(master_calls.read_reply(exported, reply).uris())
 

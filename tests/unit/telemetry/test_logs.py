@@ -16,8 +16,8 @@ from rosproxy.telemetry.logs import (
     MOST_KNOWN,
     ONE_EVERY,
     USUAL,
-    Floods,
     JsonLines,
+    LogRateLimit,
     TextLines,
 )
 
@@ -127,12 +127,12 @@ def clock() -> Clock:
     return Clock()
 
 
-def written(floods: Floods, records: Iterable[logging.LogRecord]) -> list[logging.LogRecord]:
+def written(floods: LogRateLimit, records: Iterable[logging.LogRecord]) -> list[logging.LogRecord]:
     return [one for one in records if floods.filter(one)]
 
 
 def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) -> None:
-    floods = Floods(clock)
+    floods = LogRateLimit(clock)
     assert len(written(floods, (record("%s: gone", "/a") for _ in range(1000)))) == BURST_OF_ONE
     assert len(written(floods, [record("%s: gone", "/b")])) == 1
     clock.now += ONE_EVERY
@@ -149,14 +149,14 @@ def test_the_same_warning_again_and_again_is_written_now_and_then(clock: Clock) 
 
 def test_a_node_is_told_of_after_another_one_at_the_same_address(clock: Clock) -> None:
     """A node registers some five times when it starts, and is refused each time."""
-    floods, why = Floods(clock), "all ports of the range are in use; " * 7
+    floods, why = LogRateLimit(clock), "all ports of the range are in use; " * 7
     told = [record("%s: %s: %s", "10.0.0.5", node, why) for node in ("/a", "/b") for _ in range(5)]
     assert written(floods, told) == told
 
 
 @pytest.mark.parametrize("level", [logging.INFO, logging.ERROR])
 def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int) -> None:
-    floods, more = Floods(clock), 3 * MOST_KNOWN
+    floods, more = LogRateLimit(clock), 3 * MOST_KNOWN
     names = [record("%s is new", f"/{n}", level=level) for n in range(BURST_OF_ALL + more)]
     assert len(written(floods, names)) == BURST_OF_ALL
     assert len(written(floods, [record("%s is old", "/a", level=level)])) == 1
@@ -166,13 +166,13 @@ def test_names_made_up_one_after_the_other_fill_no_disk(clock: Clock, level: int
 
 
 def test_long_names_fill_no_disk_either(clock: Clock) -> None:
-    floods = Floods(clock)
+    floods = LogRateLimit(clock)
     names = (record("%s is new", f"/{n}" + "x" * LONGEST, level=logging.INFO) for n in range(5000))
     assert len(written(floods, names)) * LONGEST < 2 * BURST_OF_ALL * USUAL
 
 
 def test_what_is_logged_once_and_for_debugging_is_written(clock: Clock) -> None:
-    floods = Floods(clock)
+    floods = LogRateLimit(clock)
     debug = [record("look", level=logging.DEBUG) for _ in range(2 * BURST_OF_ALL)]
     assert written(floods, debug) == debug
     started = [record("%s at %s is %s", f"/{n}", "a", "b", level=logging.INFO) for n in range(1000)]

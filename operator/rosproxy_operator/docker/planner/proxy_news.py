@@ -37,7 +37,7 @@ AWAY = 2.0
 """Seconds for which a running container may be off a network before its address counts as gone."""
 MOVING = 5.0
 """Seconds for which a proxy is told of a move, until it has found the nodes at the new address."""
-Place = tuple[str, str]
+ContainerNetwork = tuple[str, str]
 """A container's id and a network."""
 _HOST_NAME = re.compile(r"[\w.-]{1,253}", re.ASCII)
 """What a node can call its host in a URI; aliases may be anything."""
@@ -71,7 +71,7 @@ class NetworkFacts:
     """
 
     master_address: str = ""
-    addresses: Mapping[Place, str] = field(default_factory=dict)
+    addresses: Mapping[ContainerNetwork, str] = field(default_factory=dict)
     taken: frozenset[str] = frozenset()
     subnets: tuple[IPv4Network, ...] = ()
     arrivals: frozenset[ContainerArrival] = frozenset()
@@ -88,8 +88,8 @@ class Places:
     """
 
     def __init__(self) -> None:
-        self._at: dict[Place, str] = {}
-        self._absent: dict[Place, float] = {}
+        self._at: dict[ContainerNetwork, str] = {}
+        self._absent: dict[ContainerNetwork, float] = {}
         self._moves: dict[str, tuple[str, float]] = {}
 
     def look(self, known: NetworkFacts, now: float) -> None:

@@ -62,7 +62,7 @@ table ip $table {
 """Its source is chosen before the rule leads elsewhere, maybe to another network: so masquerade."""
 MEMORY, PIDS = 64 * 1024**2, 16
 """Bytes and threads of what sets the rules: nft has 5 MiB, and one."""
-Place = tuple[Key, str]
+RedirectSite = tuple[Key, str]
 """A proxy's key, and the id of the container whose network a redirect is in."""
 
 
@@ -113,7 +113,7 @@ def redirect_steps(
 ) -> Iterator[RedirectSteps]:
     """What is to be done so that each redirect that is wanted is there, and no other."""
     wanted = _wanted(observed, settings, desired)
-    records: dict[Place, list[RedirectContainer]] = {}
+    records: dict[RedirectSite, list[RedirectContainer]] = {}
     for one in observed.redirects:
         records.setdefault((one.key, one.container.shares or ""), []).append(one)
     names = {container.id: container.name for container in observed.containers}
@@ -145,12 +145,12 @@ def in_place(observed: HostState, key: Key, owner: Container) -> str:
 
 def _wanted(
     observed: HostState, settings: PlanSettings, desired: Iterable[Desired]
-) -> dict[Place, CreateRedirect | None]:
+) -> dict[RedirectSite, CreateRedirect | None]:
     """The redirects that there ought to be; None for one that is to be left as it is.
 
     Of several proxies for one address, in one network, the first one gets it.
     """
-    found: dict[Place, CreateRedirect | None] = {}
+    found: dict[RedirectSite, CreateRedirect | None] = {}
     owned: dict[tuple[str, HostPort], Key] = {}
     by_id = {container.id: container for container in observed.containers}
     for one in desired:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
 from rosproxy.forwarding.kernel.nft import Counters, Counts
-from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 
 SILENCE_WINDOW = 2.0
 """Seconds at least over which it is told whether anything goes back through a port."""
@@ -78,20 +78,20 @@ class KernelAccounts:
     """
 
     def __init__(self) -> None:
-        self.owners: Mapping[int, Holder] = {}
-        self._accounts: dict[Holder, Account] = {}
+        self.owners: Mapping[int, LeaseHolder] = {}
+        self._accounts: dict[LeaseHolder, Account] = {}
         self._deltas, self._silence = CounterDeltas(), UnansweredPorts()
         self.unanswered: list[int] = []
         self._counted_at = 0.0
 
-    def note_owners(self, endpoints: Holders[Holder]) -> None:
+    def note_owners(self, endpoints: LeaseHolders[LeaseHolder]) -> None:
         """Take in who holds which fast port now."""
         there = {p: e for p, e in self.owners.items() if endpoints.by_port.get(e.port) is e}
         self.owners = there | {e.fast_port: e for e in endpoints if e.fast_port is not None}
         known = set(self.owners.values())
         self._accounts = {e: account for e, account in self._accounts.items() if e in known}
 
-    def owns(self, endpoint: Holder) -> bool:
+    def owns(self, endpoint: LeaseHolder) -> bool:
         """Whether an endpoint had a fast port when that was last looked at."""
         return any(owner is endpoint for owner in self.owners.values())
 
@@ -118,7 +118,7 @@ class KernelAccounts:
         Those to a node that is down don't count: if its host vanished without a word, the kernel
         takes them for open for days.
         """
-        found: dict[Holder, list[Flow]] = {endpoint: [] for endpoint in self.owners.values()}
+        found: dict[LeaseHolder, list[Flow]] = {endpoint: [] for endpoint in self.owners.values()}
         for flow in flows:
             owner = self.owners.get(flow.port)
             if owner is not None and not owner.is_down:
@@ -126,15 +126,15 @@ class KernelAccounts:
         for endpoint, mine in found.items():
             endpoint.fast_peers = conntrack.peers(mine, endpoint.address)
 
-    def account(self, endpoint: Holder) -> Account:
+    def account(self, endpoint: LeaseHolder) -> Account:
         """What went through an endpoint's fast ports so far."""
         return self._accounts.get(endpoint, Account())
 
-    def ports_of(self, endpoint: Holder) -> list[int]:
+    def ports_of(self, endpoint: LeaseHolder) -> list[int]:
         """The fast ports that connections to an endpoint may go through."""
         return [port for port, owner in self.owners.items() if owner is endpoint]
 
-    def _add(self, endpoint: Holder, more: Counts, passed: float) -> None:
+    def _add(self, endpoint: LeaseHolder, more: Counts, passed: float) -> None:
         account = self._accounts.setdefault(endpoint, Account())
         account.sent += more.sent
         account.received += more.received

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
+from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Marks, Transport
-from rosproxy.forwarding.kernel.policy import Forwards
 from rosproxy.net.addresses import HostPort
 
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rosproxy.forwarding.kernel.policy import Changes, Forwards
+from rosproxy.forwarding.kernel.decisions import Changes, Forwards
 from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort, Network, is_address, parse_address
 

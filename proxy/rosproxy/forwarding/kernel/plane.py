@@ -17,13 +17,13 @@ from typing import Any
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
+from rosproxy.forwarding.kernel.decisions import Forwards
 from rosproxy.forwarding.kernel.nft import Counts, Near
-from rosproxy.forwarding.kernel.policy import Forwards
 from rosproxy.forwarding.kernel.preflight import why_not
 from rosproxy.forwarding.kernel.syncer import OPTION, Clock, ForwardSyncer
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.net.tasks import Tasks
 from rosproxy.settings import Settings
 from rosproxy.telemetry.metrics import Traffic
@@ -47,7 +47,7 @@ class KernelPlane:
     def __init__(
         self,
         settings: Settings,
-        endpoints: Holders[Holder],
+        endpoints: LeaseHolders[LeaseHolder],
         tasks: Tasks,
         problems: Problems,
         clock: Clock,
@@ -102,7 +102,7 @@ class KernelPlane:
         """What the kernel forwards now, as far as is known."""
         return self._table.forwards if self.syncer.usable else {}
 
-    def recovered(self, endpoints: Sequence[Holder]) -> None:
+    def recovered(self, endpoints: Sequence[LeaseHolder]) -> None:
         """Note that the registry is rebuilt; what it holds gets the fast ports that it had.
 
         Also where the kernel may not forward now: subscribers may be connected to them.
@@ -113,7 +113,7 @@ class KernelPlane:
         self.syncer.recovered = True
         self.syncer.note_change()
 
-    def cut(self, endpoint: Holder) -> None:
+    def cut(self, endpoint: LeaseHolder) -> None:
         """Have the kernel forget an endpoint's connections; who sends next gets a reset."""
         ports, ipv6 = self._accounts.ports_of(endpoint), ":" in endpoint.address
         if self.syncer.usable and ports:
@@ -136,7 +136,7 @@ class KernelPlane:
         mode = self._settings.data_plane
         return {"mode": mode, "plane": plane, "reason": self.syncer.why_not or ""}
 
-    def status_of(self, endpoint: Holder) -> dict[str, Any]:
+    def status_of(self, endpoint: LeaseHolder) -> dict[str, Any]:
         """The plane of one endpoint's topics, as JSON; bytes of IP packets."""
         account = self._accounts.account(endpoint)
         reason, port = self.syncer.reason(endpoint), endpoint.fast_port

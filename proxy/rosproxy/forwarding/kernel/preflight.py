@@ -4,8 +4,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from rosproxy.forwarding.kernel.decisions import HostForwarding
 from rosproxy.forwarding.kernel.nft import NftError, dropping_chains
-from rosproxy.forwarding.kernel.policy import HostForwarding
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from rosproxy.settings import DataPlane
 

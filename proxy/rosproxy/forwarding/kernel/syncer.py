@@ -19,16 +19,16 @@ from collections.abc import Callable, Collection
 
 from msgspec.structs import replace
 
-from rosproxy.forwarding.kernel import policy
+from rosproxy.forwarding.kernel import decisions
 from rosproxy.forwarding.kernel.accounting import KernelAccounts
 from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.decisions import Changes, HostForwarding
 from rosproxy.forwarding.kernel.nft import Counters, Near, NftError
-from rosproxy.forwarding.kernel.policy import Changes, HostForwarding
 from rosproxy.forwarding.kernel.preflight import read_forwarding
 from rosproxy.forwarding.kernel.table import KernelTable
 from rosproxy.forwarding.kernel.tools import ToolError
 from rosproxy.leases import fast_ports
-from rosproxy.leases.fast_ports import Holder, Holders
+from rosproxy.leases.fast_ports import LeaseHolder, LeaseHolders
 from rosproxy.net.addresses import HostPort
 from rosproxy.net.interfaces import address_towards
 from rosproxy.telemetry.problems import Problems
@@ -58,7 +58,7 @@ class ForwardSyncer:
 
     def __init__(
         self,
-        endpoints: Holders[Holder],
+        endpoints: LeaseHolders[LeaseHolder],
         table: KernelTable,
         accounts: KernelAccounts,
         problems: Problems,
@@ -68,12 +68,12 @@ class ForwardSyncer:
         self._endpoints, self._table, self._accounts = endpoints, table, accounts
         self._problems, self._clock, self._near = problems, clock, near
         self._lock, self._wake, self._done = asyncio.Lock(), asyncio.Event(), asyncio.Event()
-        self._changed: set[Holder] = set()
+        self._changed: set[LeaseHolder] = set()
         self._all = True
-        self._host, self._pauses = HostForwarding(), policy.Pauses()
+        self._host, self._pauses = HostForwarding(), decisions.Pauses()
         self._own: dict[str, bool] = {}
         self._own_until, self._retry_at = 0.0, float("inf")
-        self._logged: dict[Holder, str] = {}
+        self._logged: dict[LeaseHolder, str] = {}
         connections = table.table.has_connections
         self.what = "topics" if connections else "datagrams"
         self.subject = OPTION if connections else f"{OPTION} for UDP"
@@ -111,7 +111,7 @@ class ForwardSyncer:
         if self._clock() > self._own_until:
             self._own, self._own_until = {}, self._clock() + OWN_TTL
 
-    def note_change(self, endpoint: Holder | None = None) -> None:
+    def note_change(self, endpoint: LeaseHolder | None = None) -> None:
         """Note that an endpoint has changed, or any."""
         if endpoint is None or not self.usable:
             self._all = True
@@ -126,11 +126,11 @@ class ForwardSyncer:
         await self._wake.wait()
         await self._sync()
 
-    def may_forward(self, endpoint: Holder) -> bool:
+    def may_forward(self, endpoint: LeaseHolder) -> bool:
         """Whether an endpoint's topics could be forwarded if it had a fast port."""
         return isinstance(self._target(endpoint), HostPort)
 
-    def reason(self, endpoint: Holder) -> str:
+    def reason(self, endpoint: LeaseHolder) -> str:
         """Why an endpoint's topics are not forwarded by the kernel; nothing if they are."""
         where = self._target(endpoint)
         if isinstance(where, str):
@@ -140,14 +140,14 @@ class ForwardSyncer:
         made = self._table.forwards.get(endpoint.fast_port) == where
         return "" if made else "about to be forwarded"
 
-    def log_reason(self, endpoint: Holder) -> None:
+    def log_reason(self, endpoint: LeaseHolder) -> None:
         """Log why an endpoint's topics are not forwarded, if that has not been said yet."""
         why = self.reason(endpoint)
         if why and self.usable and self._logged.get(endpoint) != why:
             self._logged[endpoint] = why
             log.info("%s: the proxy forwards its topics: %s", endpoint.label, why)
 
-    async def forwards(self, endpoint: Holder, tcpros_port: int) -> bool:
+    async def forwards(self, endpoint: LeaseHolder, tcpros_port: int) -> bool:
         """Whether an endpoint's fast port leads to a TCPROS port of its node; waits a moment."""
 
         def leads() -> bool:
@@ -194,7 +194,7 @@ class ForwardSyncer:
         await self._sync()
         await self._table.cut(ports)
 
-    def _target(self, endpoint: Holder) -> HostPort | str:
+    def _target(self, endpoint: LeaseHolder) -> HostPort | str:
         """Where an endpoint's topics may be forwarded to, or why they may not."""
         if self.why_not is not None:
             return self.why_not
@@ -202,7 +202,7 @@ class ForwardSyncer:
         if address not in self._own:
             self._own[address] = address_towards(address) == address
         own = {address} if self._own[address] else ()
-        where = policy.destination(endpoint, replace(self._host, own=own))
+        where = decisions.destination(endpoint, replace(self._host, own=own))
         if isinstance(where, str) or endpoint.fast_port is None:
             return where
         return self._pauses.why(endpoint.fast_port, where, self._clock()) or where
@@ -248,9 +248,9 @@ class ForwardSyncer:
         changed, self._changed = self._changed, set()
         if self._all or not self.recovered:
             self._all, changed = False, set(self._endpoints)
-            wanted = policy.kept(now, changed, self.recovered)
+            wanted = decisions.kept(now, changed, self.recovered)
         else:
-            wanted = policy.unchanged(now, self._accounts.owners, changed)
+            wanted = decisions.unchanged(now, self._accounts.owners, changed)
         by_port = self._endpoints.by_port
         for endpoint in changed:
             if endpoint.fast_port and by_port.get(endpoint.port) is endpoint:

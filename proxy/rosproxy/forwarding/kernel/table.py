@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from rosproxy.forwarding.kernel import conntrack
 from rosproxy.forwarding.kernel.conntrack import Flow
+from rosproxy.forwarding.kernel.decisions import Changes, Forwards, changes
 from rosproxy.forwarding.kernel.nft import Counters, Near, NftError, Table, TableState
-from rosproxy.forwarding.kernel.policy import Changes, Forwards, changes
 from rosproxy.forwarding.kernel.tools import ToolError, Tools
 from rosproxy.net.interfaces import address_towards
 

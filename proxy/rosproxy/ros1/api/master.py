@@ -5,9 +5,9 @@ addresses are exported, the master is called, what it accepted is noted in the r
 addresses in the reply are imported (`rosproxy.ros1.rewriting.master_api`). All other calls pass as
 they are; long ones, parameters above all, unread.
 
-The policy is asked twice (`PolicyJudge`): about what needs no endpoint before, and about
+The policy is asked twice (`AccessChecks`): about what needs no endpoint before, and about
 registrations once their node is admitted. What it denies the master does not get; the nodes inside
-that have to know are told (`Matchmaker`).
+that have to know are told (`PublisherUpdates`).
 """
 
 import asyncio
@@ -19,7 +19,7 @@ from rosproxy.net.http_client import LongReply
 from rosproxy.ros1.clients.master import Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.bounds import LONGEST_NAME, too_long_to_register
-from rosproxy.ros1.protocol.master_methods import NO_ROW, row
+from rosproxy.ros1.protocol.master_methods import NO_SPEC, method_spec
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
@@ -27,17 +27,23 @@ from rosproxy.ros1.protocol.xmlrpc.limits import Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import master_api, master_calls
-from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_calls import Admission, LocalReply, Noted, Refusal, Request
+from rosproxy.ros1.rewriting.addressing import Caller
+from rosproxy.ros1.rewriting.master_calls import (
+    CallOutcome,
+    LocalReply,
+    Refusal,
+    RegistryChange,
+    Request,
+)
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.admission import NodeAdmission
-from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, counted
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.adopter import Adopter
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
-from rosproxy.ros1.upkeep.matchmaker import Matchmaker
 from rosproxy.ros1.upkeep.policy_enforcer import PolicyEnforcer
+from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.service_finder import ServiceFinder
 
@@ -51,8 +57,8 @@ class MasterApi:
     _stand_ins: StandInPorts
     _recovery: Recovery
     _adopter: Adopter
-    _judge: PolicyJudge
-    _matchmaker: Matchmaker
+    _access: AccessChecks
+    _publisher_updates: PublisherUpdates
     _enforcer: PolicyEnforcer
     _services: ServiceFinder
     _memory: LeaseMemory
@@ -60,13 +66,13 @@ class MasterApi:
     async def __call__(self, call: IncomingCall) -> bytes | LongReply:
         """The reply to a call. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
-        asker = Asker(call.source, call.local.host, master=call.host_header or str(call.local))
+        caller = Caller(call.source, call.local.host, master=call.host_header or str(call.local))
         metrics, upstream = self._context.metrics, self._context.upstream
-        judged = self._judge.judges_parameters(call.source)
+        judged = self._access.judges_parameters(call.source)
         if not judged and await _is_long_and_passes(call.body):
             return await counted(metrics, "master", MULTICALL, upstream.pass_to_master(call.body))
         try:
-            request = master_calls.read_request(call.body, asker, self._context.master_call)
+            request = master_calls.read_request(call.body, caller, self._context.master_call)
         except xmlrpc.XmlRpcError:
             metrics.count("master", "other", "malformed")
             raise
@@ -74,14 +80,14 @@ class MasterApi:
 
     def watch(self, method: str, size: int) -> passing.CallWatch | None:
         """How to watch a long call while it passes; None if it has to be read."""
-        if method in (MULTICALL, "getParamNames") and self._judge.judges_parameters(None):
+        if method in (MULTICALL, "getParamNames") and self._access.judges_parameters(None):
             return None
         return _watch(method, size, self._context.master_call)
 
     async def pass_on(self, call: IncomingCall, long_call: LongCall) -> bytes | LongReply:
         """The reply to a long call, which passes unread. Raises XmlRpcError, Unreachable."""
         self._refuse_loop(call)
-        denied = self._judge.judge_long(long_call.method, call.body, call.source)
+        denied = self._access.judge_long(long_call.method, call.body, call.source)
         if denied is not None:
             self._context.metrics.count("master", long_call.method, "refused")
             return xmlrpc.dump_reply(denied.triple())
@@ -101,8 +107,8 @@ class MasterApi:
         if not request.plain:
             await self._recovery.ensure()
             await self._services.find_for(request)
-        replies = await self._judge.judge_request(request)
-        if request.plain and not any(replies) and not self._judge.has_to_read_reply(request):
+        replies = await self._access.judge_request(request)
+        if request.plain and not any(replies) and not self._access.has_to_read_reply(request):
             return await self._context.upstream.pass_to_master(request.body)
         return await self._rewrite(request, replies, call)
 
@@ -114,45 +120,45 @@ class MasterApi:
         async with self._admitted(request, replies, call) as admitted:
             admissions = self._judge_registrations(request, admitted)
             exported = master_api.export_request(request, admissions, addressing)
-            self._note(exported.facts(), request.asker.address)
+            self._note(exported.facts(), request.caller.address)
             if exported.body is None:
                 return exported.local_reply()
             await self._memory.write()
             limits = request.reply_limits
             answer = await self._context.upstream.post_to_master(exported.body, limits)
             reply = master_calls.read_reply(exported, answer)
-            self._note(reply.facts(self._context.now()), request.asker.address)
+            self._note(reply.facts(self._context.now()), request.caller.address)
             await self._memory.write()
-            await self._stand_ins.listen_for(reply.uris(), request.asker)
+            await self._stand_ins.listen_for(reply.uris(), request.caller)
             if self._context.policy.version != version:
                 self._enforcer.look_again()
-            return master_api.import_reply(reply, addressing, self._judge.unseen(reply))
+            return master_api.import_reply(reply, addressing, self._access.unseen(reply))
 
     def _judge_registrations(
-        self, request: Request, admissions: Sequence[Admission]
-    ) -> list[Admission]:
+        self, request: Request, admissions: Sequence[CallOutcome]
+    ) -> list[CallOutcome]:
         """The admissions, with the proxy's own replies to what the master does not get."""
-        judge, now = self._judge.judge_registration, self._context.now()
+        judge, now = self._access.judge_registration, self._context.now()
         pairs = zip(request.calls, admissions, strict=True)
-        return [judge(call, one, request.asker, now) if call else one for call, one in pairs]
+        return [judge(call, one, request.caller, now) if call else one for call, one in pairs]
 
     @asynccontextmanager
     async def _admitted(
         self, request: Request, replies: Sequence[LocalReply | None], incoming: IncomingCall
-    ) -> AsyncIterator[Sequence[Admission]]:
+    ) -> AsyncIterator[Sequence[CallOutcome]]:
         """What becomes of each call of a request. Raises Unreachable.
 
         Within the context their endpoints are *pending*: their leases do not end while the calls
         are on their way. If the caller goes away meanwhile, the master is told nothing.
         """
-        self._context.refresh_networks(request.asker.address)
-        admissions: list[Admission] = []
+        self._context.refresh_networks(request.caller.address)
+        admissions: list[CallOutcome] = []
         try:
             # One after the other: they may register the same new node.
             for call, reply in zip(request.calls, replies, strict=True):
                 if incoming.gone:
                     raise Unreachable("the caller has gone")
-                admission: Admission = reply
+                admission: CallOutcome = reply
                 if call and reply is None:
                     admission = await self._admit(call, request)
                 admissions.append(admission)
@@ -165,23 +171,23 @@ class MasterApi:
                 if isinstance(admission, Endpoint):
                     admission.release()
 
-    async def _admit(self, call: Call, request: Request) -> Admission:
+    async def _admit(self, call: Call, request: Request) -> CallOutcome:
         """What becomes of one call; what is too long, or one too many, is refused."""
-        asker, may_be_long = request.asker, len(request.body) > LONGEST_NAME
+        caller, may_be_long = request.caller, len(request.body) > LONGEST_NAME
         if may_be_long and (text := too_long_to_register(call)):
-            return self._refuse("long_name", call, asker, text)
-        admission = await self._admission.admit(call, asker)
+            return self._refuse("long_name", call, caller, text)
+        admission = await self._admission.admit(call, caller)
         if isinstance(admission, Endpoint) and (text := admission.full):
-            return self._refuse("too_many_names", call, asker, text)
+            return self._refuse("too_many_names", call, caller, text)
         return admission
 
-    def _refuse(self, reason: str, call: Call, asker: Asker, text: str) -> Refusal:
+    def _refuse(self, reason: str, call: Call, caller: Caller, text: str) -> Refusal:
         """Refuse a call that is over a bound, and tell of it."""
-        what = f"{call.method} of {asker.caller_id}: {text}"
-        self._context.refusals.note(reason, asker.address, what)
+        what = f"{call.method} of {caller.caller_id}: {text}"
+        self._context.refusals.note(reason, caller.address, what)
         return Refusal(f"rosproxy: {text}")
 
-    def _note(self, facts: Iterable[Noted], source: str) -> None:
+    def _note(self, facts: Iterable[RegistryChange], source: str) -> None:
         """Take in what the master accepted, and what it is not told.
 
         A service's port is believed only from the node's own address: anybody may register a
@@ -193,10 +199,10 @@ class MasterApi:
             if fact.endpoint is None:
                 registry.unregister(held.kind, held.name, held.caller_id)
             elif registry.by_port.get(fact.endpoint.port) is fact.endpoint:
-                own = source == fact.endpoint.place.address
+                own = source == fact.endpoint.location.address
                 held = self._as_known(fact.endpoint, held)
                 registry.register(fact.endpoint, held if own else replace(held, service_api=None))
-            self._matchmaker.note(held)
+            self._publisher_updates.note(held)
 
     def _as_known(self, endpoint: Endpoint, held: Registration) -> Registration:
         """A registration to note; one that is hidden from now on is shown until it is taken back.
@@ -228,8 +234,8 @@ class PublishedMaster:
         upstream = self._context.upstream
         if await _is_long_and_passes(call.body):
             return await upstream.pass_to_master(call.body)
-        asker = Asker(call.source, call.local.host, master=self._address)
-        request = master_calls.read_request(call.body, asker, self._context.master_call)
+        caller = Caller(call.source, call.local.host, master=self._address)
+        request = master_calls.read_request(call.body, caller, self._context.master_call)
         if request.plain:
             return await upstream.pass_to_master(call.body)
         reply = await upstream.post_to_master(call.body)
@@ -245,7 +251,7 @@ class PublishedMaster:
 
 
 def _passes(method: str) -> bool:
-    return row(method) == NO_ROW
+    return method_spec(method) == NO_SPEC
 
 
 def _watch(method: str, size: int, limits: Limits) -> passing.CallWatch | None:

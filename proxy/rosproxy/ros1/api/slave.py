@@ -23,7 +23,7 @@ from rosproxy.ros1.protocol.xmlrpc import multicall, passing
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.rewriting import policing, slave_api
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.long_calls import LongCall
 from rosproxy.ros1.servers.tcpros import InsideNodes, TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
@@ -47,11 +47,11 @@ class SlaveApi:
         stand_ins: StandInPorts,
         adopter: Adopter,
         tcpros: TcprosServer,
-        judge: PolicyJudge,
+        access: AccessChecks,
     ) -> None:
         self._context, self._leases, self._stand_ins = context, leases, stand_ins
-        self._adopter, self._tcpros, self._judge = adopter, tcpros, judge
-        self._nodes = InsideNodes(context, judge)
+        self._adopter, self._tcpros, self._access = adopter, tcpros, access
+        self._nodes = InsideNodes(context, access)
         greeting = "rosproxy: slave API of a ROS node behind it\n"
         self.server = XmlRpcServer(context, self, greeting, context.lease_call, self)
 
@@ -94,7 +94,7 @@ class SlaveApi:
         endpoint, method = self._endpoint(call), long_call.method
         caller_id, parameter, *_ = *passing.first_strings(call.body, 2), None, None
         why = await self._why_not(endpoint, method, caller_id or "", call.source)
-        if why is None and caller_id is None and not self._judge.idle:
+        if why is None and caller_id is None and not self._access.idle:
             why = NO_CALLER_ID
         if why is None and method == "paramUpdate":
             why = await self._not_subscribed(endpoint, parameter)
@@ -151,7 +151,7 @@ class SlaveApi:
             self._context.metrics.count("slave", parsed.method, "refused")
             return xmlrpc.dump_reply([-1, f"rosproxy: {too_long}", 0])
         if parsed.method == "requestTopic":
-            denied = self._judge.outside_may_not_ask(parsed, endpoint, call.source)
+            denied = self._access.outside_may_not_ask(parsed, endpoint, call.source)
             if denied is not None:
                 self._context.metrics.count("slave", parsed.method, "refused")
                 return xmlrpc.dump_reply(denied)
@@ -173,14 +173,14 @@ class SlaveApi:
         if parsed.method == "publisherUpdate":
             await self._context.after_registration(endpoint)
             topic, announced = parsed.string(1) or "", slave_api.announced_publishers(parsed)
-            node = self._context.node_asker(endpoint)
+            node = self._context.caller_at(endpoint)
             await self._stand_ins.listen_for_announced(topic, announced, node)
             if len(announced) > MANY_VALUES:
-                await self._context.take_turn()
+                await self._context.yield_to_others()
             body, parsed = self._with_hidden(endpoint, parsed, body)
         self._context.refresh_networks()
         addressing, near = self._context.addressing, call.reached_locally
-        node = self._context.node_asker(endpoint)
+        node = self._context.caller_at(endpoint)
         view = slave_api.from_outside(node, self._context.settings.master_uri, addressing)
         if self._context.stand_ins.both:
             body = await self._stand_ins.udpros.lead_outwards(endpoint, parsed, body, call.source)
@@ -190,7 +190,7 @@ class SlaveApi:
         port, said = endpoint.port, slave_api.topic_port(parsed, reply)
         if said is not None:
             endpoint.note_topic_port(parsed.string(1) or "", said)
-            if self._judge.may_bypass(endpoint):
+            if self._access.may_bypass(endpoint):
                 port = await self._leases.fast_port(endpoint, said) or port
         reached = HostPort(call.local.host, port) if near else addressing.outside(port)
         return slave_api.rewrite_reply(parsed, reply, reached, view)
@@ -247,7 +247,7 @@ class SlaveApi:
         """Why a caller may not call a method of a node; None if he may."""
         if not await self._is_for(method, source):
             return NOT_THE_MASTER
-        return await self._judge.outside_may_not_call(method, endpoint, source, caller_id)
+        return await self._access.outside_may_not_call(method, endpoint, source, caller_id)
 
     async def _not_subscribed(self, endpoint: Endpoint, parameter: str | None) -> str | None:
         """Why a node is not told of a parameter; None if it may have subscribed to it.

@@ -8,7 +8,7 @@ that name a topic, and in TCPROS headers. Whatever else is that long passes as i
 
 from collections.abc import Iterable, Mapping
 
-from rosproxy.ros1.protocol.master_methods import row
+from rosproxy.ros1.protocol.master_methods import method_spec
 from rosproxy.ros1.protocol.uris import LONGEST_URI
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 
@@ -19,7 +19,7 @@ nested in many namespaces, have a hundred; ROS 2 allows 255."""
 
 def too_long_to_register(call: Call) -> str | None:
     """What in a call that registers is too long; None if nothing is, and for any other call."""
-    found = row(call.method)
+    found = method_spec(call.method)
     if found.registers is None:
         return None
     names = {"caller_id": 0, "name": found.name, "type": found.type}

@@ -1,7 +1,8 @@
 """The rows of the master API that name addresses: which parameter, which part of the reply.
 
 Sources: http://wiki.ros.org/ROS/Master_API, http://wiki.ros.org/ROS/Parameter%20Server%20API and
-ros_comm/tools/rosmaster/src/rosmaster/master_api.py. A method without a row is forwarded as it is.
+ros_comm/tools/rosmaster/src/rosmaster/master_api.py. A method without an entry is forwarded as it
+is.
 """
 
 from enum import Enum
@@ -28,7 +29,7 @@ class Reply(Enum):
     MASTER_URI = 4
 
 
-class Row(msgspec.Struct, frozen=True):
+class MethodSpec(msgspec.Struct, frozen=True):
     """One method: positions of the parameters that matter, what it registers and returns."""
 
     name: int | None = None
@@ -40,25 +41,25 @@ class Row(msgspec.Struct, frozen=True):
     reply: Reply = Reply.OTHER
 
 
-MASTER_METHODS: dict[str, Row] = {
-    "registerService": Row(name=1, service_api=2, caller_api=3, registers=Kind.SERVICE),
-    "unregisterService": Row(name=1, service_api=2, unregisters=Kind.SERVICE),
-    "registerSubscriber": Row(
+MASTER_METHODS: dict[str, MethodSpec] = {
+    "registerService": MethodSpec(name=1, service_api=2, caller_api=3, registers=Kind.SERVICE),
+    "unregisterService": MethodSpec(name=1, service_api=2, unregisters=Kind.SERVICE),
+    "registerSubscriber": MethodSpec(
         name=1, type=2, caller_api=3, registers=Kind.SUBSCRIBER, reply=Reply.SLAVE_URIS
     ),
-    "unregisterSubscriber": Row(name=1, caller_api=2, unregisters=Kind.SUBSCRIBER),
-    "registerPublisher": Row(
+    "unregisterSubscriber": MethodSpec(name=1, caller_api=2, unregisters=Kind.SUBSCRIBER),
+    "registerPublisher": MethodSpec(
         name=1, type=2, caller_api=3, registers=Kind.PUBLISHER, reply=Reply.SLAVE_URIS
     ),
-    "unregisterPublisher": Row(name=1, caller_api=2, unregisters=Kind.PUBLISHER),
-    "subscribeParam": Row(name=2, caller_api=1, registers=Kind.PARAM),
-    "unsubscribeParam": Row(name=2, caller_api=1, unregisters=Kind.PARAM),
-    "lookupNode": Row(reply=Reply.SLAVE_URI),
-    "lookupService": Row(reply=Reply.SERVICE_URI),
-    "getUri": Row(reply=Reply.MASTER_URI),
+    "unregisterPublisher": MethodSpec(name=1, caller_api=2, unregisters=Kind.PUBLISHER),
+    "subscribeParam": MethodSpec(name=2, caller_api=1, registers=Kind.PARAM),
+    "unsubscribeParam": MethodSpec(name=2, caller_api=1, unregisters=Kind.PARAM),
+    "lookupNode": MethodSpec(reply=Reply.SLAVE_URI),
+    "lookupService": MethodSpec(reply=Reply.SERVICE_URI),
+    "getUri": MethodSpec(reply=Reply.MASTER_URI),
 }
 
-NO_ROW = Row()
+NO_SPEC = MethodSpec()
 
 _PARAMETERS = {"deleteParam", "getParam", "getParamNames", "hasParam", "searchParam", "setParam"}
 _GRAPH = {"getPublishedTopics", "getSystemState", "getTopicTypes", "system.multicall"}
@@ -68,9 +69,9 @@ KNOWN_METHODS = frozenset(MASTER_METHODS).union(_PARAMETERS, _GRAPH, _NODES, _TO
 """The methods of both APIs, those of slaves as well."""
 
 
-def row(method: str) -> Row:
-    """The row of a method; an empty one if nothing in it is rewritten."""
-    return MASTER_METHODS.get(method, NO_ROW)
+def method_spec(method: str) -> MethodSpec:
+    """What is rewritten of a method; an empty spec if nothing in it is rewritten."""
+    return MASTER_METHODS.get(method, NO_SPEC)
 
 
 def resolve_name(name: str, caller_id: str) -> str:

@@ -29,7 +29,7 @@ STATES = ("ok", "new", "failing", "refused", "silent", "cleaned", "unverified")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class NodeLocation:
     """Where a node's slave API really is.
 
     ``address`` is the IP address the proxy connects to. ``named``: the host that the node gives
@@ -100,7 +100,7 @@ class Endpoint:
 
     uri: str
     node: HostPort
-    place: Place
+    location: NodeLocation
     port: int
     registrations: dict[tuple[Kind, str, str], Registration] = field(default_factory=dict)
     callers: dict[str, int] = field(default_factory=dict)
@@ -159,7 +159,7 @@ class Endpoint:
 
     def note_named(self, named: bool) -> None:
         """Note whether the host that the node gives leads to it."""
-        self.place = replace(self.place, named=named)
+        self.location = replace(self.location, named=named)
 
     def note_uri(self, uri: str) -> None:
         """Note how the node writes its own URI, of which a recovery knows the host and port."""
@@ -192,7 +192,7 @@ class Endpoint:
 
     def confirm(self) -> None:
         """Note that the node registered from its own address: what it says is believed."""
-        self.place, self.trusted = replace(self.place, confirmed=True), True
+        self.location, self.trusted = replace(self.location, confirmed=True), True
 
     def note_topic_port(self, topic: str, port: int | None) -> None:
         """Note the TCPROS port that the node names for a topic now, if it does.
@@ -230,7 +230,7 @@ class Endpoint:
     @property
     def address(self) -> str:
         """The IP address at which the proxy reaches the node."""
-        return self.place.address
+        return self.location.address
 
     @property
     def state(self) -> str:
@@ -290,7 +290,7 @@ class Endpoint:
     @property
     def slave(self) -> HostPort:
         """Where the proxy reaches the slave API: what an endpoint is known by."""
-        return HostPort(self.place.address, self.node.port)
+        return HostPort(self.location.address, self.node.port)
 
     @property
     def caller_ids(self) -> list[str]:
@@ -370,5 +370,5 @@ class Endpoint:
         return not (held or self.connected or self.pending)
 
 
-Held = tuple[Endpoint, Registration]
+EndpointRegistration = tuple[Endpoint, Registration]
 """A registration and the endpoint that has it."""

@@ -9,7 +9,7 @@ outside; a hidden service is found by its name.
 from collections.abc import Iterable
 
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Endpoint, Held
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration
 from rosproxy.ros1.registry.registry import Registry
 
 
@@ -29,7 +29,7 @@ def is_hidden_subscriber(registry: Registry, endpoint: Endpoint, topic: str) -> 
     return endpoint in registry.hidden.get((Kind.SUBSCRIBER, topic), {}).values()
 
 
-def subscribers_inside(registry: Registry, topic: str) -> list[Held]:
+def subscribers_inside(registry: Registry, topic: str) -> list[EndpointRegistration]:
     """All subscriptions of nodes inside to a topic."""
     return [
         (endpoint, held)

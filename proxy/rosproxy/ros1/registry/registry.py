@@ -12,7 +12,12 @@ from rosproxy.leases.ports import PortPool, PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, service_uri
-from rosproxy.ros1.registry.endpoint import LONGEST_REGISTRATION, Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import (
+    LONGEST_REGISTRATION,
+    Endpoint,
+    NodeLocation,
+    Registration,
+)
 
 MOST_ADMISSIONS = 16
 """Hosts with ports, and sources, remembered for one endpoint. A node gives one, from one address
@@ -65,13 +70,13 @@ class Registry:
         """
         return self._admitted.get((node, source)) if node else None
 
-    def admit(self, uri: str, node: HostPort, place: Place, source: str) -> Endpoint:
+    def admit(self, uri: str, node: HostPort, location: NodeLocation, source: str) -> Endpoint:
         """The endpoint of a slave URI that ``source`` registers; made if there is none.
 
         One that is there already takes on what came from the node's own address: nobody can rename
         somebody else's. Raises RangeExhausted if it needs a port and none can be had.
         """
-        slave = HostPort(place.address, node.port)
+        slave = HostPort(location.address, node.port)
         endpoint = self.by_slave.get(slave)
         if endpoint is None:
             port = self.pool.take(prefer=self._last_port.get(slave))
@@ -81,22 +86,24 @@ class Registry:
                     f"leases held, {len(self.pool.blocked)} taken by other programs); give the "
                     "proxy a larger --port-range (ROSPROXY_PORT_RANGE)"
                 )
-            endpoint = self._add(uri, node, place, port, source)
-        elif place.confirmed or not endpoint.place.confirmed:
+            endpoint = self._add(uri, node, location, port, source)
+        elif location.confirmed or not endpoint.location.confirmed:
             self._forget_node(endpoint)
-            endpoint.uri, endpoint.node, endpoint.place = uri, node, place
+            endpoint.uri, endpoint.node, endpoint.location = uri, node, location
             self._by_node.setdefault(node, {})[endpoint.port] = endpoint
             self.lease_changes += 1
         self._admit(endpoint, node, source)
         return endpoint
 
-    def restore(self, uri: str, node: HostPort, place: Place, port: int) -> Endpoint | None:
+    def restore(
+        self, uri: str, node: HostPort, location: NodeLocation, port: int
+    ) -> Endpoint | None:
         """Rebuild an endpoint on the port that it had; None if either is taken."""
-        if HostPort(place.address, node.port) in self.by_slave or not self.pool.claim(port):
+        if HostPort(location.address, node.port) in self.by_slave or not self.pool.claim(port):
             return None
-        endpoint = self._add(uri, node, place, port, place.address)
+        endpoint = self._add(uri, node, location, port, location.address)
         endpoint.trusted, endpoint.restored = False, True
-        self._admit(endpoint, node, place.address)
+        self._admit(endpoint, node, location.address)
         return endpoint
 
     def remove(self, endpoint: Endpoint) -> None:
@@ -114,7 +121,7 @@ class Registry:
         if not known:
             self._unproven.pop(endpoint.source, None)
 
-    def move(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+    def move(self, places: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
         """Note that nodes are at other addresses now; ports and registrations stay.
 
         What came from the old address means the node at the new one from now on, and what it
@@ -127,11 +134,11 @@ class Registry:
             del self.by_slave[endpoint.slave], self._last_port[endpoint.slave]
         admissions = [(e, a) for e in moved for a in self._take_admissions(e)]
         for endpoint in moved:
-            endpoint.place = places[endpoint]
+            endpoint.location = places[endpoint]
             self.by_slave[endpoint.slave] = endpoint
             self._remember(endpoint)
         for endpoint, node in admissions:
-            self._admit(endpoint, node, endpoint.place.address)
+            self._admit(endpoint, node, endpoint.location.address)
         return moved
 
     def reclaimable(self) -> Endpoint | None:
@@ -241,7 +248,7 @@ class Registry:
         """Everything that is registered, with its endpoint."""
         return [(e, held) for e in self for held in e.registrations.values()]
 
-    def _movable(self, places: Mapping[Endpoint, Place]) -> list[Endpoint]:
+    def _movable(self, places: Mapping[Endpoint, NodeLocation]) -> list[Endpoint]:
         """Those whose new addresses are free, or will be; of two for the same one the first."""
         moved = list(places)
         while True:
@@ -258,15 +265,17 @@ class Registry:
 
     def _take_admissions(self, endpoint: Endpoint) -> list[HostPort]:
         """What meant an endpoint if its own address said so; it no longer does."""
-        address = endpoint.place.address
+        address = endpoint.location.address
         nodes = [node for node, source in endpoint.admissions if source == address]
         for node in nodes:
             del endpoint.admissions[node, address]
             del self._admitted[node, address]
         return [*nodes, endpoint.node]
 
-    def _add(self, uri: str, node: HostPort, place: Place, port: int, source: str) -> Endpoint:
-        endpoint = Endpoint(uri, node, place, port, source=source)
+    def _add(
+        self, uri: str, node: HostPort, location: NodeLocation, port: int, source: str
+    ) -> Endpoint:
+        endpoint = Endpoint(uri, node, location, port, source=source)
         self.lease_changes += 1
         self._unproven.setdefault(source, {})[endpoint] = None
         self.by_port[port] = self.by_slave[endpoint.slave] = endpoint

@@ -13,7 +13,7 @@ from enum import Enum
 from rosproxy.net.addresses import Network, is_inside
 
 
-class Standing(Enum):
+class ClientKind(Enum):
     """What an address is to the proxy; the value is the word for it in metrics."""
 
     ADMITTED = "admitted"
@@ -21,20 +21,20 @@ class Standing(Enum):
     UNSELECTED = "unselected"
 
 
-def standing(
+def client_kind(
     address: str, networks: Sequence[Network], selected: Collection[str] | None
-) -> Standing:
+) -> ClientKind:
     """What an address is, given the inside networks and the selected addresses; None: not told."""
     if selected is not None and address in selected:
-        return Standing.ADMITTED
+        return ClientKind.ADMITTED
     if not is_inside(address, networks):
-        return Standing.OUTSIDE
-    return Standing.ADMITTED if selected is None else Standing.UNSELECTED
+        return ClientKind.OUTSIDE
+    return ClientKind.ADMITTED if selected is None else ClientKind.UNSELECTED
 
 
-def refusal(address: str, found: Standing, networks: Sequence[Network]) -> str:
+def refusal(address: str, found: ClientKind, networks: Sequence[Network]) -> str:
     """What somebody is told, in one line, who may not use the proxy as its master."""
-    if found is Standing.UNSELECTED:
+    if found is ClientKind.UNSELECTED:
         return (
             f"rosproxy: {address} is not selected to use this proxy as its master: label its "
             "container rosproxy.enable=true (Docker) or its pod rosproxy.io/inject=true "

@@ -24,10 +24,10 @@ from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.registry.stand_ins import StandIns
 
 
-class Asker(msgspec.Struct, frozen=True):
+class Caller(msgspec.Struct, frozen=True):
     """Who is going to use an address.
 
-    ``address`` is the asker's own IP address, ``proxy`` the proxy's address that it can reach,
+    ``address`` is the caller's own IP address, ``proxy`` the proxy's address that it can reach,
     ``caller_id`` its node name and ``endpoint`` its endpoint, each as far as known. ``master`` is
     how it calls its master: ``host:port``.
     """
@@ -76,48 +76,48 @@ class Addressing:
         """The service URI that stands for an endpoint's services outside."""
         return service_uri(self.outside(endpoint.port))
 
-    def export_slave(self, uri: str, asker: Asker) -> str:
+    def export_slave(self, uri: str, caller: Caller) -> str:
         """The outside form of a slave URI that an inside node gave."""
-        uri = placed(uri, asker.address)
+        uri = placed(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         where = parse_slave_uri(uri)
-        endpoint = self._own(where, asker) if where else None
+        endpoint = self._own(where, caller) if where else None
         if endpoint:
             return self.advertised_uri(endpoint)
-        if where and self._is_relayed(where, asker):
+        if where and self._is_relayed(where, caller):
             return uri.replace(str(where), str(self.outside(where.port)), 1)
         return uri
 
-    def export_service(self, uri: str, service: str, asker: Asker) -> str:
+    def export_service(self, uri: str, service: str, caller: Caller) -> str:
         """The outside form of the URI of a service that an inside node gave."""
-        uri = placed(uri, asker.address)
+        uri = placed(uri, caller.address)
         if (original := self.stand_ins.export_uri(uri)) is not None:
             return original
         where = parse_service_uri(uri)
         if where is None:
             return uri
-        if self._is_relayed(where, asker):
+        if self._is_relayed(where, caller):
             return service_uri(self.outside(where.port))
         known = self.registry.services.get(service)
         if known and (where.host == known[0].node.host or uri == known[1].service_api):
             return self.advertised_service(known[0])
         return uri
 
-    def import_slave(self, uri: str, asker: Asker) -> str:
+    def import_slave(self, uri: str, caller: Caller) -> str:
         """The form of a slave URI from outside that an inside node can use."""
         endpoint = self.stands_for(uri)
-        return self._import(endpoint, asker) if endpoint else self._import_foreign(uri, asker)
+        return self._import(endpoint, caller) if endpoint else self._import_foreign(uri, caller)
 
-    def import_service(self, uri: str, service: str, asker: Asker) -> str:
+    def import_service(self, uri: str, service: str, caller: Caller) -> str:
         """The form of a service URI from outside that an inside node can use."""
         endpoint = self._endpoint_at(parse_service_uri(uri))
         if endpoint is None:
-            return self._import_foreign(uri, asker)
+            return self._import_foreign(uri, caller)
         literal = self._service_literal(endpoint, service)
-        if literal and self._direct(endpoint, asker):
+        if literal and self._direct(endpoint, caller):
             return literal
-        return service_uri(HostPort(asker.proxy, endpoint.port))
+        return service_uri(HostPort(caller.proxy, endpoint.port))
 
     def foreign(self, uri: str) -> HostPort | None:
         """What a stand-in for a URI that the master has needs to lead to; None if it needs none."""
@@ -126,12 +126,12 @@ class Addressing:
             return None
         return where
 
-    def handed_out(self, uri: str, asker: Asker) -> bool:
+    def handed_out(self, uri: str, caller: Caller) -> bool:
         """Whether a slave URI is one of this proxy's own, in the inside or the outside form."""
         where = parse_slave_uri(uri)
         if where is None:
             return False
-        return self._is_relayed(where, asker) or self.stands_for(uri) is not None
+        return self._is_relayed(where, caller) or self.stands_for(uri) is not None
 
     def advertises(self, where: HostPort) -> bool:
         """Whether outside finds one of this proxy's own ports at a host and port."""
@@ -141,21 +141,21 @@ class Addressing:
         """The listening port of an advertised slave URI of this proxy."""
         return self._listening(parse_slave_uri(uri))
 
-    def _import_foreign(self, uri: str, asker: Asker) -> str:
-        return self.stand_ins.import_uri(uri, asker.proxy) if self.foreign(uri) else uri
+    def _import_foreign(self, uri: str, caller: Caller) -> str:
+        return self.stand_ins.import_uri(uri, caller.proxy) if self.foreign(uri) else uri
 
-    def _import(self, endpoint: Endpoint, asker: Asker) -> str:
-        if self._direct(endpoint, asker) and self._own(endpoint.node, asker) is endpoint:
+    def _import(self, endpoint: Endpoint, caller: Caller) -> str:
+        if self._direct(endpoint, caller) and self._own(endpoint.node, caller) is endpoint:
             return endpoint.uri
-        return slave_uri(HostPort(asker.proxy, endpoint.port))
+        return slave_uri(HostPort(caller.proxy, endpoint.port))
 
-    def _direct(self, endpoint: Endpoint, asker: Asker) -> bool:
-        if endpoint is asker.endpoint:
+    def _direct(self, endpoint: Endpoint, caller: Caller) -> bool:
+        if endpoint is caller.endpoint:
             return True
-        if asker.address == endpoint.place.address:
-            return not endpoint.place.stale
-        shared = [n for n in self.networks if is_inside(asker.address, [n])]
-        return endpoint.place.named and is_inside(endpoint.place.address, shared)
+        if caller.address == endpoint.location.address:
+            return not endpoint.location.stale
+        shared = [n for n in self.networks if is_inside(caller.address, [n])]
+        return endpoint.location.named and is_inside(endpoint.location.address, shared)
 
     def stands_for(self, uri: str) -> Endpoint | None:
         """The endpoint that an advertised slave URI stands for.
@@ -178,16 +178,16 @@ class Addressing:
             return None
         return self.ports.listening(where.port)
 
-    def _is_relayed(self, where: HostPort, asker: Asker) -> bool:
-        return where.host == asker.proxy and where.port in self.ports.listen
+    def _is_relayed(self, where: HostPort, caller: Caller) -> bool:
+        return where.host == caller.proxy and where.port in self.ports.listen
 
-    def _own(self, node: HostPort, asker: Asker) -> Endpoint | None:
-        """Whom an asker means by a host and port; several nodes may call themselves the same."""
-        admitted = self.registry.admitted(node, asker.address)
+    def _own(self, node: HostPort, caller: Caller) -> Endpoint | None:
+        """Whom an caller means by a host and port; several nodes may call themselves the same."""
+        admitted = self.registry.admitted(node, caller.address)
 
         def distance(endpoint: Endpoint) -> tuple[bool, bool, bool]:
-            itself = endpoint is asker.endpoint
-            return not itself, endpoint is not admitted, endpoint.place.address != asker.address
+            itself = endpoint is caller.endpoint
+            return not itself, endpoint is not admitted, endpoint.location.address != caller.address
 
         return min(self.registry.by_node(node), key=distance, default=None)
 

@@ -11,23 +11,23 @@ from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import Kind, Reply, resolve_name, row
+from rosproxy.ros1.protocol.master_methods import Kind, Reply, method_spec, resolve_name
 from rosproxy.ros1.protocol.uris import parse_service_uri, placed
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.multicall import insert_items
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import hidden_graph
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_calls import (
-    NOTHING_UNSEEN,
-    Admission,
+    NO_REPLY_CHANGES,
+    CallOutcome,
     Exported,
     LocalReply,
     MasterReply,
+    ReplyChanges,
     Request,
     Result,
-    Unseen,
     caller_id_of,
     read_reply,
     second_name,
@@ -36,20 +36,20 @@ from rosproxy.ros1.rewriting.slave_api import replace_held
 
 
 def export_request(
-    request: Request, admissions: Sequence[Admission], addressing: Addressing
+    request: Request, admissions: Sequence[CallOutcome], addressing: Addressing
 ) -> Exported:
     """The request for the master: URIs exported, calls that the proxy answers left out.
 
     ``admissions`` has one for each call. A call that unregisters concerns the endpoint of its
     registration instead.
     """
-    asker, edits, outcomes = request.asker, list[Edit](), list[Admission]()
+    caller, edits, outcomes = request.caller, list[Edit](), list[CallOutcome]()
     for call, admission in zip(request.calls, admissions, strict=True):
         outcome = admission
-        if call and outcome is None and row(call.method).unregisters:
-            outcome = holder(call, asker, addressing)
+        if call and outcome is None and method_spec(call.method).unregisters:
+            outcome = holder(call, caller, addressing)
         if call and not isinstance(outcome, LocalReply):
-            edits += _export_call(call, outcome, asker, addressing)
+            edits += _export_call(call, outcome, caller, addressing)
         outcomes.append(outcome)
     local = [isinstance(outcome, LocalReply) for outcome in outcomes]
     if local and all(local):
@@ -59,16 +59,16 @@ def export_request(
 
 
 def import_reply(
-    reply: MasterReply, addressing: Addressing, unseen: Unseen = NOTHING_UNSEEN
+    reply: MasterReply, addressing: Addressing, changes: ReplyChanges = NO_REPLY_CHANGES
 ) -> bytes:
     """The reply for the inside node: URIs imported, the proxy's own replies put in."""
     edits: list[Edit] = []
     request = reply.exported.request
     for result in reply.results:
-        asker = request.asker
+        caller = request.caller
         if result.endpoint:
-            asker = replace(asker, endpoint=result.endpoint)
-        edits += _import_result(result, asker, addressing, unseen)
+            caller = replace(caller, endpoint=result.endpoint)
+        edits += _import_result(result, caller, addressing, changes)
     if request.multicall and reply.value and reply.value.items:
         outcomes = enumerate(reply.exported.outcomes)
         local = [(i, one.triple()) for i, one in outcomes if isinstance(one, LocalReply)]
@@ -89,86 +89,86 @@ def rename_master(request: Request, reply: bytes, master: str) -> bytes:
         if not (result.triple and result.value):
             continue
         text = result.value.string()
-        if row(result.call.method).reply is Reply.MASTER_URI and text:
+        if method_spec(result.call.method).reply is Reply.MASTER_URI and text:
             edits += replace_held(result.triple, f"http://{master}/")
     return xmlrpc.apply(reply, edits)
 
 
-def holder(call: Call, asker: Asker, addressing: Addressing) -> Endpoint | None:
+def holder(call: Call, caller: Caller, addressing: Addressing) -> Endpoint | None:
     """The endpoint of the registration that a call ends, if it gives that endpoint's URI."""
-    found, known = row(call.method), addressing.registry.by_caller.get(caller_id_of(call))
+    found, known = method_spec(call.method), addressing.registry.by_caller.get(caller_id_of(call))
     if known is None:
         return None
     if found.caller_api is None:
         uri = addressing.export_service(
-            call.string(found.service_api) or "", second_name(call), asker
+            call.string(found.service_api) or "", second_name(call), caller
         )
         return known if uri == addressing.advertised_service(known) else None
-    uri = addressing.export_slave(call.string(found.caller_api) or "", asker)
+    uri = addressing.export_slave(call.string(found.caller_api) or "", caller)
     return known if uri == addressing.advertised_uri(known) else None
 
 
 def _export_call(
-    call: Call, admission: Admission, asker: Asker, addressing: Addressing
+    call: Call, admission: CallOutcome, caller: Caller, addressing: Addressing
 ) -> Iterator[Edit]:
-    caller_api = call.string_value(row(call.method).caller_api)
-    service_api = call.string_value(row(call.method).service_api)
+    caller_api = call.string_value(method_spec(call.method).caller_api)
+    service_api = call.string_value(method_spec(call.method).service_api)
     if isinstance(admission, Endpoint):
         if caller_api:
             yield xmlrpc.replace(caller_api, addressing.advertised_uri(admission))
-        if service_api and parse_service_uri(placed(service_api.text, asker.address)):
+        if service_api and parse_service_uri(placed(service_api.text, caller.address)):
             yield xmlrpc.replace(service_api, addressing.advertised_service(admission))
         return
     if caller_api:
-        yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, asker))
+        yield xmlrpc.replace(caller_api, addressing.export_slave(caller_api.text, caller))
     if service_api:
-        text = addressing.export_service(service_api.text, second_name(call), asker)
+        text = addressing.export_service(service_api.text, second_name(call), caller)
         yield xmlrpc.replace(service_api, text)
 
 
 def _import_result(
-    result: Result, asker: Asker, addressing: Addressing, unseen: Unseen
+    result: Result, caller: Caller, addressing: Addressing, changes: ReplyChanges
 ) -> list[Edit]:
     triple = result.triple
     if triple is None or not result.accepted:
         return []
     held = triple.items[2]
-    if row(result.call.method).reply is Reply.SLAVE_URIS:
-        return _import_uris(result.call, held, asker, addressing, unseen)
+    if method_spec(result.call.method).reply is Reply.SLAVE_URIS:
+        return _import_uris(result.call, held, caller, addressing, changes)
     if result.call.method == "getParamNames":
-        return [xmlrpc.remove(item) for item in held.items if item.text in unseen.params]
-    if unseen.graph and result.call.method in hidden_graph.METHODS:
+        return [xmlrpc.remove(item) for item in held.items if item.text in changes.params]
+    if changes.graph and result.call.method in hidden_graph.METHODS:
         said = xmlrpc.python_value(held)
         more = hidden_graph.completed(result.call, said, addressing.registry)
         return [Edit(*held.outer, xmlrpc.dump_value(more))]
-    return _import_uri(result.call, triple, asker, addressing)
+    return _import_uri(result.call, triple, caller, addressing)
 
 
-def _import_uri(call: Call, triple: Value, asker: Asker, addressing: Addressing) -> list[Edit]:
-    text, kind = triple.items[2].string(), row(call.method).reply
+def _import_uri(call: Call, triple: Value, caller: Caller, addressing: Addressing) -> list[Edit]:
+    text, kind = triple.items[2].string(), method_spec(call.method).reply
     if text and kind is Reply.SLAVE_URI:
-        return replace_held(triple, addressing.import_slave(text, asker))
+        return replace_held(triple, addressing.import_slave(text, caller))
     if text and kind is Reply.SERVICE_URI:
-        uri = addressing.import_service(text, second_name(call), asker)
+        uri = addressing.import_service(text, second_name(call), caller)
         return replace_held(triple, uri)
-    if text and kind is Reply.MASTER_URI and asker.master:
-        return replace_held(triple, f"http://{asker.master}/")
+    if text and kind is Reply.MASTER_URI and caller.master:
+        return replace_held(triple, f"http://{caller.master}/")
     return []
 
 
 def _import_uris(
-    call: Call, held: Value, asker: Asker, addressing: Addressing, unseen: Unseen
+    call: Call, held: Value, caller: Caller, addressing: Addressing, changes: ReplyChanges
 ) -> list[Edit]:
     """The publishers that a subscriber is told of, or the subscribers that a publisher is."""
     more: Sequence[str] = ()
-    if row(call.method).registers is Kind.SUBSCRIBER:
-        more = unseen.publishers.get(second_name(call), ())
+    if method_spec(call.method).registers is Kind.SUBSCRIBER:
+        more = changes.publishers.get(second_name(call), ())
     if more:
         uris = [*(item.text for item in held.items), *more]
-        imported = dict.fromkeys(addressing.import_slave(uri, asker) for uri in uris)
+        imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in uris)
         return [Edit(*held.outer, xmlrpc.dump_value([*imported]))]
     return [
-        xmlrpc.replace(item, addressing.import_slave(item.text, asker))
+        xmlrpc.replace(item, addressing.import_slave(item.text, caller))
         for item in held.items
         if item.kind == "string"
     ]
@@ -176,7 +176,7 @@ def _import_uris(
 
 def registration(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
-    found, caller_id = row(call.method), caller_id_of(call)
+    found, caller_id = method_spec(call.method), caller_id_of(call)
     kind, name = found.registers or found.unregisters, call.string(found.name)
     if kind is None or not name:
         return None

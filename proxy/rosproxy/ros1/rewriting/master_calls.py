@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import msgspec
 from msgspec.structs import replace
 
-from rosproxy.ros1.protocol.master_methods import NO_ROW, Reply, resolve_name, row
+from rosproxy.ros1.protocol.master_methods import NO_SPEC, Reply, method_spec, resolve_name
 from rosproxy.ros1.protocol.uris import placed
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc import passing
@@ -19,7 +19,7 @@ from rosproxy.ros1.protocol.xmlrpc.limits import OWN_REPLY, REPLY, Limits
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL, inner_calls, inner_items
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.rewriting import hidden_graph
-from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.rewriting.slave_api import ros_triple
 
 
@@ -42,14 +42,14 @@ class Answered(msgspec.Struct, frozen=True):
     code: int
     text: str
     value: object
-    fact: "Noted | None" = None
+    fact: "RegistryChange | None" = None
 
     def triple(self) -> list[object]:
         """The ROS status triple."""
         return [self.code, self.text, self.value]
 
 
-class Unseen(msgspec.Struct, frozen=True):
+class ReplyChanges(msgspec.Struct, frozen=True):
     """What a reply has to say otherwise than the master does.
 
     ``publishers`` are those by topic that the master does not know of, as it would have them;
@@ -62,11 +62,11 @@ class Unseen(msgspec.Struct, frozen=True):
     graph: bool = False
 
 
-NOTHING_UNSEEN = Unseen()
+NO_REPLY_CHANGES = ReplyChanges()
 _URIS = frozenset({Reply.SLAVE_URI, Reply.SLAVE_URIS, Reply.SERVICE_URI})
 LocalReply = Refusal | Answered
 """The reply to a call that the master does not get."""
-Admission = Endpoint | LocalReply | None
+CallOutcome = Endpoint | LocalReply | None
 """What became of a call: the endpoint that it registers, or the proxy's own reply to it."""
 
 
@@ -80,7 +80,7 @@ class Request(msgspec.Struct, frozen=True):
     body: bytes
     calls: tuple[Call | None, ...]
     multicall: bool
-    asker: Asker
+    caller: Caller
     items: Sequence[Value] = ()
 
     @property
@@ -105,12 +105,12 @@ class Request(msgspec.Struct, frozen=True):
         """Whether nothing in the reply is rewritten."""
         if self.multicall or self.tells_graph or self.method == "getParamNames":
             return False
-        return row(self.method).reply is Reply.OTHER
+        return method_spec(self.method).reply is Reply.OTHER
 
     @property
     def plain(self) -> bool:
         """Whether request and reply pass untouched."""
-        return all(call is None or row(call.method) == NO_ROW for call in self.calls)
+        return all(call is None or method_spec(call.method) == NO_SPEC for call in self.calls)
 
 
 class Exported(msgspec.Struct, frozen=True):
@@ -122,7 +122,7 @@ class Exported(msgspec.Struct, frozen=True):
     """
 
     request: Request
-    outcomes: tuple[Admission, ...]
+    outcomes: tuple[CallOutcome, ...]
     body: bytes | None
 
     def local_reply(self) -> bytes:
@@ -130,7 +130,7 @@ class Exported(msgspec.Struct, frozen=True):
         triples = [one.triple() for one in self.outcomes if isinstance(one, LocalReply)]
         return xmlrpc.dump_reply([[t] for t in triples] if self.request.multicall else triples[0])
 
-    def facts(self) -> "list[Noted]":
+    def facts(self) -> "list[RegistryChange]":
         """What the registry has to learn from the calls that the proxy answers."""
         local = (one for one in self.outcomes if isinstance(one, Answered))
         return [one.fact for one in local if one.fact]
@@ -158,7 +158,7 @@ class Result(msgspec.Struct, frozen=True):
         return self.triple.items[2] if self.triple else None
 
 
-class Noted(msgspec.Struct, frozen=True):
+class RegistryChange(msgspec.Struct, frozen=True):
     """A fact from an accepted call, for the registry.
 
     ``endpoint`` is where the registration was made, None if it has ended.
@@ -185,7 +185,7 @@ class MasterReply(msgspec.Struct, frozen=True):
             if result.call.method == "getParamNames" and result.value:
                 yield from (item.text for item in result.value.items)
 
-    def facts(self, now: float) -> list[Noted]:
+    def facts(self, now: float) -> list[RegistryChange]:
         """What the registry has to learn from the calls that the master accepted.
 
         The master also accepts what changes nothing: a node that makes room for another of its
@@ -193,29 +193,29 @@ class MasterReply(msgspec.Struct, frozen=True):
         """
         found = []
         for result in self.results:
-            held = registration(result.call, now, self.exported.request.asker.address)
+            held = registration(result.call, now, self.exported.request.caller.address)
             if held and result.accepted and result.endpoint:
-                made = row(result.call.method).registers is not None
-                found.append(Noted(held, result.endpoint if made else None))
+                made = method_spec(result.call.method).registers is not None
+                found.append(RegistryChange(held, result.endpoint if made else None))
         return found
 
     def uris(self) -> Iterator[str]:
         """The URIs that it hands to an inside node, as the master holds them."""
         for result in self.results:
             held = result.value
-            if held and result.accepted and row(result.call.method).reply in _URIS:
+            if held and result.accepted and method_spec(result.call.method).reply in _URIS:
                 texts = (item.string() for item in (held.items or [held]))
                 yield from (text for text in texts if text)
 
 
-def read_request(body: bytes, asker: Asker, limits: Limits = OWN_REPLY) -> Request:
+def read_request(body: bytes, caller: Caller, limits: Limits = OWN_REPLY) -> Request:
     """Parse a request within limits. Raises XmlRpcError if it is none, or is beyond them."""
     call = xmlrpc.parse_call(body, limits)
     if call.method != MULTICALL:
-        return Request(body, (call,), False, replace(asker, caller_id=caller_id_of(call)))
+        return Request(body, (call,), False, replace(caller, caller_id=caller_id_of(call)))
     calls = tuple(inner_calls(call))
     caller_id = next((caller_id_of(inner) for inner in calls if inner), "")
-    return Request(body, calls, True, replace(asker, caller_id=caller_id), inner_items(call))
+    return Request(body, calls, True, replace(caller, caller_id=caller_id), inner_items(call))
 
 
 def read_reply(exported: Exported, reply: bytes) -> MasterReply:
@@ -234,14 +234,14 @@ def read_reply(exported: Exported, reply: bytes) -> MasterReply:
 
 def registering_uri(call: Call | None) -> str | None:
     """The slave URI that a call registers, if it is a complete registration."""
-    if call is None or row(call.method).registers is None:
+    if call is None or method_spec(call.method).registers is None:
         return None
-    return call.string(row(call.method).caller_api)
+    return call.string(method_spec(call.method).caller_api)
 
 
 def registration(call: Call, now: float, source: str) -> Registration | None:
     """What a call from an address registers or unregisters; None for any other call."""
-    found, caller_id = row(call.method), caller_id_of(call)
+    found, caller_id = method_spec(call.method), caller_id_of(call)
     kind, name = found.registers or found.unregisters, call.string(found.name)
     if kind is None or not name:
         return None

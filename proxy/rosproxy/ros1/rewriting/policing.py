@@ -16,8 +16,8 @@ from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry import hidden
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
-from rosproxy.ros1.rewriting.master_calls import Answered, Noted, second_name
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
+from rosproxy.ros1.rewriting.master_calls import Answered, RegistryChange, second_name
 
 KINDS = {
     Kind.PUBLISHER: RuleKind.PUBLISH,
@@ -60,11 +60,11 @@ def param_use_of(call: Call) -> ParamUse | None:
 
 
 def hidden_registration(
-    held: Registration, endpoint: Endpoint, asker: Asker, addressing: Addressing
+    held: Registration, endpoint: Endpoint, caller: Caller, addressing: Addressing
 ) -> Answered:
     """The answer to a registration that the master is not told of."""
-    asker, registry = replace(asker, endpoint=endpoint), addressing.registry
-    fact = Noted(held, endpoint)
+    caller, registry = replace(caller, endpoint=endpoint), addressing.registry
+    fact = RegistryChange(held, endpoint)
     if held.kind is Kind.SERVICE:
         text = f"Registered [{held.caller_id}] as provider of [{held.name}]"
         return Answered(1, text, 1, fact)
@@ -74,31 +74,31 @@ def hidden_registration(
     else:
         found = hidden.publishers_inside(registry, held.name)
         text = f"Subscribed to [{held.name}]"
-    return Answered(1, text, _imported(dict.fromkeys(found), asker, addressing), fact)
+    return Answered(1, text, _imported(dict.fromkeys(found), caller, addressing), fact)
 
 
 def hidden_end(held: Registration) -> Answered:
     """The answer to a call that ends a registration of which the master knows nothing."""
     text = f"Unregistered [{held.caller_id}] as provider of [{held.name}]"
-    return Answered(1, text, 1, Noted(held, None))
+    return Answered(1, text, 1, RegistryChange(held, None))
 
 
-def hidden_service(call: Call, asker: Asker, addressing: Addressing) -> Answered | None:
+def hidden_service(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
     """The answer to lookupService, if the master does not know of the service."""
     endpoint = hidden.service(addressing.registry, second_name(call))
     if endpoint is None:
         return None
     uri = addressing.advertised_service(endpoint)
-    found = addressing.import_service(uri, second_name(call), asker)
+    found = addressing.import_service(uri, second_name(call), caller)
     return Answered(1, f"rosrpc URI: [{found}]", found)
 
 
-def hidden_node(call: Call, asker: Asker, addressing: Addressing) -> Answered | None:
+def hidden_node(call: Call, caller: Caller, addressing: Addressing) -> Answered | None:
     """The answer to lookupNode, if the master knows nothing of that node."""
     endpoint = hidden.node(addressing.registry, second_name(call))
     if endpoint is None:
         return None
-    uri = addressing.import_slave(addressing.advertised_uri(endpoint), asker)
+    uri = addressing.import_slave(addressing.advertised_uri(endpoint), caller)
     return Answered(1, "node api", uri)
 
 
@@ -149,6 +149,6 @@ def _searched(caller_id: str, name: str) -> tuple[str, ...]:
     return tuple(resolve_name(f"{space}/{name}", "") for space in spaces)
 
 
-def _imported(endpoints: Iterable[Endpoint], asker: Asker, addressing: Addressing) -> list[str]:
+def _imported(endpoints: Iterable[Endpoint], caller: Caller, addressing: Addressing) -> list[str]:
     uris = map(addressing.advertised_uri, endpoints)
-    return [addressing.import_slave(uri, asker) for uri in uris]
+    return [addressing.import_slave(uri, caller) for uri in uris]

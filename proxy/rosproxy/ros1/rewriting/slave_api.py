@@ -19,7 +19,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit, Value
 from rosproxy.ros1.protocol.xmlrpc.multicall import MULTICALL
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 
 MASTER_ONLY = frozenset({"shutdown", "publisherUpdate", "paramUpdate"})
 """What the master calls at nodes; a policy can refuse it from anybody else."""
@@ -40,16 +40,16 @@ class CallView(msgspec.Struct, frozen=True):
     master_uri: str
 
 
-def from_outside(node: Asker, master_uri: str, addressing: Addressing) -> CallView:
+def from_outside(node: Caller, master_uri: str, addressing: Addressing) -> CallView:
     """The view of a call from outside at a node inside."""
-    imported = partial(addressing.import_slave, asker=node)
-    return CallView(imported, partial(addressing.export_slave, asker=node), master_uri)
+    imported = partial(addressing.import_slave, caller=node)
+    return CallView(imported, partial(addressing.export_slave, caller=node), master_uri)
 
 
-def from_inside(asker: Asker, master_uri: str, addressing: Addressing) -> CallView:
+def from_inside(caller: Caller, master_uri: str, addressing: Addressing) -> CallView:
     """The view of a call from a node inside at one outside."""
-    exported = partial(addressing.export_slave, asker=asker)
-    return CallView(exported, partial(addressing.import_slave, asker=asker), master_uri)
+    exported = partial(addressing.export_slave, caller=caller)
+    return CallView(exported, partial(addressing.import_slave, caller=caller), master_uri)
 
 
 def rewritten(method: str) -> bool:

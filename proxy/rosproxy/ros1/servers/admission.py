@@ -1,4 +1,4 @@
-"""Admission: a node that registers through the proxy gets an endpoint and a port.
+"""CallOutcome: a node that registers through the proxy gets an endpoint and a port.
 
 A node says where it is by its slave URI, and that may name a host which only its own container
 knows. So the address that the registration came from counts where it must: see `NodeAdmission`'s
@@ -25,15 +25,15 @@ from rosproxy.leases.leases import RANGE_OPTION, Leases
 from rosproxy.net.addresses import HostPort, is_loopback
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.protocol.master_methods import row
+from rosproxy.ros1.protocol.master_methods import method_spec
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, placed
 from rosproxy.ros1.protocol.xmlrpc.document import Call
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.registry import RangeExhausted
-from rosproxy.ros1.registry.selection import Standing
-from rosproxy.ros1.rewriting.addressing import Asker
-from rosproxy.ros1.rewriting.master_calls import Admission, Refusal, registering_uri
+from rosproxy.ros1.registry.selection import ClientKind
+from rosproxy.ros1.rewriting.addressing import Caller
+from rosproxy.ros1.rewriting.master_calls import CallOutcome, Refusal, registering_uri
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class NodeAdmission:
         self._cleanup, self._verification = cleanup, verification
         self._making_room = asyncio.Lock()
 
-    async def admit(self, call: Call, asker: Asker) -> Admission:
+    async def admit(self, call: Call, caller: Caller) -> CallOutcome:
         """The endpoint of a call that registers, or why there is none; None for other calls.
 
         None, too, for a node that is found to be outside: its URI passes as it is. Raises
@@ -85,53 +85,58 @@ class NodeAdmission:
             return None
         if self._context.retired:
             return Refusal(RETIRED)
-        uri = placed(uri, asker.address)
+        uri = placed(uri, caller.address)
         node = parse_slave_uri(uri)
-        endpoint = self._context.registry.admitted(node, asker.address)
+        endpoint = self._context.registry.admitted(node, caller.address)
         if endpoint is not None and not endpoint.never_found:
-            return await self._admit_again(endpoint, uri, call, asker)
+            return await self._admit_again(endpoint, uri, call, caller)
         if node is None:
             return Refusal(
                 f"rosproxy: caller_api {uri[:200]!r} is not of the form http://host:port/"
             )
-        if self._context.addressing.handed_out(uri, asker):
+        if self._context.addressing.handed_out(uri, caller):
             return None
-        return await self._admit_new(uri, node, call, asker)
+        return await self._admit_new(uri, node, call, caller)
 
     async def _admit_again(
-        self, endpoint: Endpoint, uri: str, call: Call, asker: Asker
+        self, endpoint: Endpoint, uri: str, call: Call, caller: Caller
     ) -> Endpoint | Refusal:
         """The endpoint that a URI has meant before, for a node that is there.
 
         Somebody else at a source that hides several has to bear out its name as well.
         """
-        caller_id, place = call.string(0) or "", endpoint.place
-        if place.address != asker.address and caller_id not in endpoint.caller_ids:
-            name = await self._context.nodes.name(endpoint.slave, _service(call, asker))
+        caller_id, location = call.string(0) or "", endpoint.location
+        if location.address != caller.address and caller_id not in endpoint.caller_ids:
+            name = await self._context.nodes.name(endpoint.slave, _service(call, caller))
             if name != caller_id:
                 return Refusal(
                     f"rosproxy: {endpoint.uri[:200]} is not the address of {caller_id[:200]}: the "
                     f"node there says that it is {(name or 'none')[:200]}"
                 )
-        if place.address == asker.address:
+        if location.address == caller.address:
             endpoint.note_uri(uri)
-        self._welcome_back(endpoint, asker)
+        self._welcome_back(endpoint, caller)
         return endpoint
 
-    async def _admit_new(self, uri: str, node: HostPort, call: Call, asker: Asker) -> Admission:
+    async def _admit_new(self, uri: str, node: HostPort, call: Call, caller: Caller) -> CallOutcome:
         """The endpoint of a node that has not registered from there before; see `admit`."""
-        place = await self._place(node, call, asker)
-        if place is None:
+        location = await self._locate(node, call, caller)
+        if location is None:
             return None
-        taken_in = await self.take_in(uri, node, place, asker)
+        taken_in = await self.take_in(uri, node, location, caller)
         if isinstance(taken_in, Endpoint):
             await self._leases.cleared(taken_in)
-            first_probe = self._probe_first(taken_in, asker.caller_id)
+            first_probe = self._probe_first(taken_in, caller.caller_id)
             self._context.tasks.spawn(first_probe, f"first probe of {uri}")
         return taken_in
 
     async def take_in(
-        self, uri: str, node: HostPort, place: Place, asker: Asker, answers: bool = False
+        self,
+        uri: str,
+        node: HostPort,
+        location: NodeLocation,
+        caller: Caller,
+        answers: bool = False,
     ) -> Endpoint | Refusal:
         """The endpoint of a node found at a place, its port open; a refusal if none is left.
 
@@ -139,21 +144,21 @@ class NodeAdmission:
         Raises Unreachable.
         """
         registry, leases, problems = self._context.registry, self._leases, self._context.problems
-        slave, source = HostPort(place.address, node.port), asker.address
+        slave, source = HostPort(location.address, node.port), caller.address
         if slave not in registry.by_slave and not answers and self._is_crowded(source):
             answers = await self._comes_to_answer(slave, source)
             if not answers and self._is_crowded(source):
-                return self._refuse(uri, asker, _crowd_text(source, slave, registry.most_unproven))
+                return self._refuse(uri, caller, _crowd_text(source, slave, registry.most_unproven))
         while True:
             try:
-                endpoint = registry.admit(uri, node, place, source)
+                endpoint = registry.admit(uri, node, location, source)
             except RangeExhausted as error:
                 answers = answers or await self._answers(slave)
                 async with self._making_room:
                     room = registry.pool.free or await self._make_room(answers)
                 if room:
                     continue
-                return self._refuse(uri, asker, str(error))
+                return self._refuse(uri, caller, str(error))
             if answers:
                 endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
             leases.open(endpoint)
@@ -228,24 +233,24 @@ class NodeAdmission:
     async def _answers(self, slave: HostPort) -> bool:
         return (await self._context.nodes.probe(slave)).probe is ProbeResult.ANSWERED
 
-    def _refuse(self, uri: str, asker: Asker, text: str) -> Refusal:
+    def _refuse(self, uri: str, caller: Caller, text: str) -> Refusal:
         self._context.metrics.exhausted.inc()
-        self._context.problems.add(asker.caller_id, text)
-        log.error("%s: %s (%s) gets no port: %s", asker.address, asker.caller_id, uri, text)
+        self._context.problems.add(caller.caller_id, text)
+        log.error("%s: %s (%s) gets no port: %s", caller.address, caller.caller_id, uri, text)
         return Refusal(text)
 
-    def _welcome_back(self, endpoint: Endpoint, asker: Asker) -> None:
+    def _welcome_back(self, endpoint: Endpoint, caller: Caller) -> None:
         """A node that registers is alive, whatever was believed of it."""
-        if not endpoint.place.confirmed and endpoint.place.address == asker.address:
+        if not endpoint.location.confirmed and endpoint.location.address == caller.address:
             endpoint.confirm()
             self._context.problems.solved_at(endpoint.port)
         if endpoint.trusted:
             self._leases.open(endpoint)
         known = endpoint.caller_ids
-        if endpoint.health.down or (known and asker.caller_id not in known):
+        if endpoint.health.down or (known and caller.caller_id not in known):
             endpoint.health.suspect()
 
-    async def _place(self, node: HostPort, call: Call, asker: Asker) -> Place | None:
+    async def _locate(self, node: HostPort, call: Call, caller: Caller) -> NodeLocation | None:
         """Where a node is that gives ``node`` as its address; None if that is outside.
 
         If the address leads elsewhere than to the source of the call, and no node answers at the
@@ -253,22 +258,22 @@ class NodeAdmission:
         that the call registers. Outside it need only be there: a gateway registers nodes of another
         machine under names of its own, and no port is opened for that.
         """
-        source, caller_id = asker.address, call.string(0) or ""
+        source, caller_id = caller.address, call.string(0) or ""
         addresses = await resolve(self._context.upstream.reach(node).host, source)
         elsewhere = [address for address in addresses if not is_loopback(address)]
         if source in addresses or not elsewhere:
-            return Place(source, named=source in addresses)
+            return NodeLocation(source, named=source in addresses)
         if await self._answers(HostPort(source, node.port)):
-            return Place(source, named=False)
-        service = _service(call, asker)
+            return NodeLocation(source, named=False)
+        service = _service(call, caller)
         for address in elsewhere[:MOST_ADDRESSES]:
-            where, standing = HostPort(address, node.port), self._context.standing(address)
-            if standing is Standing.OUTSIDE:
+            where, client_kind = HostPort(address, node.port), self._context.client_kind(address)
+            if client_kind is ClientKind.OUTSIDE:
                 bears_out = await self._answers(where)  # a gateway gives it another name
             else:
                 bears_out = await self._context.nodes.name(where, service) == caller_id
-            if bears_out and standing is Standing.ADMITTED:
-                return Place(address, named=True, confirmed=False)
+            if bears_out and client_kind is ClientKind.ADMITTED:
+                return NodeLocation(address, named=True, confirmed=False)
             if bears_out:
                 log.info("%s at %s is outside; its URI passes as it is", caller_id, where)
                 return None
@@ -279,7 +284,7 @@ class NodeAdmission:
         )
         self._context.problems.add(caller_id, text)
         log.warning("%s: %s %s", source, caller_id, text)
-        return Place(source, named=False)
+        return NodeLocation(source, named=False)
 
     async def _probe_first(self, endpoint: Endpoint, caller_id: str) -> None:
         """Look at once whether a new node can be reached, and say so if not."""
@@ -295,10 +300,10 @@ class NodeAdmission:
         log.warning("%s: %s %s", endpoint.source, caller_id, text)
 
 
-def _service(call: Call, asker: Asker) -> tuple[str, int] | None:
+def _service(call: Call, caller: Caller) -> tuple[str, int] | None:
     """The service that a call registers, and its port; None if it registers another thing."""
-    found = row(call.method)
-    where = parse_service_uri(placed(call.string(found.service_api) or "", asker.address))
+    found = method_spec(call.method)
+    where = parse_service_uri(placed(call.string(found.service_api) or "", caller.address))
     return (call.string(found.name) or "", where.port) if where else None
 
 
@@ -316,7 +321,7 @@ def _on_loopback(endpoint: Endpoint) -> bool:
     Then roscpp, too, accepts TCPROS connections on loopback only, though its slave API answers
     (transport_tcp.cpp, isOnlyLocalhostAllowed).
     """
-    return is_loopback(endpoint.node.host) and not is_loopback(endpoint.place.address)
+    return is_loopback(endpoint.node.host) and not is_loopback(endpoint.location.address)
 
 
 def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
@@ -324,7 +329,7 @@ def _unreachable_text(endpoint: Endpoint, reason: str) -> str:
         return (
             f"gives its address as {endpoint.uri}, a loopback address, and listens only there: no "
             "other machine can reach it. Unset ROS_IP and ROS_HOSTNAME where it runs, or set "
-            f"ROS_IP={endpoint.place.address}"
+            f"ROS_IP={endpoint.location.address}"
         )
     return (
         f"can't be reached by the proxy at {endpoint.slave} ({reason}). Check that it listens on "

@@ -24,7 +24,7 @@ from rosproxy.net.addresses import is_loopback
 from rosproxy.net.interfaces import is_own
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry import selection
-from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.registry.selection import ClientKind
 
 log = logging.getLogger(__name__)
 
@@ -81,22 +81,22 @@ class Callers:
         """Why a caller is refused, in one line; None if it is let in."""
         if not self._begun.is_set() and not is_own(source):
             await self.begin()
-        if self._standing(source) is Standing.ADMITTED:
+        if self._standing(source) is ClientKind.ADMITTED:
             return None
         await self._wait_for_news(source)
         found = self._standing(source)
-        if found is Standing.ADMITTED:
+        if found is ClientKind.ADMITTED:
             return None
         text = selection.refusal(source, found, self._context.addressing.networks)
         self._report(text, found)
         return text
 
-    def _standing(self, source: str) -> Standing:
+    def _standing(self, source: str) -> ClientKind:
         self._context.refresh_networks()
-        if self._context.standing(source) is Standing.ADMITTED or is_own(source):
-            return Standing.ADMITTED
+        if self._context.client_kind(source) is ClientKind.ADMITTED or is_own(source):
+            return ClientKind.ADMITTED
         self._context.refresh_networks(source)
-        return self._context.standing(source)
+        return self._context.client_kind(source)
 
     async def _wait_for_news(self, source: str) -> None:
         """Wait until an operator has selected a source, up to NEWS_TIMEOUT.
@@ -110,7 +110,7 @@ class Callers:
         waiting[source] += 1
         try:
             async with asyncio.timeout(NEWS_TIMEOUT):
-                while self._standing(source) is not Standing.ADMITTED:
+                while self._standing(source) is not ClientKind.ADMITTED:
                     await self._news.wait()
         except TimeoutError:
             log.debug("%s was not selected in time", source)
@@ -119,7 +119,7 @@ class Callers:
             if not waiting[source]:
                 del waiting[source]
 
-    def _report(self, text: str, found: Standing) -> None:
+    def _report(self, text: str, found: ClientKind) -> None:
         context, now = self._context, self._context.now()
         context.metrics.strangers.labels(found.value).inc()
         context.problems.solved(SUBJECT)  # the last one is enough: there may be any number

@@ -26,7 +26,7 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.tcpros import HeaderError, decode_header, encode_header, header_length
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.graph import ROSOUT
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.telemetry.metrics import Traffic
 
 log = logging.getLogger(__name__)
@@ -171,13 +171,13 @@ class InsideNodes:
     host in a reply or registration is never used, so none can lead to another inside host.
     """
 
-    def __init__(self, context: Context, judge: PolicyJudge) -> None:
-        self._context, self._judge = context, judge
+    def __init__(self, context: Context, access: AccessChecks) -> None:
+        self._context, self._access = context, access
         self._asking: dict[tuple[Endpoint, str, str], asyncio.Task[int | None]] = {}
 
     def target(self, endpoint: Endpoint) -> "InsideNode":
         """What connections to an endpoint's ports lead to."""
-        return InsideNode(self._context, self._judge, endpoint, self._learn_port)
+        return InsideNode(self._context, self._access, endpoint, self._learn_port)
 
     async def _learn_port(self, endpoint: Endpoint, kind: str, name: str) -> int | None:
         """The TCPROS port of a topic or service now; the node is asked once for all who wait."""
@@ -226,7 +226,7 @@ class InsideNode:
     """A node inside as a target, for those who connect from outside."""
 
     _context: Context
-    _judge: PolicyJudge
+    _access: AccessChecks
     _endpoint: Endpoint
     _learn_port: Callable[[Endpoint, str, str], Awaitable[int | None]]
     inside: bool = True
@@ -239,7 +239,7 @@ class InsideNode:
     def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why somebody outside may not have a topic or service; None if he may."""
         asked = RuleKind.SERVE if kind == "service" else RuleKind.PUBLISH
-        return self._judge.outside_may_not(asked, name, self._endpoint, peer)
+        return self._access.outside_may_not(asked, name, self._endpoint, peer)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; a port that is not known or refuses is asked for.
@@ -249,7 +249,7 @@ class InsideNode:
         endpoint = self._endpoint
         if kind == "topic":
             port = endpoint.topic_ports.get(name)
-        elif endpoint.place.confirmed:
+        elif endpoint.location.confirmed:
             port = self._context.registry.service_port(endpoint, name)
         else:
             port = None  # it came from an address that hides several: the node has to answer for it
@@ -283,7 +283,7 @@ class InsideNode:
         if is_loopback(endpoint.node.host):
             text += (
                 f": it listens on loopback only ({endpoint.uri}). Unset ROS_IP and ROS_HOSTNAME "
-                f"where it runs, or set ROS_IP={endpoint.place.address}"
+                f"where it runs, or set ROS_IP={endpoint.location.address}"
             )
         log.warning("%s: %s", endpoint.label, text)
         self._context.problems.add(endpoint.label, text, endpoint.port)

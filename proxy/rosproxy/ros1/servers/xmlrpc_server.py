@@ -340,7 +340,7 @@ class XmlRpcServer(web.Server):
         call.body, values = body, body.count(b"<value")
         call.hold(len(body) - held + VALUE * values)
         if values > MANY_VALUES:
-            await self._context.take_turn()
+            await self._context.yield_to_others()
 
     async def _pass_on(
         self, service: LongCalls, call: IncomingCall, long_call: LongCall

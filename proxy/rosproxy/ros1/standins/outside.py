@@ -20,7 +20,7 @@ from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_service_uri, path_of
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.registry.stand_ins import StandIn
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.access_checks import AccessChecks
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class OutsideNode:
 
     _outside: Outside
     _context: Context
-    _judge: PolicyJudge
+    _access: AccessChecks
     _stand_in: StandIn
     inside: bool = False
 
@@ -134,7 +134,7 @@ class OutsideNode:
     def why_not(self, kind: str, name: str, peer: str, caller_id: str) -> str | None:
         """Why a node inside may not have a topic or service; None if it may."""
         asked = RuleKind.CALL if kind == "service" else RuleKind.SUBSCRIBE
-        return self._judge.inside_may_not(asked, name, peer, caller_id)
+        return self._access.inside_may_not(asked, name, peer, caller_id)
 
     async def connect(self, kind: str, name: str) -> socket.socket | None:
         """A connection to the node; its port for a topic is asked for anew if the known refuses."""

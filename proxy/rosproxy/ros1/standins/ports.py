@@ -33,12 +33,12 @@ from rosproxy.ros1.protocol.uris import parse_service_uri, slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import stand_ins
 from rosproxy.ros1.registry.graph import Graph
-from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.rewriting import slave_api
-from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.rewriting.addressing import Caller
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.callers import Callers
-from rosproxy.ros1.servers.judge import PolicyJudge
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.servers.xmlrpc_server import IncomingCall, XmlRpcServer, counted
 from rosproxy.ros1.standins.outside import Outside, OutsideNode
@@ -65,11 +65,11 @@ class StandInPorts:
         context: Context,
         callers: Callers,
         tcpros: TcprosServer,
-        judge: PolicyJudge,
+        access: AccessChecks,
         plane: KernelPlane,
     ) -> None:
         self._context, self._callers, self._stand_ins = context, callers, context.stand_ins
-        self._tcpros, self._judge, self._plane = tcpros, judge, plane
+        self._tcpros, self._access, self._plane = tcpros, access, plane
         self._acceptors: dict[HostPort, Acceptor] = {}
         self._refused: dict[str, None] = {}
         """URIs of nodes that refused when they were last tried, the oldest first; not too many."""
@@ -77,7 +77,7 @@ class StandInPorts:
         greeting = "rosproxy: a ROS node outside\n"
         self.server = XmlRpcServer(context, self._forward, greeting, context.master_call)
         self._outside = Outside(context, self._note_refused)
-        self.udpros = UdprosRelays(context, judge, self._outside)
+        self.udpros = UdprosRelays(context, access, self._outside)
         self._closed = False
         self._asking = asyncio.Lock()
         self._asked: set[str] = set()
@@ -85,8 +85,8 @@ class StandInPorts:
         self._publishers: dict[str, set[str]] = {}
         """The master's last answer to that: slave URIs by topic."""
 
-    async def listen_for(self, uris: Iterable[str], asker: Asker) -> None:
-        """Have a port listen for each of these URIs that needs one, before ``asker`` is given them.
+    async def listen_for(self, uris: Iterable[str], caller: Caller) -> None:
+        """Have a port listen for each of these URIs that needs one, before they are given away.
 
         The URIs are the master's own word.
         """
@@ -102,9 +102,9 @@ class StandInPorts:
             if number % PORTS_PER_TURN == 0:
                 await asyncio.sleep(0)
             if uri not in self._refused and not self._closed:
-                self._listen(uri, where, self._stand_ins.address(asker.proxy))
+                self._listen(uri, where, self._stand_ins.address(caller.proxy))
 
-    async def listen_for_announced(self, topic: str, uris: Sequence[str], asker: Asker) -> None:
+    async def listen_for_announced(self, topic: str, uris: Sequence[str], caller: Caller) -> None:
         """The same for the publishers that a ``publisherUpdate`` names, as far as they are some.
 
         Anybody may call that at a lease, and name any port. Its source proves nothing: every
@@ -112,11 +112,11 @@ class StandInPorts:
         port would have to be opened the master is asked whether it has that publisher.
         """
         wanted = self._needed(uris)
-        address = self._stand_ins.address(asker.proxy)
+        address = self._stand_ins.address(caller.proxy)
         known = {uri for uri in wanted if self._stand_ins.find(address, uri)}
         if len(known) < len(wanted):
             known |= await self._publishers_of(topic)
-        await self.listen_for((uri for uri in wanted if uri in known), asker)
+        await self.listen_for((uri for uri in wanted if uri in known), caller)
 
     def with_address(self, body: bytes, call: xmlrpc.Call) -> bytes:
         """A call from outside, parsed as ``call``, in a form that an inside node can use."""
@@ -278,7 +278,7 @@ class StandInPorts:
         there = self._stand_ins.choose_fast_candidate(stand_in) if usable else None
         if there is None:
             return
-        if not self._judge.inside_may_bypass() or stand_ins.obstacle(
+        if not self._access.inside_may_bypass() or stand_ins.obstacle(
             there.port, self._context.settings
         ):
             return
@@ -343,12 +343,12 @@ class StandInPorts:
         """Serve a connection from inside: XML-RPC or TCPROS, by its first bytes."""
         await self._callers.begin()
         self._context.refresh_networks()
-        if self._context.standing(peer) is not Standing.ADMITTED:
+        if self._context.client_kind(peer) is not ClientKind.ADMITTED:
             log.debug("%s may not use the proxy: refused at %s", peer, stand_in.local)
             conn.close()
             return
         self._stand_ins.note_used(stand_in)
-        target = OutsideNode(self._outside, self._context, self._judge, stand_in)
+        target = OutsideNode(self._outside, self._context, self._access, stand_in)
         await self.server.dispatch(conn, peer, partial(self._tcpros.serve, target, peer))
 
     async def _forward(self, call: IncomingCall) -> bytes:
@@ -363,12 +363,12 @@ class StandInPorts:
         return await counted(self._context.metrics, "stand_in", parsed.method, answer)
 
     async def _answer(self, stand_in: StandIn, parsed: xmlrpc.Call, call: IncomingCall) -> bytes:
-        denied = self._judge.inside_may_not_ask(parsed, call.source)
+        denied = self._access.inside_may_not_ask(parsed, call.source)
         if denied is not None:
             return xmlrpc.dump_reply(denied)
-        asker = Asker(call.source, call.local.host)
-        master = slave_uri(HostPort(asker.proxy, self._context.settings.master_port))
-        view = slave_api.from_inside(asker, master, self._context.addressing)
+        caller = Caller(call.source, call.local.host)
+        master = slave_uri(HostPort(caller.proxy, self._context.settings.master_port))
+        view = slave_api.from_inside(caller, master, self._context.addressing)
         body = slave_api.rewrite_call(call.body, parsed, view)
         if not stand_in.kept:
             body = await self.udpros.lead_inwards(stand_in, parsed, body, call.source)
@@ -382,5 +382,5 @@ class StandInPorts:
         if said is not None:
             stand_in.note_topic_port(parsed.string(1) or "", said)
             reached = await self._topics_at(stand_in, said)
-        await self.listen_for(slave_api.told_uris(parsed, reply), asker)
+        await self.listen_for(slave_api.told_uris(parsed, reply), caller)
         return slave_api.rewrite_reply(parsed, reply, reached, view)

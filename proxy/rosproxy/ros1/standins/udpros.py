@@ -36,10 +36,10 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.protocol.xmlrpc.document import Call, Edit
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.registry.selection import Standing
+from rosproxy.ros1.registry.selection import ClientKind
 from rosproxy.ros1.registry.stand_ins import PORTS, StandIn
 from rosproxy.ros1.rewriting.udpros import lead_to, read_offers
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.standins.outside import Outside
 
 log = logging.getLogger(__name__)
@@ -82,8 +82,8 @@ class _Right:
 class UdprosRelays:
     """Opens relays for the offers that pass, and ends them."""
 
-    def __init__(self, context: Context, judge: PolicyJudge, outside: Outside) -> None:
-        self._context, self._judge, self._outside = context, judge, outside
+    def __init__(self, context: Context, access: AccessChecks, outside: Outside) -> None:
+        self._context, self._access, self._outside = context, access, outside
         self._open: dict[UdprosSubscription, tuple[DatagramRelay, _Right]] = {}
 
     def __iter__(self) -> Iterator[tuple[UdprosSubscription, DatagramRelay]]:
@@ -102,7 +102,7 @@ class UdprosRelays:
         self, endpoint: Endpoint, call: Call, body: bytes, source: str
     ) -> bytes:
         """The call of a subscriber that asks through the proxy as a node inside is to have it."""
-        proxy = self._context.node_asker(endpoint).proxy
+        proxy = self._context.caller_at(endpoint).proxy
         topic, caller_id = call.string(1) or "", call.string(0) or ""
 
         def there() -> bool:
@@ -111,7 +111,7 @@ class UdprosRelays:
 
         def allowed() -> bool:
             kind = RuleKind.PUBLISH
-            return not self._judge.outside_may_not(kind, topic, endpoint, source, caller_id)
+            return not self._access.outside_may_not(kind, topic, endpoint, source, caller_id)
 
         right = _Right(there, allowed)
 
@@ -119,7 +119,7 @@ class UdprosRelays:
             target = await self._reachable(where, source)
             if target is None:
                 return None
-            port, sources = endpoint.port, [endpoint.place.address]
+            port, sources = endpoint.port, [endpoint.location.address]
             one = UdprosSubscription(port, topic, caller_id, source, target, False)
             led = self._lead(one, right, proxy, _tried(one, PORTS), sources)
             return HostPort(proxy, led) if led else None
@@ -138,7 +138,7 @@ class UdprosRelays:
             return (Kind.SUBSCRIBER, topic, caller_id) in endpoint.registrations
 
         def allowed() -> bool:
-            return not self._judge.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
+            return not self._access.inside_may_not(RuleKind.SUBSCRIBE, topic, source, caller_id)
 
         right = _Right(there, allowed)
 
@@ -176,7 +176,7 @@ class UdprosRelays:
 
         That is outside or, on another inside network, at the very address that asks.
         """
-        if self._context.standing(source) is Standing.ADMITTED:
+        if self._context.client_kind(source) is ClientKind.ADMITTED:
             return HostPort(source, where.port)
         try:
             return await self._outside.reach(where)

@@ -17,14 +17,14 @@ from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.rewriting.addressing import Asker
+from rosproxy.ros1.rewriting.addressing import Caller
 from rosproxy.ros1.servers.admission import NodeAdmission
-from rosproxy.ros1.upkeep.policy import adoption as policy
-from rosproxy.ros1.upkeep.policy.adoption import Container, DirectNode
-from rosproxy.ros1.upkeep.policy.registration import known_as
-from rosproxy.ros1.upkeep.registrar import Former, Registrar
+from rosproxy.ros1.upkeep.decisions import adoption as decisions
+from rosproxy.ros1.upkeep.decisions.adoption import Container, DirectNode
+from rosproxy.ros1.upkeep.decisions.registration import known_as
+from rosproxy.ros1.upkeep.registrar import FormerUris, Registrar
 from rosproxy.ros1.upkeep.verifier import Verifier
 
 log = logging.getLogger(__name__)
@@ -63,10 +63,10 @@ class Adopter:
             return 0
         async with self._one_at_a_time:
             graph = await context.upstream.read_graph()
-            nodes = policy.find_direct(graph, inside, context.addressing)
+            nodes = decisions.find_direct(graph, inside, context.addressing)
             infos = await self._inspect({place for node in nodes for place in node.places})
             sure = await self._verify(nodes, infos)
-            located, doubts = policy.locate(nodes, infos, sure)
+            located, doubts = decisions.locate(nodes, infos, sure)
             for name, why in doubts.items():
                 self._report(name, why)
             return await self._take_in(located, infos)
@@ -94,7 +94,7 @@ class Adopter:
         What the node registered around the proxy is then registered anew. Nor is it meant for one
         that never had the name: another had this port before.
         """
-        name = policy.renamed_node(caller_id, reason)
+        name = decisions.renamed_node(caller_id, reason)
         if name is None:
             return False
         if name not in endpoint.callers:
@@ -105,14 +105,14 @@ class Adopter:
         except (TimeoutError, Unreachable):
             return False
         advertised = self._context.addressing.advertised_uri(endpoint)
-        if not policy.has_name_still(endpoint, uri, advertised):
+        if not decisions.has_name_still(endpoint, uri, advertised):
             return False
         log.info("%s registered around the proxy; not shut down", name)
         former = {} if uri == advertised else {name: (endpoint, uri or endpoint.uri)}
         self._context.tasks.spawn(self._repeat(endpoint, former), f"taking over {endpoint.uri}")
         return True
 
-    async def _repeat(self, endpoint: Endpoint, former: Former) -> None:
+    async def _repeat(self, endpoint: Endpoint, former: FormerUris) -> None:
         """Take names over once more; and what is at the master neither way by now."""
         try:
             async with self._one_at_a_time:
@@ -179,9 +179,9 @@ class Adopter:
         own = parse_slave_uri(uri) or place
         host = self._context.upstream.reach(own).host
         named = place.host in await resolve(host, place.host)
-        asker = Asker(place.host, "", nodes[0].caller_id)
-        where = Place(place.host, named, confirmed=False)
-        endpoint = await self._admission.take_in(uri, own, where, asker, answers=True)
+        caller = Caller(place.host, "", nodes[0].caller_id)
+        where = NodeLocation(place.host, named, confirmed=False)
+        endpoint = await self._admission.take_in(uri, own, where, caller, answers=True)
         if not isinstance(endpoint, Endpoint):
             return None
         endpoint.hold()

@@ -22,8 +22,8 @@ from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.registry.health import ProbeResult
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.upkeep.adopter import Adopter
-from rosproxy.ros1.upkeep.policy import liveness
-from rosproxy.ros1.upkeep.policy.adoption import Container
+from rosproxy.ros1.upkeep.decisions import liveness
+from rosproxy.ros1.upkeep.decisions.adoption import Container
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
@@ -103,7 +103,7 @@ class ContainerEvents:
 
     async def _remove(self, addresses: Collection[str]) -> int:
         """Unregister the nodes at addresses that are gone; those that answer live on."""
-        found = [e for e in self.context.registry if e.place.address in addresses]
+        found = [e for e in self.context.registry if e.location.address in addresses]
         return await self._remove_dead(found, self.context.now() - YOUNG)
 
     async def _remove_dead(self, found: Sequence[Endpoint], since: float) -> int:
@@ -171,7 +171,7 @@ class ContainerEvents:
         self._cut(endpoint)
         self.context.problems.solved_at(endpoint.port)
         self.leases.open(endpoint)
-        address, fields = endpoint.place.address, endpoint.log_fields
+        address, fields = endpoint.location.address, endpoint.log_fields
         log.info("%s is at %s now", endpoint.label, address, extra=fields)
 
     async def _unregister(self, endpoints: Iterable[Endpoint]) -> int:

@@ -20,7 +20,7 @@ from rosproxy.leases.leases import Leases
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.servers.access_checks import AccessChecks
 from rosproxy.ros1.servers.tcpros import UNREGISTERED, TcprosServer
 from rosproxy.ros1.standins.ports import StandInPorts
 from rosproxy.ros1.upkeep.recovery import Recovery
@@ -50,7 +50,7 @@ class PolicyEnforcer:
     _recovery: Recovery
     _tcpros: TcprosServer
     _plane: KernelPlane
-    _judge: PolicyJudge
+    _access: AccessChecks
     _stand_ins: StandInPorts
     _enforced: int = -1
     _again: bool = False
@@ -95,24 +95,24 @@ class PolicyEnforcer:
         for relay in self._tcpros.relays:
             endpoint = self._context.registry.by_port.get(relay.port)
             denied = endpoint is not None and self._is_denied(relay, endpoint)
-            if denied or (relay.inside_asks and self._judge.inside_may_not_keep(relay)):
+            if denied or (relay.inside_asks and self._access.inside_may_not_keep(relay)):
                 relay.end()
                 count += 1
         return count
 
     def _is_denied(self, relay: Relay, endpoint: Endpoint) -> bool:
         if relay.name == UNREGISTERED:
-            return not self._judge.may_bypass(endpoint)
+            return not self._access.may_bypass(endpoint)
         kind = RuleKind.SERVE if relay.kind == "service" else RuleKind.PUBLISH
-        return bool(self._judge.outside_may_not(kind, relay.name, endpoint, relay.peer))
+        return bool(self._access.outside_may_not(kind, relay.name, endpoint, relay.peer))
 
     def _take_fast_ports(self) -> int:
         """Take fast ports from nodes of which something may be denied; how many connections."""
-        count = 0 if self._judge.inside_may_bypass() else self._stand_ins.take_fast_ports()
+        count = 0 if self._access.inside_may_bypass() else self._stand_ins.take_fast_ports()
         if count:
             self._leases.watch(self._context.registry)
         for endpoint in self._context.registry:
-            if endpoint.fast_port is not None and not self._judge.may_bypass(endpoint):
+            if endpoint.fast_port is not None and not self._access.may_bypass(endpoint):
                 count += endpoint.fast_connections
                 self._plane.cut(endpoint)
                 self._leases.take_fast_port(endpoint)

@@ -22,7 +22,7 @@ from rosproxy.ros1.clients.node import ProbeAnswer
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.registry.endpoint import Endpoint
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.upkeep.policy import liveness
+from rosproxy.ros1.upkeep.decisions import liveness
 from rosproxy.ros1.upkeep.recovery import Recovery
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber

@@ -2,7 +2,7 @@
 
 The proxy keeps nothing on disk; the master is the database. `Recovery.ensure` reads the master's
 graph once, and what the proxy has it remember (`LeaseMemory`), finds the URIs that this proxy
-advertised (`policy.claims`), and rebuilds the endpoints on the ports that they had. Calls that
+advertised (`decisions.claims`), and rebuilds the endpoints on the ports that they had. Calls that
 register wait for it: a node that registered before would
 get another port, and the master would shut it down for having moved. Before that an operator's
 policy is waited for (``--await-policy``), or what it denies would be registered for a moment.
@@ -31,13 +31,13 @@ from rosproxy.net.addresses import is_inside
 from rosproxy.net.resolver import resolve
 from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.health import ProbeResult
-from rosproxy.ros1.registry.selection import Standing
-from rosproxy.ros1.servers.judge import PolicyJudge
+from rosproxy.ros1.registry.selection import ClientKind
+from rosproxy.ros1.servers.access_checks import AccessChecks
+from rosproxy.ros1.upkeep.decisions import recovery as decisions
+from rosproxy.ros1.upkeep.decisions.recovery import Claim
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
-from rosproxy.ros1.upkeep.policy import recovery as policy
-from rosproxy.ros1.upkeep.policy.recovery import Claim
 from rosproxy.ros1.upkeep.registrar import Registrar
 from rosproxy.ros1.upkeep.resubscriber import Resubscriber
 from rosproxy.ros1.upkeep.verifier import Verifier
@@ -45,7 +45,7 @@ from rosproxy.ros1.upkeep.verifier import Verifier
 log = logging.getLogger(__name__)
 
 PARALLEL_INSPECTIONS = 64
-HASTE = 1.0
+CLAIM_GRACE = 1.0
 """Seconds that a claim gets to be borne out once a living node waits for its port."""
 DOUBT = (
     "answers, but does not tell whether it is the node that the master has at this port, which is "
@@ -67,12 +67,12 @@ class Recovery:
         registrar: Registrar,
         resubscriber: Resubscriber,
         plane: KernelPlane,
-        judge: PolicyJudge,
+        access: AccessChecks,
         memory: LeaseMemory,
     ) -> None:
         self._context, self._leases, self._plane = context, leases, plane
         self._verifier, self._memory = Verifier(context.nodes), memory
-        self._judge = judge
+        self._access = access
         self._registrar, self._resubscriber = registrar, resubscriber
         self.verifying: set[Endpoint] = set()
         self._inspecting: set[Endpoint] = set()
@@ -130,7 +130,7 @@ class Recovery:
 
         Those that were being asked all that time and are silent count as failing from then on.
         """
-        end, waited = self._context.now() + HASTE, set(self.verifying)
+        end, waited = self._context.now() + CLAIM_GRACE, set(self.verifying)
         asked = set(self._inspecting)
         while waited & self.verifying and self._context.now() < end:
             if self._context.registry.pool.free or self._context.registry.dead() is not None:
@@ -143,12 +143,12 @@ class Recovery:
         self._context.refresh_networks()
         memory = await self._memory.read()
         graph = await self._context.upstream.read_graph()
-        found, forgotten = policy.claims(graph, self._context.addressing, memory)
+        found, forgotten = decisions.claims(graph, self._context.addressing, memory)
         restored = [(claim, self._restore(claim)) for claim in await self._settle(found)]
         endpoints = [endpoint for _, endpoint in restored if endpoint is not None]
         served = {id(claim) for claim, endpoint in restored if endpoint is not None}
         left = [claim for claim in found if id(claim) not in served]
-        self._plane.recovered([e for e in endpoints if self._judge.may_bypass(e)])
+        self._plane.recovered([e for e in endpoints if self._access.may_bypass(e)])
         if (left or forgotten) and self._context.settings.cleanup_after:
             sweep = self._sweep(left, forgotten)
             self._context.tasks.spawn(sweep, "taking back what former proxies left")
@@ -165,17 +165,17 @@ class Recovery:
             if is_inside(claim.slave.host, self._context.addressing.networks):
                 claim.said = await self._context.nodes.inspect(claim.slave)
 
-        await asyncio.gather(*map(ask, policy.contested(found)))
-        return policy.settle(found)
+        await asyncio.gather(*map(ask, decisions.contested(found)))
+        return decisions.settle(found)
 
     def _restore(self, claim: Claim) -> Endpoint | None:
         """The endpoint of a claim, not trusted yet; None if it may not be, or its port is taken."""
         address = claim.slave.host
-        if self._context.standing(address) is Standing.OUTSIDE:
+        if self._context.client_kind(address) is ClientKind.OUTSIDE:
             text = "port %d: the master has %s for it, which is not in an inside network; refused"
             log.warning(text, claim.port, address)
             return None
-        place = Place(address, named=claim.node.host == address, confirmed=False)
+        place = NodeLocation(address, named=claim.node.host == address, confirmed=False)
         registry = self._context.registry
         endpoint = registry.restore(claim.uri, claim.node, place, claim.port)
         if endpoint is None:
@@ -227,7 +227,7 @@ class Recovery:
 
         None if it lives and does not tell.
         """
-        if self._context.standing(claim.slave.host) is Standing.OUTSIDE:
+        if self._context.client_kind(claim.slave.host) is ClientKind.OUTSIDE:
             return False
         held, ports = claim.registrations, claim.service_ports
         info, borne_out = await self._verifier.ask(claim.slave, held, ports)
@@ -259,12 +259,14 @@ class Recovery:
         endpoint.note_verified(info.pid, info.topic_ports)
         endpoint.health.note(ProbeResult.ANSWERED, self._context.now())
         self._leases.open(endpoint)
-        address = endpoint.place.address
+        address = endpoint.location.address
         host = self._context.upstream.reach(endpoint.node).host
         addresses = await resolve(host, address)
-        if endpoint.place.address == address:  # neighbours can use the host's name if it leads here
+        if (
+            endpoint.location.address == address
+        ):  # neighbours can use the host's name if it leads here
             endpoint.note_named(address in addresses)
-        await self._registrar.disown(endpoint, policy.others(held, info))
+        await self._registrar.disown(endpoint, decisions.others(held, info))
         if len(self._context.addressing.uris_at_master(endpoint)) > 1:
             held_now = list(endpoint.registrations.values())
             await self._registrar.register([(endpoint, one) for one in held_now])

@@ -18,16 +18,16 @@ from rosproxy.ros1.clients.master import CALLER_ID, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind, prefix
 from rosproxy.ros1.protocol.uris import parse_slave_uri, service_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import NodeInfo
 from rosproxy.ros1.rewriting.policing import KINDS
+from rosproxy.ros1.upkeep.decisions import registration as decisions
 from rosproxy.ros1.upkeep.lease_memory import LeaseMemory
-from rosproxy.ros1.upkeep.matchmaker import Matchmaker
-from rosproxy.ros1.upkeep.policy import registration as policy
+from rosproxy.ros1.upkeep.publisher_updates import PublisherUpdates
 
 log = logging.getLogger(__name__)
 
-Former = Mapping[str, tuple[Endpoint, str]]
+FormerUris = Mapping[str, tuple[Endpoint, str]]
 """Names with their endpoints, and the former URIs by which the master has them."""
 JUDGED_AT_ONCE = 100
 """Registrations that the policy is asked about before others have their turn: rules may be many."""
@@ -38,13 +38,15 @@ SETTLE_TIME = 2.0
 class Registrar:
     """Calls to the master on behalf of inside nodes, and what follows from the replies."""
 
-    def __init__(self, context: Context, matchmaker: Matchmaker, memory: LeaseMemory) -> None:
-        self._context, self._matchmaker, self._memory = context, matchmaker, memory
+    def __init__(
+        self, context: Context, publisher_updates: PublisherUpdates, memory: LeaseMemory
+    ) -> None:
+        self._context, self._publisher_updates, self._memory = context, publisher_updates, memory
         self._complete: tuple[bytes, int, frozenset[int]] = b"", -1, frozenset()
         """The master's state, our own and the ports of nodes that answered, when nothing of theirs
         was missing."""
 
-    async def register(self, held: Sequence[Held]) -> None:
+    async def register(self, held: Sequence[EndpointRegistration]) -> None:
         """Register again what the master has lost. Raises Unreachable, MasterError.
 
         A name that somebody else holds by now is left to them; what it holds with a former URI
@@ -52,20 +54,20 @@ class Registrar:
         """
         names = {one.caller_id for _, one in held}
         at_master = await self._context.upstream.look_up("lookupNode", names)
-        kept: list[Held] = []
+        kept: list[EndpointRegistration] = []
         former: dict[str, tuple[Endpoint, str]] = {}
         for endpoint, one in held:
             uri = at_master.get(one.caller_id)
             if uri in (None, self._context.addressing.advertised_uri(endpoint)):
                 kept.append((endpoint, one))
-            elif policy.known_as(endpoint, uri):
+            elif decisions.known_as(endpoint, uri):
                 former[one.caller_id] = endpoint, uri
             else:
                 log.info("%s is registered as %s by now; left to it", one.caller_id, uri)
                 self._context.registry.drop_caller(endpoint, one.caller_id)
         await self._register(kept + await self._free(former))
 
-    async def reclaim(self, former: Former) -> None:
+    async def reclaim(self, former: FormerUris) -> None:
         """Register nodes anew that the master has by former URIs. Raises Unreachable, MasterError.
 
         What it has of them that the registry has not is taken in.
@@ -79,7 +81,7 @@ class Registrar:
         the publishers have gone before it is told that they are there.
         """
         topics = [(e, topic) for e in endpoints for topic in e.names(Kind.SUBSCRIBER)]
-        update = self._matchmaker.update_inside
+        update = self._publisher_updates.update_inside
         await asyncio.gather(*(update(e, topic, []) for e, topic in topics))
         await self.register([(e, held) for e in endpoints for held in e.registrations.values()])
         for endpoint in endpoints:
@@ -87,7 +89,7 @@ class Registrar:
 
     async def register_missing(self, endpoint: Endpoint, info: NodeInfo) -> None:
         """Register what a node has and the master does not know of. Raises Unreachable."""
-        found = policy.unregistered(endpoint, info)
+        found = decisions.unregistered(endpoint, info)
         for held in found:
             self._context.registry.register(endpoint, held)
         if found:
@@ -110,7 +112,7 @@ class Registrar:
         if state is None:
             return
         held = {one: e for e in alive for one in e.registrations.values()}
-        lost = policy.lost(list(held), state, started)
+        lost = decisions.lost(list(held), state, started)
         if lost:
             log.warning("the master has lost %d registrations; making them again", len(lost))
             await self.register([(held[one], one) for one in lost])
@@ -146,7 +148,7 @@ class Registrar:
             one for one in held if known.get(one.caller_id) == uri and one.caller_id not in names
         ]
         service = service_uri(where)
-        await upstream.multicall([policy.unregister_call(one, uri, service) for one in left])
+        await upstream.multicall([decisions.unregister_call(one, uri, service) for one in left])
         if left:
             log.info("took back %d registrations that a former proxy left for %s", len(left), uri)
 
@@ -169,7 +171,7 @@ class Registrar:
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is None:
             return
-        kept = policy.still_held(endpoint, info, pid == endpoint.health.pid)
+        kept = decisions.still_held(endpoint, info, pid == endpoint.health.pid)
         for held in list(endpoint.registrations.values()):
             if held not in kept and held.since < endpoint.health.cleaned_at:
                 self._context.registry.unregister(held.kind, held.name, held.caller_id)
@@ -186,7 +188,7 @@ class Registrar:
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
             endpoint.replace_topic_ports(info.topic_ports)
-            await self._forget(endpoint, policy.left_over(endpoint, info, started))
+            await self._forget(endpoint, decisions.left_over(endpoint, info, started))
 
     async def reconcile(self, endpoint: Endpoint) -> None:
         """Make up for the calls that a node made around the proxy. Raises Unreachable, MasterError.
@@ -196,7 +198,7 @@ class Registrar:
         started = self._context.now()
         info = await self._context.nodes.inspect(endpoint.slave)
         if info is not None:
-            await self._forget(endpoint, policy.vanished(endpoint, info, started))
+            await self._forget(endpoint, decisions.vanished(endpoint, info, started))
             await self.register_missing(endpoint, info)
 
     async def apply_policy(self) -> tuple[int, int]:
@@ -204,7 +206,7 @@ class Registrar:
 
         Raises Unreachable, MasterError.
         """
-        to_hide, to_show = list[Held](), list[Held]()
+        to_hide, to_show = list[EndpointRegistration](), list[EndpointRegistration]()
         for count, (endpoint, held) in enumerate(self._context.registry.registrations(), 1):
             if self._verdict(endpoint, held).allowed == held.hidden:
                 (to_show if held.hidden else to_hide).append((endpoint, held))
@@ -222,7 +224,7 @@ class Registrar:
             return policy.judge_below(kind, prefix(held.name), held.caller_id, address)
         return verdict
 
-    async def _conceal(self, held: Sequence[Held]) -> None:
+    async def _conceal(self, held: Sequence[EndpointRegistration]) -> None:
         """Hide registrations, and take back what the master has of them. Raises Unreachable.
 
         They are hidden before the master is told: the lists of publishers that it then sends are
@@ -245,32 +247,32 @@ class Registrar:
         for _, one in params:
             registry.unregister(one.kind, one.name, one.caller_id)
         subscribers = [(e, one) for e, one in held if one.kind is Kind.SUBSCRIBER]
-        update = self._matchmaker.update_inside
+        update = self._publisher_updates.update_inside
         await asyncio.gather(*(update(e, one.name, []) for e, one in subscribers))
-        self._matchmaker.tell({one.name for _, one in held if one.kind is Kind.PUBLISHER})
+        self._publisher_updates.tell({one.name for _, one in held if one.kind is Kind.PUBLISHER})
 
-    async def _take_back(self, held: Iterable[Held]) -> None:
+    async def _take_back(self, held: Iterable[EndpointRegistration]) -> None:
         addressing = self._context.addressing
         calls = [
-            policy.unregister_call(one, uri, addressing.advertised_service(e))
+            decisions.unregister_call(one, uri, addressing.advertised_service(e))
             for e, one in held
             for uri in addressing.uris_at_master(e)
         ]
         await self._context.upstream.multicall(calls)
 
-    async def _register(self, held: Sequence[Held]) -> None:
+    async def _register(self, held: Sequence[EndpointRegistration]) -> None:
         """Register at the master; subscribers are handed the publishers that the replies name.
 
         What the policy denies is hidden.
         """
         if self._context.retired:
             return
-        addressing, current = self._context.addressing, policy.to_register(held)
+        addressing, current = self._context.addressing, decisions.to_register(held)
         allowed = {(e, one): self._verdict(e, one).allowed for e, one in current}
         await self._conceal([held for held, may in allowed.items() if not may])
         wanted = [held for held, may in allowed.items() if may]
         calls = [
-            policy.register_call(
+            decisions.register_call(
                 one, addressing.advertised_uri(e), addressing.advertised_service(e)
             )
             for e, one in wanted
@@ -281,13 +283,13 @@ class Registrar:
             if one.hidden and endpoint.registrations.get(one.key) is one:
                 self._context.registry.register(endpoint, replace(one, hidden=False))
         updates = (
-            self._matchmaker.update_inside(endpoint, one.name, publishers)
+            self._publisher_updates.update_inside(endpoint, one.name, publishers)
             for (endpoint, one), publishers in zip(wanted, values, strict=True)
             if one.kind is Kind.SUBSCRIBER and isinstance(publishers, list)
         )
         await asyncio.gather(*updates)
         topics = {one.name for _, one in wanted if one.kind is Kind.PUBLISHER}
-        self._matchmaker.tell(topics, everybody=False)
+        self._publisher_updates.tell(topics, everybody=False)
 
     async def _forget(self, endpoint: Endpoint, ended: Sequence[Registration]) -> None:
         await self._unregister(endpoint, ended)
@@ -300,16 +302,16 @@ class Registrar:
         ended = list(held)
         await self._take_back((endpoint, one) for one in ended if not one.hidden)
         for one in ended:
-            self._matchmaker.note(one)
+            self._publisher_updates.note(one)
 
-    async def _free(self, former: Former) -> list[Held]:
+    async def _free(self, former: FormerUris) -> list[EndpointRegistration]:
         """All that some names hold, once it is taken back at the master.
 
         It has nodes that have moved by former advertised URIs: they hold what the registry has.
         Those that registered around the proxy it has by their own: what they hold it alone knows.
         """
         registry, addressing = self._context.registry, self._context.addressing
-        calls: list[policy.MethodCall] = []
+        calls: list[decisions.MethodCall] = []
         direct: dict[str, tuple[Endpoint, str]] = {}
         for name, (endpoint, uri) in former.items():
             endpoint.note_former_uri(uri)
@@ -319,7 +321,7 @@ class Registrar:
             else:
                 service = addressing.advertised_service(endpoint)
                 held = [one for one in _held_by(endpoint, name) if not one.hidden]
-                calls += [policy.unregister_call(one, uri, service) for one in held]
+                calls += [decisions.unregister_call(one, uri, service) for one in held]
         await self._context.upstream.multicall(calls)
         freed, known = await self._free_direct(direct)
         for one in freed:
@@ -331,7 +333,7 @@ class Registrar:
             (endpoint, one) for name, endpoint in names.items() for one in _held_by(endpoint, name)
         ]
 
-    async def _free_direct(self, former: Former) -> tuple[list[Registration], dict[str, str]]:
+    async def _free_direct(self, former: FormerUris) -> tuple[list[Registration], dict[str, str]]:
         """End everything that names hold which the master has by their nodes' own URIs.
 
         What that was; and the names that the master knows still, with their URIs. It may have
@@ -346,12 +348,12 @@ class Registrar:
         mine = [one for name in uris for one in state.get(name, [])]
         provided = {one.name for one in mine if one.kind is Kind.SERVICE}
         services = await upstream.look_up("lookupService", provided)
-        free = policy.free_calls(mine, uris, services)
-        values = await upstream.multicall([*free, *policy.release_calls(uris, CALLER_ID)])
-        params, known = policy.read_release(uris, values[len(free) :])
+        free = decisions.free_calls(mine, uris, services)
+        values = await upstream.multicall([*free, *decisions.release_calls(uris, CALLER_ID)])
+        params, known = decisions.read_release(uris, values[len(free) :])
         stuck = [name for name, uri in known.items() if uri == uris[name]]
         restored = [one for one in mine if one.caller_id in stuck]
-        await upstream.multicall(policy.restore_calls(restored, uris, services))
+        await upstream.multicall(decisions.restore_calls(restored, uris, services))
         for name in stuck:
             self._give_up(former[name][0], name, uris[name])
         return [one for one in [*mine, *params] if one.caller_id not in known], known

@@ -25,15 +25,15 @@ from rosproxy.ros1.clients.master import MasterError, Unreachable
 from rosproxy.ros1.context import Context
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import Graph
 from rosproxy.ros1.registry.stand_ins import StandIn
 from rosproxy.ros1.servers.tcpros import TcprosServer
 from rosproxy.ros1.standins.ports import StandInPorts
-from rosproxy.ros1.upkeep.matchmaker import PARALLEL_CALLS, Matchmaker
-from rosproxy.ros1.upkeep.policy import resubscription as policy
-from rosproxy.ros1.upkeep.policy.registration import one_publisher_per_topic
-from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.decisions import resubscription as decisions
+from rosproxy.ros1.upkeep.decisions.registration import one_publisher_per_topic
+from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.publisher_updates import PARALLEL_CALLS, PublisherUpdates
 from rosproxy.ros1.upkeep.registrar import Registrar
 
 log = logging.getLogger(__name__)
@@ -60,12 +60,16 @@ class Resubscriber:
         self,
         context: Context,
         registrar: Registrar,
-        matchmaker: Matchmaker,
+        publisher_updates: PublisherUpdates,
         tcpros: TcprosServer,
         plane: KernelPlane,
         stand_ins: StandInPorts,
     ) -> None:
-        self._context, self._registrar, self._matchmaker = context, registrar, matchmaker
+        self._context, self._registrar, self._publisher_updates = (
+            context,
+            registrar,
+            publisher_updates,
+        )
         self._tcpros, self._plane, self._stand_ins = tcpros, plane, stand_ins
         self._limit = asyncio.Semaphore(PARALLEL_CALLS)
         self._looks: dict[Endpoint, list[float]] = {}
@@ -124,8 +128,8 @@ class Resubscriber:
         Unreachable, MasterError.
         """
         held = await self._context.upstream.read_registrations()
-        wanted = policy.subscriptions(held, endpoints, self._context.addressing)
-        left = policy.without_relay(wanted, self._tcpros.topic_connections())
+        wanted = decisions.subscriptions(held, endpoints, self._context.addressing)
+        left = decisions.without_relay(wanted, self._tcpros.topic_connections())
         if not left and not self._context.stand_ins.both:
             return set()
         graph = Graph(held, await self._context.upstream.look_up("lookupNode", held))
@@ -133,16 +137,16 @@ class Resubscriber:
         bus = await self._read_buses(left) if ask else {}
         outside = self._outside_publishers(graph, endpoints)
         for endpoint, _, uris in outside:
-            await self._stand_ins.listen_for(uris, self._context.node_asker(endpoint))
+            await self._stand_ins.listen_for(uris, self._context.caller_at(endpoint))
         if self._context.stand_ins.by_port or any(
             one.endpoint.fast_port or one.endpoint.fast_peers for one in left
         ):
             await self._plane.look()
         addresses = await self._resolve_hosts(graph, left)
-        left = policy.without_relay(left, self._tcpros.topic_connections())
+        left = decisions.without_relay(left, self._tcpros.topic_connections())
         missed = [
             (one.topic, one.caller_id, self._context.addressing.advertised_uri(one.endpoint))
-            for one in policy.unconnected(left, bus, addresses)
+            for one in decisions.unconnected(left, bus, addresses)
         ]
         return await self._send_without(graph, missed + self._without_outside(outside))
 
@@ -157,9 +161,9 @@ class Resubscriber:
             subscriber = addressing.stands_for(uri) if uri else None
             if subscriber is None:
                 return uri is not None
-            asker = self._context.node_asker(subscriber)
-            handed = addressing.import_slave(addressing.advertised_uri(one.endpoint), asker)
-            return addressing.handed_out(handed, asker)
+            caller = self._context.caller_at(subscriber)
+            handed = addressing.import_slave(addressing.advertised_uri(one.endpoint), caller)
+            return addressing.handed_out(handed, caller)
 
         return [one for one in left if is_relayed(one)]
 
@@ -174,7 +178,7 @@ class Resubscriber:
                 except (Unreachable, MasterError) as error:
                     log.debug("%s does not tell its connections: %s", endpoint.label, error)
                     return []
-            return policy.read_bus(rows)
+            return decisions.read_bus(rows)
 
         endpoints = list(dict.fromkeys(one.endpoint for one in left))
         found = await asyncio.gather(*map(read, endpoints))
@@ -222,7 +226,7 @@ class Resubscriber:
         relays = self._tcpros.topic_connections() | self._stand_ins.udpros.connections()
         left: dict[Way, list[Missed]] = {}
         for endpoint, held, uris in outside:
-            proxy = context.node_asker(endpoint).proxy
+            proxy = context.caller_at(endpoint).proxy
             for uri in uris:
                 there = context.stand_ins.find(proxy, uri)
                 if there is None or (there.local.port, held.name, held.caller_id) not in relays:
@@ -242,7 +246,7 @@ class Resubscriber:
             missed.setdefault((topic, node), set()).add(uri)
         publishers = graph.by_topic(Kind.PUBLISHER)
         calls = (
-            self._matchmaker.update(
+            self._publisher_updates.update(
                 graph.uris[node], topic, [u for u in publishers.get(topic, []) if u not in uris]
             )
             for (topic, node), uris in missed.items()
@@ -255,7 +259,7 @@ class Resubscriber:
         return topics
 
 
-def _subscribers(endpoints: Iterable[Endpoint]) -> list[Held]:
+def _subscribers(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
     """All that the nodes of some endpoints subscribe to."""
     held = [(e, held) for e in endpoints for held in e.registrations.values()]
     return [one for one in held if one[1].kind is Kind.SUBSCRIBER]

@@ -17,7 +17,7 @@ from rosproxy.ros1.clients.node import NodeClient
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import ROSOUT, NodeInfo
-from rosproxy.ros1.upkeep.policy import recovery as policy
+from rosproxy.ros1.upkeep.decisions import recovery as decisions
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ class Verifier:
         service_ports: Iterable[int] = (),
     ) -> bool | None:
         """The same of a node that has said something of itself: one of the names is enough."""
-        names = policy.by_name(held)
-        verdicts = {name: policy.confirmed_by(names[name], info) for name in names}
+        names = decisions.by_name(held)
+        verdicts = {name: decisions.confirmed_by(names[name], info) for name in names}
         if True in verdicts.values():
             return True
         untold = [one for one in held if verdicts[one.caller_id] is None]
@@ -65,7 +65,7 @@ class Verifier:
     ) -> bool:
         """Whether it answers for a topic or service, by a name that has registered it."""
         callers = {one.caller_id for one in held}
-        topics, services = policy.to_ask(held)
+        topics, services = decisions.to_ask(held)
         for topic in topics:
             port = info.topic_ports.get(topic) or await self._port(where, topic)
             if port is None:

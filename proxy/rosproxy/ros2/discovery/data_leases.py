@@ -17,7 +17,7 @@ from rosproxy.ros2.registry.participants import LeaseKind
 
 @dataclass(eq=False, slots=True)
 class ForwardedLease:
-    """A port and the locator that it leads to, as `rosproxy.leases.fast_ports.Holder`.
+    """A port and the locator that it leads to, as `rosproxy.leases.fast_ports.LeaseHolder`.
 
     Nothing tells by itself whether a locator is answered. ``fast_peers`` stays empty: datagrams
     have no connections.
@@ -54,7 +54,7 @@ class ForwardedLease:
 
 
 class DataLeases:
-    """The leases of user data of all domains, as `rosproxy.leases.fast_ports.Holders`.
+    """The leases of user data of all domains, as `rosproxy.leases.fast_ports.LeaseHolders`.
 
     ``domains`` are those inside of each; ``pool`` are the ports of all.
     """

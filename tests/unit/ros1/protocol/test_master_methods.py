@@ -4,11 +4,11 @@ import pytest
 
 from rosproxy.ros1.protocol.master_methods import (
     MASTER_METHODS,
-    NO_ROW,
+    NO_SPEC,
     Kind,
     Reply,
+    method_spec,
     resolve_name,
-    row,
 )
 
 SIGNATURES = {
@@ -39,7 +39,7 @@ def test_every_method_with_an_address_has_a_row() -> None:
 
 @pytest.mark.parametrize("method", SIGNATURES)
 def test_positions_are_those_of_the_signature(method: str) -> None:
-    found = row(method)
+    found = method_spec(method)
     assert found.caller_api == position(method, "caller_api")
     assert found.service_api == position(method, "service_api")
     assert found.type == position(method, "topic_type")
@@ -66,7 +66,7 @@ def test_positions_are_those_of_the_signature(method: str) -> None:
 def test_what_a_method_does(
     method: str, registers: Kind | None, unregisters: Kind | None, reply: Reply
 ) -> None:
-    found = row(method)
+    found = method_spec(method)
     assert (found.registers, found.unregisters, found.reply) == (registers, unregisters, reply)
 
 
@@ -86,7 +86,7 @@ def test_what_a_method_does(
     ],
 )
 def test_every_other_method_has_none(method: str) -> None:
-    assert row(method) is NO_ROW
+    assert method_spec(method) is NO_SPEC
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from tests.unit.builders import (
     cpp_reply,
     exchange,
     make_addressing,
-    make_asker,
+    make_caller,
     py_call,
     py_reply,
     python_values,
@@ -27,7 +27,7 @@ from tests.unit.builders import (
 OWN, OUT = "http://10.0.0.5:40001/", "http://robot-host:45000/"
 SERVICE, OUT_SERVICE = "rosrpc://10.0.0.5:50001", "rosrpc://robot-host:45000"
 FULL = "http://full:40001/"
-NODE = make_asker("10.0.0.5", master=MASTER)
+NODE = make_caller("10.0.0.5", master=MASTER)
 FAULT = {"faultCode": 1, "faultString": "method is not supported"}
 REFUSED = [[-1, "rosproxy: no port is left", 0]]
 

@@ -19,7 +19,7 @@ from tests.unit.builders import (
     cpp_call,
     cpp_reply,
     make_addressing,
-    make_asker,
+    make_caller,
     py_call,
     py_reply,
     python_values,
@@ -56,9 +56,9 @@ PLAIN = st.recursive(
 
 WORLD = make_addressing()
 NODE = add_node(WORLD)
-ASKER = make_asker("10.0.0.5")
+CALLER = make_caller("10.0.0.5")
 REACHED = HostPort("robot-host", 45000)
-VIEW = slave_api.from_outside(ASKER, "http://robot:11311/", WORLD)
+VIEW = slave_api.from_outside(CALLER, "http://robot:11311/", WORLD)
 METHODS = ["getParam", "registerPublisher", "lookupService", "system.multicall", "x", "__proto__"]
 
 
@@ -110,7 +110,7 @@ def exported(request: master_calls.Request) -> master_calls.Exported:
 @given(st.sampled_from(METHODS), st.lists(VALUES, max_size=4))
 def test_a_call_without_addresses_comes_out_byte_for_byte(method: str, values: list[Any]) -> None:
     body = py_call(method, *values)
-    request = master_calls.read_request(body, ASKER)
+    request = master_calls.read_request(body, CALLER)
     assert exported(request).body == body
 
 
@@ -118,7 +118,7 @@ def test_a_call_without_addresses_comes_out_byte_for_byte(method: str, values: l
 def test_a_reply_without_addresses_comes_out_byte_for_byte(
     method: str, value: Any, status: int
 ) -> None:
-    request = master_calls.read_request(py_call(method, "/node"), ASKER)
+    request = master_calls.read_request(py_call(method, "/node"), CALLER)
     for reply in (py_reply(value), py_reply([status, "said", value])):
         answer = master_calls.read_reply(exported(request), reply)
         assert master_api.import_reply(answer, WORLD) == reply
@@ -144,7 +144,7 @@ def test_the_slave_side_leaves_other_values_alone(
 
 def everything(body: bytes) -> None:
     """Do all that the shell does with a body from somebody else."""
-    request = master_calls.read_request(body, ASKER)
+    request = master_calls.read_request(body, CALLER)
     exported(request)
     parsed = xmlrpc.parse_call(body)
     slave_api.rewrite_call(body, parsed, VIEW)
@@ -158,7 +158,7 @@ def everything_in_reply(reply: bytes) -> None:
     call = xmlrpc.parse_call(py_call("requestTopic", "/a", "/b", [["TCPROS"]]))
     slave_api.topic_port(call, reply)
     slave_api.rewrite_reply(call, reply, REACHED, VIEW)
-    request = master_calls.read_request(py_call("system.multicall", []), ASKER)
+    request = master_calls.read_request(py_call("system.multicall", []), CALLER)
     master_api.import_reply(master_calls.read_reply(exported(request), reply), WORLD)
     multicall.results_reply([multicall.result_value(reply)])
 

@@ -11,7 +11,7 @@ from rosproxy.ros1.registry.endpoint import (
     MOST_CHARACTERS,
     MOST_REGISTRATIONS,
     Endpoint,
-    Place,
+    NodeLocation,
     Registration,
 )
 from rosproxy.ros1.registry.health import Health
@@ -30,7 +30,7 @@ def admit(
 ) -> Endpoint:
     node = parse_slave_uri(uri)
     assert node
-    place = Place(address, node.host == address, confirmed)
+    place = NodeLocation(address, node.host == address, confirmed)
     return registry.admit(uri, node, place, source or address)
 
 
@@ -95,16 +95,16 @@ def test_nobody_renames_the_endpoint_of_somebody_else() -> None:
     forged = admit(registry, "http://alias:40001/", "10.0.0.5", "10.0.0.66", confirmed=False)
     assert forged is endpoint
     assert endpoint.uri == own_uri("10.0.0.5")
-    assert endpoint.place.confirmed
+    assert endpoint.location.confirmed
     assert registry.by_node(at("http://alias:40001/")) == []
 
 
 def test_an_endpoint_that_was_only_claimed_is_confirmed_by_its_own_address() -> None:
     registry = make_registry()
     endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", "10.0.0.1", confirmed=False)
-    assert not endpoint.place.confirmed
+    assert not endpoint.location.confirmed
     assert node(registry, 5) is endpoint
-    assert endpoint.place.confirmed
+    assert endpoint.location.confirmed
 
 
 def test_a_source_that_means_another_node_by_now_stays_admitted_when_the_old_one_goes() -> None:
@@ -203,12 +203,15 @@ def test_a_call_under_way_keeps_an_endpoint() -> None:
 
 def test_restored_endpoints_have_the_port_that_they_had() -> None:
     registry = make_registry()
-    where, place = HostPort("10.0.0.5", 40001), Place("10.0.0.5", named=True, confirmed=False)
+    where, place = (
+        HostPort("10.0.0.5", 40001),
+        NodeLocation("10.0.0.5", named=True, confirmed=False),
+    )
     endpoint = registry.restore(own_uri("10.0.0.5"), where, place, 45002)
     assert endpoint
     assert (endpoint.port, endpoint.trusted) == (45002, False)
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.5") is endpoint
-    other = HostPort("10.0.0.6", 40001), Place("10.0.0.6", named=True)
+    other = HostPort("10.0.0.6", 40001), NodeLocation("10.0.0.6", named=True)
     assert registry.restore(own_uri("10.0.0.5"), where, place, 45003) is None  # is there
     assert registry.restore(own_uri("10.0.0.6"), *other, 45002) is None  # port is taken
     assert registry.restore(own_uri("10.0.0.6"), *other, 44000) is None  # not in the range
@@ -343,7 +346,7 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
     registry = make_registry()
     endpoint, port = node(registry, 5), 45000
     held = register(registry, endpoint, PUB, "/a")
-    assert registry.move({endpoint: Place("10.0.0.9", False)}) == [endpoint]
+    assert registry.move({endpoint: NodeLocation("10.0.0.9", False)}) == [endpoint]
     assert (endpoint.slave, endpoint.port, endpoint.uri) == (
         HostPort("10.0.0.9", 40001),
         port,
@@ -362,7 +365,7 @@ def test_a_node_that_moves_keeps_its_port_and_what_it_calls_itself() -> None:
 def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> None:
     registry = make_registry()
     endpoint = admit(registry, own_uri("10.0.0.5"), "10.0.0.5", source="10.0.0.1")
-    registry.move({endpoint: Place("10.0.0.9", False)})
+    registry.move({endpoint: NodeLocation("10.0.0.9", False)})
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.1") is endpoint
     assert registry.admitted(at(own_uri("10.0.0.5")), "10.0.0.9") is endpoint
 
@@ -370,7 +373,7 @@ def test_an_admission_by_way_of_a_third_address_stays_when_a_node_moves() -> Non
 def test_two_nodes_may_swap_their_addresses() -> None:
     registry = make_registry()
     one, other = node(registry, 5), node(registry, 6)
-    places = {one: Place("10.0.0.6", False), other: Place("10.0.0.5", False)}
+    places = {one: NodeLocation("10.0.0.6", False), other: NodeLocation("10.0.0.5", False)}
     assert registry.move(places) == [one, other]
     assert registry.by_slave.get(HostPort("10.0.0.6", 40001)) is one
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is other
@@ -381,9 +384,13 @@ def test_two_nodes_may_swap_their_addresses() -> None:
 def test_a_node_whose_new_place_is_held_stays_where_it_was() -> None:
     registry = make_registry()
     one, holder, third = node(registry, 5), node(registry, 6), node(registry, 7)
-    places = {third: Place("10.0.0.5", False), one: Place("10.0.0.6", False)}
+    places = {third: NodeLocation("10.0.0.5", False), one: NodeLocation("10.0.0.6", False)}
     assert registry.move(places) == []
-    assert [e.place.address for e in (one, holder, third)] == ["10.0.0.5", "10.0.0.6", "10.0.0.7"]
+    assert [e.location.address for e in (one, holder, third)] == [
+        "10.0.0.5",
+        "10.0.0.6",
+        "10.0.0.7",
+    ]
     assert registry.by_slave.get(HostPort("10.0.0.5", 40001)) is one
 
 
@@ -445,7 +452,7 @@ def given_up(registry: Registry) -> list[str]:
     """Who is given up for nodes that live, one after the other."""
     found = []
     while (endpoint := registry.dead()) is not None:
-        found.append(endpoint.place.address.removeprefix("10.0.0."))
+        found.append(endpoint.location.address.removeprefix("10.0.0."))
         registry.remove(endpoint)
     return found
 
@@ -469,7 +476,10 @@ def test_the_dead_give_way_in_order() -> None:
 
 def test_what_only_the_master_tells_of_gives_way_once_it_was_asked_in_vain() -> None:
     registry = make_registry()
-    where, place = HostPort("10.0.0.5", 40001), Place("10.0.0.5", named=True, confirmed=False)
+    where, place = (
+        HostPort("10.0.0.5", 40001),
+        NodeLocation("10.0.0.5", named=True, confirmed=False),
+    )
     claim = registry.restore(own_uri("10.0.0.5"), where, place, 45000)
     assert claim
     register(registry, claim, PUB, "/a")

@@ -11,7 +11,7 @@ from rosproxy.leases.ports import PortRange
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import RangeExhausted, Registry
 
 PORTS = PortRange(45000, 45005)
@@ -46,7 +46,7 @@ class Registries(RuleBasedStateMachine):
         self, address: str, port: int, name: str | None, source: str, confirmed: bool
     ) -> None:
         where = HostPort(name or address, port)
-        place = Place(address, name is None, confirmed)
+        place = NodeLocation(address, name is None, confirmed)
         before = {endpoint.slave for endpoint in self.registry}
         try:
             endpoint = self.registry.admit(slave_uri(where), where, place, source)
@@ -62,7 +62,9 @@ class Registries(RuleBasedStateMachine):
         where = HostPort(address, slave)
         known = any(endpoint.slave == where for endpoint in self.registry)
         usable = port in PORTS and port not in self.registry.by_port and port not in self.blocked
-        found = self.registry.restore(slave_uri(where), where, Place(address, True, False), port)
+        found = self.registry.restore(
+            slave_uri(where), where, NodeLocation(address, True, False), port
+        )
         assert (found is not None) == (usable and not known)
         assert found is None or found.port == port
 
@@ -72,7 +74,7 @@ class Registries(RuleBasedStateMachine):
         for address in addresses:
             endpoint = self.draw(data)
             if endpoint:
-                places[endpoint] = Place(address, False)
+                places[endpoint] = NodeLocation(address, False)
         before = {endpoint: endpoint.slave for endpoint in self.registry}
         admitted = {endpoint: set(endpoint.admissions) for endpoint in self.registry}
         ports = {endpoint: endpoint.port for endpoint in self.registry}

@@ -4,10 +4,10 @@ from ipaddress import ip_network
 
 import pytest
 
-from rosproxy.ros1.registry.selection import Standing, refusal, standing
+from rosproxy.ros1.registry.selection import ClientKind, client_kind, refusal
 
 NETWORKS = (ip_network("10.0.0.0/24"), ip_network("fd00::/64"))
-ADMITTED, OUTSIDE, UNSELECTED = Standing.ADMITTED, Standing.OUTSIDE, Standing.UNSELECTED
+ADMITTED, OUTSIDE, UNSELECTED = ClientKind.ADMITTED, ClientKind.OUTSIDE, ClientKind.UNSELECTED
 
 
 @pytest.mark.parametrize(
@@ -24,8 +24,8 @@ ADMITTED, OUTSIDE, UNSELECTED = Standing.ADMITTED, Standing.OUTSIDE, Standing.UN
         ("10.0.1.5", {"10.0.1.5"}, ADMITTED),
     ],
 )
-def test_standing(address: str, selected: set[str] | None, found: Standing) -> None:
-    assert standing(address, NETWORKS, selected) is found
+def test_standing(address: str, selected: set[str] | None, found: ClientKind) -> None:
+    assert client_kind(address, NETWORKS, selected) is found
 
 
 def test_a_refusal_is_one_line_that_says_what_to_do() -> None:

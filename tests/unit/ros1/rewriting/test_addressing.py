@@ -4,16 +4,16 @@ import pytest
 
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Place
+from rosproxy.ros1.registry.endpoint import NodeLocation
 from rosproxy.ros1.rewriting.addressing import Addressing
-from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_asker
+from tests.unit.builders import PROXY, add_node, add_registration, make_addressing, make_caller
 
 LITERAL = "http://10.0.0.5:40001/"
 OUTSIDE = "http://robot-host:45000/"
 RELAYED = f"http://{PROXY}:45000/"
 
-NEIGHBOUR = make_asker("10.0.0.6")
-STRANGER = make_asker("172.20.0.9")  # inside, in a network from which the node can't be reached
+NEIGHBOUR = make_caller("10.0.0.6")
+STRANGER = make_caller("172.20.0.9")  # inside, in a network from which the node can't be reached
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_an_advertised_uri_tells_the_port_alone(uri: str, address: str | None) -
     assert addressing.advertised_service(endpoint) == "rosrpc://robot-host:45000"
     assert addressing.lease_of(OUTSIDE) == 45000
     assert addressing.stands_for(OUTSIDE) is endpoint
-    assert addressing.export_slave(uri, make_asker(endpoint.place.address)) == OUTSIDE
+    assert addressing.export_slave(uri, make_caller(endpoint.location.address)) == OUTSIDE
 
 
 @pytest.mark.parametrize(
@@ -76,8 +76,8 @@ def test_an_advertised_ipv6_host_has_brackets() -> None:
     outside = "http://[fd00::1]:45000/"
     assert addressing.advertised_uri(endpoint) == outside
     assert addressing.advertised_service(endpoint) == "rosrpc://[fd00::1]:45000"
-    assert addressing.import_slave(outside, make_asker("fd01::6")) == "http://[fd01::5]:40001/"
-    far = make_asker("fd02::6", proxy="fd02::1")
+    assert addressing.import_slave(outside, make_caller("fd01::6")) == "http://[fd01::5]:40001/"
+    far = make_caller("fd02::6", proxy="fd02::1")
     relayed = "http://[fd02::1]:45000/"
     assert addressing.import_slave(outside, far) == relayed
     assert addressing.export_slave(relayed, far) == outside
@@ -85,34 +85,34 @@ def test_an_advertised_ipv6_host_has_brackets() -> None:
 
 IMPORTS = [
     # who asks, about a node with this host name and address, gets
-    ("the node itself", make_asker("10.0.0.5"), LITERAL, None, LITERAL),
+    ("the node itself", make_caller("10.0.0.5"), LITERAL, None, LITERAL),
     ("a neighbour", NEIGHBOUR, LITERAL, None, LITERAL),
     ("a stranger", STRANGER, LITERAL, None, RELAYED),
-    ("one of another family", make_asker("fd00::6", proxy="fd00::1"), LITERAL, None, None),
+    ("one of another family", make_caller("fd00::6", proxy="fd00::1"), LITERAL, None, None),
     (
         "the node, by an unresolvable name",
-        make_asker("10.0.0.5"),
+        make_caller("10.0.0.5"),
         "http://c5:40001/",
         "10.0.0.5",
         "",
     ),
     ("a neighbour, same", NEIGHBOUR, "http://c5:40001/", "10.0.0.5", None),
     ("a stranger, same", STRANGER, "http://c5:40001/", "10.0.0.5", None),
-    ("the node, by loopback", make_asker("10.0.0.5"), "http://127.0.0.1:40001/", "10.0.0.5", ""),
+    ("the node, by loopback", make_caller("10.0.0.5"), "http://127.0.0.1:40001/", "10.0.0.5", ""),
     ("a neighbour, same", NEIGHBOUR, "http://127.0.0.1:40001/", "10.0.0.5", None),
 ]
 
 
-@pytest.mark.parametrize(("asker", "uri", "address", "given"), [row[1:] for row in IMPORTS])
-def test_what_an_asker_is_given(asker, uri: str, address: str | None, given: str | None) -> None:
+@pytest.mark.parametrize(("caller", "uri", "address", "given"), [row[1:] for row in IMPORTS])
+def test_what_a_caller_is_given(caller, uri: str, address: str | None, given: str | None) -> None:
     """None stands for the relayed form, an empty text for the node's own."""
     addressing = make_addressing()
     endpoint = add_node(addressing, uri, address)
     outside = addressing.advertised_uri(endpoint)
-    relayed = outside.replace("robot-host", str(HostPort(asker.proxy, 1))[:-2])
+    relayed = outside.replace("robot-host", str(HostPort(caller.proxy, 1))[:-2])
     expected = {None: relayed, "": uri}.get(given, given)
-    assert addressing.import_slave(outside, asker) == expected
-    assert addressing.export_slave(str(expected), asker) == outside
+    assert addressing.import_slave(outside, caller) == expected
+    assert addressing.export_slave(str(expected), caller) == outside
 
 
 def test_a_name_that_leads_to_the_node_is_given_to_neighbours() -> None:
@@ -141,7 +141,7 @@ def test_neighbours_share_a_network(
     addressing = make_addressing(networks=networks)
     uri = f"http://{other}:40001/"
     outside = addressing.advertised_uri(add_node(addressing, uri))
-    assert (addressing.import_slave(outside, make_asker(one)) == uri) is neighbours
+    assert (addressing.import_slave(outside, make_caller(one)) == uri) is neighbours
 
 
 UNTOUCHED = [
@@ -163,9 +163,9 @@ UNTOUCHED = [
 def test_what_is_no_endpoint_of_ours_is_imported_and_exported_as_it_is(uri: str) -> None:
     addressing = make_addressing()
     add_node(addressing)
-    for asker in (NEIGHBOUR, STRANGER):
-        assert addressing.import_slave(uri, asker) == uri
-        assert addressing.export_slave(uri, asker) == uri
+    for caller in (NEIGHBOUR, STRANGER):
+        assert addressing.import_slave(uri, caller) == uri
+        assert addressing.export_slave(uri, caller) == uri
 
 
 def two_with_the_same_uri() -> tuple[Addressing, str, str]:
@@ -175,7 +175,7 @@ def two_with_the_same_uri() -> tuple[Addressing, str, str]:
 
 
 @pytest.mark.parametrize(
-    ("asker", "first", "second"),
+    ("caller", "first", "second"),
     [
         ("10.0.0.5", "http://node:40001/", f"http://{PROXY}:45001/"),
         ("10.0.0.6", f"http://{PROXY}:45000/", "http://node:40001/"),
@@ -187,23 +187,23 @@ def two_with_the_same_uri() -> tuple[Addressing, str, str]:
     ],
 )
 def test_two_containers_with_the_same_uri_each_mean_their_own(
-    asker: str, first: str, second: str
+    caller: str, first: str, second: str
 ) -> None:
     addressing, one, other = two_with_the_same_uri()
-    who = make_asker(asker)
+    who = make_caller(caller)
     assert [addressing.import_slave(uri, who) for uri in (one, other)] == [first, second]
     assert [addressing.export_slave(uri, who) for uri in (first, second)] == [one, other]
 
 
-def test_a_uri_that_an_asker_would_take_for_its_own_is_not_given_to_it() -> None:
-    """A neighbour's URI that reads like the asker's own led the asker to itself."""
+def test_a_uri_that_a_caller_would_take_for_its_own_is_not_given_to_it() -> None:
+    """A neighbour's URI that reads like the caller's own led the caller to itself."""
     addressing, uri = make_addressing(), "http://node:40001/"
     resolvable = add_node(addressing, uri, "10.0.0.5", named=True)
     add_node(addressing, uri, "10.0.0.6")
-    outside, asker = addressing.advertised_uri(resolvable), make_asker("10.0.0.6")
-    given = addressing.import_slave(outside, asker)
+    outside, caller = addressing.advertised_uri(resolvable), make_caller("10.0.0.6")
+    given = addressing.import_slave(outside, caller)
     assert given == f"http://{PROXY}:45000/"
-    assert addressing.export_slave(given, asker) == outside
+    assert addressing.export_slave(given, caller) == outside
 
 
 def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
@@ -211,9 +211,9 @@ def test_a_node_behind_source_nat_means_itself_by_its_uri() -> None:
     addressing, uri = make_addressing(), "http://node:40001/"
     add_node(addressing, uri, "10.0.0.6")
     where = HostPort("node", 40001)
-    place = add_node(addressing, uri, "10.0.0.5", confirmed=False).place
+    place = add_node(addressing, uri, "10.0.0.5", confirmed=False).location
     endpoint = addressing.registry.admit(uri, where, place, "10.0.0.254")
-    exported = addressing.export_slave(uri, make_asker("10.0.0.254"))
+    exported = addressing.export_slave(uri, make_caller("10.0.0.254"))
     assert exported == addressing.advertised_uri(endpoint)
 
 
@@ -221,14 +221,14 @@ def test_a_node_that_has_moved_is_sent_nobody_to_the_address_that_it_gives() -> 
     """Not even its own machine; it itself goes on by its own URI, which tells it who it is."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    addressing.registry.move({endpoint: Place("10.0.0.9", named=False, stale=True)})
+    addressing.registry.move({endpoint: NodeLocation("10.0.0.9", named=False, stale=True)})
     outside = "http://robot-host:45000/"
     assert addressing.advertised_uri(endpoint) == outside
     relayed = f"http://{PROXY}:45000/"
-    for asker in (NEIGHBOUR, make_asker("10.0.0.9"), make_asker("10.0.0.5"), STRANGER):
-        assert addressing.import_slave(outside, asker) == relayed
-    assert addressing.import_slave(outside, make_asker("10.0.0.9", endpoint=endpoint)) == LITERAL
-    assert addressing.export_slave(LITERAL, make_asker("10.0.0.9")) == outside
+    for caller in (NEIGHBOUR, make_caller("10.0.0.9"), make_caller("10.0.0.5"), STRANGER):
+        assert addressing.import_slave(outside, caller) == relayed
+    assert addressing.import_slave(outside, make_caller("10.0.0.9", endpoint=endpoint)) == LITERAL
+    assert addressing.export_slave(LITERAL, make_caller("10.0.0.9")) == outside
 
 
 def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_elses() -> None:
@@ -236,11 +236,11 @@ def test_uris_of_a_removed_endpoint_mean_the_same_until_its_port_is_somebody_els
     addressing = make_addressing(listen=(45000, 45000))
     endpoint = add_node(addressing)
     addressing.registry.remove(endpoint)
-    for asker in (NEIGHBOUR, STRANGER):
-        assert addressing.export_slave(LITERAL, asker) == OUTSIDE
-        assert addressing.export_slave(RELAYED, asker) == OUTSIDE
-        assert addressing.import_slave(OUTSIDE, asker) == OUTSIDE
-        assert addressing.export_slave(OUTSIDE, asker) == OUTSIDE
+    for caller in (NEIGHBOUR, STRANGER):
+        assert addressing.export_slave(LITERAL, caller) == OUTSIDE
+        assert addressing.export_slave(RELAYED, caller) == OUTSIDE
+        assert addressing.import_slave(OUTSIDE, caller) == OUTSIDE
+        assert addressing.export_slave(OUTSIDE, caller) == OUTSIDE
     add_node(addressing, "http://10.0.0.7:40001/")
     assert addressing.export_slave(LITERAL, NEIGHBOUR) == LITERAL
     assert addressing.import_slave(OUTSIDE, NEIGHBOUR) == "http://10.0.0.7:40001/"
@@ -267,34 +267,34 @@ def test_uris_that_the_proxy_handed_out(uri: str, handed_out: bool) -> None:
 
 SERVICES = [
     # who asks, gets
-    (make_asker("10.0.0.5"), "rosrpc://10.0.0.5:50001"),
+    (make_caller("10.0.0.5"), "rosrpc://10.0.0.5:50001"),
     (NEIGHBOUR, "rosrpc://10.0.0.5:50001"),
     (STRANGER, f"rosrpc://{PROXY}:45000"),
 ]
 
 
-@pytest.mark.parametrize(("asker", "given"), SERVICES)
-def test_a_service_is_imported_and_exported(asker, given: str) -> None:
+@pytest.mark.parametrize(("caller", "given"), SERVICES)
+def test_a_service_is_imported_and_exported(caller, given: str) -> None:
     addressing = make_addressing()
     add_registration(addressing, add_node(addressing), Kind.SERVICE, "/s")
     outside = "rosrpc://robot-host:45000"
-    assert addressing.import_service(outside, "/s", asker) == given
-    assert addressing.export_service(given, "/s", asker) == outside
+    assert addressing.import_service(outside, "/s", caller) == given
+    assert addressing.export_service(given, "/s", caller) == outside
 
 
-@pytest.mark.parametrize("asker", [asker for asker, _ in SERVICES])
-def test_a_service_that_was_rebuilt_from_the_master(asker) -> None:
+@pytest.mark.parametrize("caller", [caller for caller, _ in SERVICES])
+def test_a_service_that_was_rebuilt_from_the_master(caller) -> None:
     """Its own URI is not known until the node has answered for it."""
     addressing = make_addressing()
     endpoint = add_node(addressing)
     held = add_registration(addressing, endpoint, Kind.SERVICE, "/s")
     object.__setattr__(held, "service_api", None)
     outside = "rosrpc://robot-host:45000"
-    assert addressing.import_service(outside, "/s", asker) == f"rosrpc://{PROXY}:45000"
+    assert addressing.import_service(outside, "/s", caller) == f"rosrpc://{PROXY}:45000"
     addressing.registry.note_service_port(endpoint, "/s", 50001)
-    given = addressing.import_service(outside, "/s", asker)
-    assert given == dict(SERVICES)[asker]
-    assert addressing.export_service(given, "/s", asker) == outside
+    given = addressing.import_service(outside, "/s", caller)
+    assert given == dict(SERVICES)[caller]
+    assert addressing.export_service(given, "/s", caller) == outside
 
 
 def test_a_service_that_is_not_known_is_relayed() -> None:

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_service_uri, parse_slave_uri, service_uri, slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.memory import remembered, to_remember
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from tests.unit.builders import make_addressing
 
 ADDRESSES = st.sampled_from(
@@ -40,7 +40,7 @@ class Member:
     def join(self, addressing: Addressing) -> Endpoint:
         where = HostPort(self.name or self.address, self.port)
         named = self.named or where.host == self.address
-        place = Place(self.address, named)
+        place = NodeLocation(self.address, named)
         endpoint = addressing.registry.admit(slave_uri(where), where, place, self.address)
         caller_id = f"/n{len(addressing.registry)}"
         api = service_uri(HostPort(self.service_host or where.host, 50000 + endpoint.port % 100))
@@ -73,13 +73,13 @@ def topologies(draw: st.DrawFn, distinct: bool = False) -> tuple[Addressing, lis
 
 
 @st.composite
-def askers(draw: st.DrawFn, addressing: Addressing) -> tuple[Asker, Asker]:
+def callers(draw: st.DrawFn, addressing: Addressing) -> tuple[Caller, Caller]:
     """Somebody as the proxy gives it addresses, and as it is when it sends them back."""
     proxy = draw(PROXIES)
     endpoint = draw(st.none() | st.sampled_from(list(addressing.registry)))
-    address = endpoint.place.address if endpoint else draw(ADDRESSES)
-    plain = Asker(address, proxy)
-    return draw(st.sampled_from([plain, Asker(address, proxy, endpoint=endpoint)])), plain
+    address = endpoint.location.address if endpoint else draw(ADDRESSES)
+    plain = Caller(address, proxy)
+    return draw(st.sampled_from([plain, Caller(address, proxy, endpoint=endpoint)])), plain
 
 
 @given(topologies(), st.data())
@@ -87,7 +87,7 @@ def test_a_slave_uri_handed_out_comes_back_as_it_was(
     topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
 ) -> None:
     addressing, endpoints = topology
-    given, back = data.draw(askers(addressing))
+    given, back = data.draw(callers(addressing))
     for endpoint in endpoints:
         outside = addressing.advertised_uri(endpoint)
         inside = addressing.import_slave(outside, given)
@@ -103,12 +103,12 @@ def test_a_node_is_given_its_own_uri_literally(
     addressing, endpoints = topology
     endpoint = data.draw(st.sampled_from(endpoints))
     outside = addressing.advertised_uri(endpoint)
-    for asker in (
-        Asker(endpoint.place.address, "10.0.0.1"),
-        Asker(endpoint.place.address, "10.0.0.1", endpoint=endpoint),
+    for caller in (
+        Caller(endpoint.location.address, "10.0.0.1"),
+        Caller(endpoint.location.address, "10.0.0.1", endpoint=endpoint),
     ):
-        assert addressing.import_slave(outside, asker) == endpoint.uri
-        assert addressing.export_slave(endpoint.uri, asker) == outside
+        assert addressing.import_slave(outside, caller) == endpoint.uri
+        assert addressing.export_slave(endpoint.uri, caller) == outside
 
 
 @given(topologies(distinct=True), st.data())
@@ -116,7 +116,7 @@ def test_a_uri_comes_back_as_it_was_after_its_node_has_gone(
     topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
 ) -> None:
     addressing, endpoints = topology
-    given, back = data.draw(askers(addressing))
+    given, back = data.draw(callers(addressing))
     outside = [addressing.advertised_uri(endpoint) for endpoint in endpoints]
     inside = [addressing.import_slave(uri, given) for uri in outside]
     for endpoint in data.draw(st.lists(st.sampled_from(endpoints), unique_by=id)):
@@ -131,7 +131,7 @@ def test_a_service_uri_handed_out_comes_back_as_it_was(
     topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
 ) -> None:
     addressing, endpoints = topology
-    given, back = data.draw(askers(addressing))
+    given, back = data.draw(callers(addressing))
     for endpoint in endpoints:
         outside = addressing.advertised_service(endpoint)
         for name in (f"/s{endpoint.port}", "/unknown"):
@@ -145,11 +145,11 @@ def test_outside_uris_pass_both_ways(
     topology: tuple[Addressing, list[Endpoint]], data: st.DataObject
 ) -> None:
     addressing, _ = topology
-    asker, _ = data.draw(askers(addressing))
+    caller, _ = data.draw(callers(addressing))
     host = data.draw(st.sampled_from(["laptop", "192.168.1.77", addressing.host]))
     uri = slave_uri(HostPort(host, data.draw(st.integers(1024, 29000))))
-    assert addressing.import_slave(uri, asker) == uri
-    assert addressing.export_slave(uri, asker) == uri
+    assert addressing.import_slave(uri, caller) == uri
+    assert addressing.export_slave(uri, caller) == uri
 
 
 @given(topologies())

@@ -17,7 +17,7 @@ from tests.unit.builders import (
     add_registration,
     exchange,
     make_addressing,
-    make_asker,
+    make_caller,
     py_call,
     py_reply,
     raw_call,
@@ -33,7 +33,7 @@ OTHER_OUT = "http://robot-host:45001/"
 FAR = "http://172.20.0.7:40001/"
 FAR_OUT = "http://robot-host:45002/"
 FAR_RELAYED = f"http://{PROXY}:45002/"
-NODE = make_asker("10.0.0.5", master=MASTER)
+NODE = make_caller("10.0.0.5", master=MASTER)
 
 
 def world() -> Addressing:
@@ -207,8 +207,8 @@ def test_methods_of_the_table_are_not_plain(method: str) -> None:
 
 
 def test_the_caller_is_known_by_its_name() -> None:
-    assert master_calls.read_request(py_call("getUri", ID), NODE).asker.caller_id == ID
-    assert master_calls.read_request(py_call("getUri", 5), NODE).asker.caller_id == ""
+    assert master_calls.read_request(py_call("getUri", ID), NODE).caller.caller_id == ID
+    assert master_calls.read_request(py_call("getUri", 5), NODE).caller.caller_id == ""
 
 
 @pytest.mark.parametrize(
@@ -352,11 +352,11 @@ def test_a_refused_registration_is_answered_with_a_ros_status() -> None:
 
 
 def test_the_published_master_renames_itself_only() -> None:
-    asker = make_asker("192.168.1.77")
+    caller = make_caller("192.168.1.77")
     for body, reply, expected in (
         (py_call("getUri", ID), [1, "", "http://inside:11311/"], [1, "", "http://robot-host:1/"]),
         (py_call("lookupNode", ID, ID), [1, "", OUT], [1, "", OUT]),
     ):
-        request = master_calls.read_request(body, asker)
+        request = master_calls.read_request(body, caller)
         renamed = master_api.rename_master(request, py_reply(reply), "robot-host:1")
         assert renamed == py_reply(expected)

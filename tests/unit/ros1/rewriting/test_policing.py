@@ -12,7 +12,7 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind, resolve_name
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry import hidden
-from rosproxy.ros1.registry.endpoint import Endpoint, Place, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.rewriting.addressing import Addressing
@@ -29,7 +29,7 @@ def make(*held: tuple[str, Kind, str, bool]) -> Addressing:
     for number, (name, kind, what, is_hidden) in enumerate(held, 1):
         address = f"10.0.0.{number}"
         uri, node = f"http://{address}:1/", HostPort(address, 1)
-        endpoint = registry.admit(uri, node, Place(address, named=True), address)
+        endpoint = registry.admit(uri, node, NodeLocation(address, named=True), address)
         registry.register(endpoint, Registration(kind, what, name, "T", hidden=is_hidden))
     ports = PortMap(PORTS, PORTS)
     return Addressing(registry, "host", ports, make_stand_ins(ports))
@@ -128,7 +128,7 @@ def test_the_index_of_hidden_names_is_that_of_the_registrations(
     for caller, topic, is_hidden in steps:
         address = f"10.0.0.{ord(caller[1]) - 96}"
         node = HostPort(address, 1)
-        endpoint = registry.admit(f"http://{node}/", node, Place(address, True), address)
+        endpoint = registry.admit(f"http://{node}/", node, NodeLocation(address, True), address)
         held = Registration(Kind.PUBLISHER, topic, caller, hidden=is_hidden)
         registry.register(endpoint, held)
     wanted = {

@@ -17,7 +17,7 @@ from tests.unit.builders import (
     add_node,
     add_registration,
     make_addressing,
-    make_asker,
+    make_caller,
     py_call,
     py_reply,
     python_values,
@@ -38,7 +38,7 @@ def world() -> CallView:
     node = add_node(addressing, OWN)
     add_node(addressing, OTHER)
     add_node(addressing, "http://172.20.0.7:40001/")
-    return slave_api.from_outside(make_asker("10.0.0.5", endpoint=node), MASTER, addressing)
+    return slave_api.from_outside(make_caller("10.0.0.5", endpoint=node), MASTER, addressing)
 
 
 def inward(body: bytes) -> bytes:

@@ -8,10 +8,10 @@ from rosproxy.net.addresses import HostPort
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
-from rosproxy.ros1.upkeep.policy import adoption as policy
-from rosproxy.ros1.upkeep.policy.adoption import DirectNode
-from rosproxy.ros1.upkeep.policy.recovery import confirmed_by
-from rosproxy.ros1.upkeep.policy.registration import known_as
+from rosproxy.ros1.upkeep.decisions import adoption as policy
+from rosproxy.ros1.upkeep.decisions.adoption import DirectNode
+from rosproxy.ros1.upkeep.decisions.recovery import confirmed_by
+from rosproxy.ros1.upkeep.decisions.registration import known_as
 from tests.unit.builders import add_node, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosproxy.ros1.protocol.master_methods import Kind
-from rosproxy.ros1.registry.endpoint import Place
+from rosproxy.ros1.registry.endpoint import NodeLocation
 from rosproxy.ros1.registry.health import Health, ProbeResult
-from rosproxy.ros1.upkeep.policy import liveness
+from rosproxy.ros1.upkeep.decisions import liveness
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 
@@ -43,9 +43,9 @@ def test_who_may_have_moved() -> None:
     outside = add_node(addressing, "http://10.0.0.7:40001/")
     same = add_node(addressing, "http://10.0.0.8:40001/")
     news = {
-        moved.place.address: "10.0.0.9",
-        outside.place.address: "192.168.0.9",  # in no inside network
-        same.place.address: same.place.address,
+        moved.location.address: "10.0.0.9",
+        outside.location.address: "192.168.0.9",  # in no inside network
+        same.location.address: same.location.address,
         "10.0.0.99": "10.0.0.100",
     }
     found = liveness.movable(addressing.registry, news, addressing.networks)
@@ -65,7 +65,7 @@ def test_who_may_have_moved() -> None:
 @pytest.mark.parametrize("confirmed", [True, False])
 def test_the_place_of_a_node_that_has_moved(uri: str, stale: bool, confirmed: bool) -> None:
     endpoint = add_node(make_addressing(), uri, "10.0.0.5", True, confirmed)
-    expected = Place("10.0.0.9", named=False, confirmed=confirmed, stale=stale)
+    expected = NodeLocation("10.0.0.9", named=False, confirmed=confirmed, stale=stale)
     assert liveness.new_place(endpoint, "10.0.0.9") == expected
 
 

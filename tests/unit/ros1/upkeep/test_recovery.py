@@ -12,8 +12,8 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry import memory
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import Graph, NodeInfo
-from rosproxy.ros1.upkeep.policy import recovery as policy
-from rosproxy.ros1.upkeep.policy.recovery import Claim
+from rosproxy.ros1.upkeep.decisions import recovery as policy
+from rosproxy.ros1.upkeep.decisions.recovery import Claim
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SRV = Kind.PUBLISHER, Kind.SERVICE

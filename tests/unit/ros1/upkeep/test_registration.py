@@ -7,13 +7,13 @@ import pytest
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Registration
 from rosproxy.ros1.registry.graph import NodeInfo
-from rosproxy.ros1.upkeep.policy import registration as policy
+from rosproxy.ros1.upkeep.decisions import registration as decisions
 from tests.unit.builders import (
     add_node,
     add_registration,
     exchange,
     make_addressing,
-    make_asker,
+    make_caller,
     py_call,
     py_reply,
 )
@@ -57,14 +57,14 @@ BY_NODE = [
 def test_the_proxy_calls_the_master_exactly_as_the_node_did(
     register: bytes, unregister: bytes
 ) -> None:
-    addressing, node = make_addressing(), make_asker("10.0.0.5")
+    addressing, node = make_addressing(), make_caller("10.0.0.5")
     done = exchange(addressing, node, register, py_reply([1, "", []]))
     endpoint = addressing.registry.by_port[45000]
     (held,) = endpoint.registrations.values()
     uris = addressing.advertised_uri(endpoint), addressing.advertised_service(endpoint)
-    method, params = policy.register_call(held, *uris)
+    method, params = decisions.register_call(held, *uris)
     assert py_call(method, *params) == done.sent
-    method, params = policy.unregister_call(held, *uris)
+    method, params = decisions.unregister_call(held, *uris)
     assert py_call(method, *params) == exchange(addressing, node, unregister, py_reply([])).sent
 
 
@@ -97,7 +97,7 @@ def test_what_still_holds_of_a_node_that_is_back(
     endpoint = add_node(addressing)
     for kind, name in HELD:
         add_registration(addressing, endpoint, kind, name)
-    found = policy.still_held(endpoint, said(published, subscribed), same_process)
+    found = decisions.still_held(endpoint, said(published, subscribed), same_process)
     assert [(held.kind, held.name) for held in found] == kept
 
 
@@ -105,8 +105,8 @@ def test_a_service_alone_holds_if_the_process_is_the_same() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
     service = add_registration(addressing, endpoint, SRV, "/s")
-    assert policy.still_held(endpoint, said({"/rosout"}), same_process=True) == [service]
-    assert policy.still_held(endpoint, said({"/rosout"}), same_process=False) == []
+    assert decisions.still_held(endpoint, said({"/rosout"}), same_process=True) == [service]
+    assert decisions.still_held(endpoint, said({"/rosout"}), same_process=False) == []
 
 
 OLD = [(PUB, "/rosout", "/old", 1.0), (PUB, "/a", "/old", 1.0), (SRV, "/s", "/old", 1.0)]
@@ -138,19 +138,19 @@ def test_what_a_process_that_is_gone_has_left_behind(
     endpoint = add_node(addressing)
     for kind, name, caller_id, since in registered:
         addressing.registry.register(endpoint, Registration(kind, name, caller_id, since=since))
-    found = policy.left_over(endpoint, said(published, subscribed), before=10.0)
+    found = decisions.left_over(endpoint, said(published, subscribed), before=10.0)
     assert [held.key for held in found] == [row[:3] for row in left]
 
 
 def test_topics_that_a_node_has_and_the_master_does_not_know_of() -> None:
     addressing = make_addressing()
     endpoint = add_node(addressing)
-    assert policy.unregistered(endpoint, said({"/a"})) == []  # whose would they be?
+    assert decisions.unregistered(endpoint, said({"/a"})) == []  # whose would they be?
     add_registration(addressing, endpoint, PUB, "/a", "/n")
-    found = policy.unregistered(endpoint, said({"/a", "/b"}, {"/a"}))
+    found = decisions.unregistered(endpoint, said({"/a", "/b"}, {"/a"}))
     assert found == [Registration(PUB, "/b", "/n", "t/b"), Registration(SUB, "/a", "/n", "t/a")]
     add_registration(addressing, endpoint, SUB, "/c", "/m")
-    assert policy.unregistered(endpoint, said({"/b"})) == []
+    assert decisions.unregistered(endpoint, said({"/b"})) == []
 
 
 def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
@@ -158,13 +158,13 @@ def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
     services = {"/add": "rosrpc://c1:50001"}
     mine = [held("/a"), held("/add", kind=SRV), held("/b", kind=SUB), held("/c", "/m", SUB)]
     mine.append(held("/lost", kind=SRV))
-    assert policy.free_calls(mine, uris, services) == [
+    assert decisions.free_calls(mine, uris, services) == [
         ("unregisterSubscriber", ["/n", "/b", "http://c1:40001/"]),
         ("unregisterSubscriber", ["/m", "/c", "http://c1:40001"]),
         ("unregisterPublisher", ["/n", "/a", "http://c1:40001/"]),
         ("unregisterService", ["/n", "/add", "rosrpc://c1:50001"]),
     ]
-    assert policy.restore_calls(mine, uris, services) == [
+    assert decisions.restore_calls(mine, uris, services) == [
         ("registerPublisher", ["/n", "/a", "*", "http://c1:40001/"]),
         ("registerService", ["/n", "/add", "rosrpc://c1:50001", "http://c1:40001/"]),
         ("registerSubscriber", ["/n", "/b", "*", "http://c1:40001/"]),
@@ -175,7 +175,7 @@ def test_what_is_taken_back_and_put_back_and_in_which_order() -> None:
 def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
     ask = [("lookupNode", ["/rosproxy", name]) for name in ("/n", "/m")]
     parameter = "/rosout_disable_topics_generation"
-    assert policy.release_calls({"/n": "http://c1:1/", "/m": "http://c1:2/"}, "/rosproxy") == [
+    assert decisions.release_calls({"/n": "http://c1:1/", "/m": "http://c1:2/"}, "/rosproxy") == [
         *ask,
         ("unsubscribeParam", ["/n", "http://c1:1/", parameter]),
         ("unsubscribeParam", ["/m", "http://c1:2/", parameter]),
@@ -186,8 +186,8 @@ def test_the_parameter_that_every_node_is_subscribed_to_is_released() -> None:
 def test_who_was_subscribed_to_it_and_who_is_known_still() -> None:
     uris = dict.fromkeys(("/unknown", "/common", "/another", "/taken"), "U")
     before, after = [None, "U", "U", "other"], [None, None, "U", "other"]
-    ended, known = policy.read_release(uris, [*before, 1, 1, 1, 1, *after])
-    assert ended == [Registration(PARAM, policy.COMMON_PARAMETER, "/common")]
+    ended, known = decisions.read_release(uris, [*before, 1, 1, 1, 1, *after])
+    assert ended == [Registration(PARAM, decisions.COMMON_PARAMETER, "/common")]
     assert known == {"/another": "U", "/taken": "other"}
 
 
@@ -198,7 +198,7 @@ def test_what_has_not_ended_meanwhile_is_registered_subscribers_last() -> None:
     wanted = [(endpoint, add_registration(addressing, endpoint, kind, "/a")) for kind in kinds]
     ended = endpoint, held("/gone")
     replaced = endpoint, held("/a", "/talker")
-    found = policy.to_register([ended, replaced, *wanted])
+    found = decisions.to_register([ended, replaced, *wanted])
     assert found == [*wanted[1:], wanted[0]]
 
 
@@ -215,7 +215,7 @@ def test_topics_that_a_node_no_longer_has() -> None:
         (PARAM, "/rate", 1.0),
     ]:
         addressing.registry.register(endpoint, held(name, kind=kind, since=since))
-    gone = policy.vanished(endpoint, said(["/kept"], ["/kept"]), before=5.0)
+    gone = decisions.vanished(endpoint, said(["/kept"], ["/kept"]), before=5.0)
     assert [(one.kind, one.name) for one in gone] == [(PUB, "/dropped"), (SUB, "/dropped")]
 
 
@@ -246,4 +246,4 @@ def test_what_the_master_has_lost(
     state: dict[str, list[Registration]] = {}
     for one in masters:
         state.setdefault(one.caller_id, []).append(one)
-    assert policy.lost(ours, state, before=10.0) == lost
+    assert decisions.lost(ours, state, before=10.0) == lost

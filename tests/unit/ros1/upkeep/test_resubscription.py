@@ -7,8 +7,8 @@ import pytest
 
 from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
-from rosproxy.ros1.upkeep.policy import resubscription as policy
-from rosproxy.ros1.upkeep.policy.resubscription import BusRow, TopicSubscription
+from rosproxy.ros1.upkeep.decisions import resubscription as decisions
+from rosproxy.ros1.upkeep.decisions.resubscription import BusRow, TopicSubscription
 from tests.unit.builders import add_node, add_registration, make_addressing
 
 PUB, SUB, SRV = Kind.PUBLISHER, Kind.SUBSCRIBER, Kind.SERVICE
@@ -44,13 +44,15 @@ def test_subscriptions_are_those_to_topics_that_the_endpoints_publish() -> None:
         "/b": [Registration(PUB, "/t", "/b"), Registration(SUB, "/u", "/b")],
         "/c": [Registration(SRV, "/t", "/c")],
     }
-    assert policy.subscriptions(held, [first, second], addressing) == [
+    assert decisions.subscriptions(held, [first, second], addressing) == [
         TopicSubscription(first, "/t", "/a"),
         TopicSubscription(second, "/t", "/a"),
         TopicSubscription(second, "/u", "/b"),
     ]
-    assert policy.subscriptions(held, [first], addressing) == [TopicSubscription(first, "/t", "/a")]
-    assert policy.subscriptions({}, [first], addressing) == []
+    assert decisions.subscriptions(held, [first], addressing) == [
+        TopicSubscription(first, "/t", "/a")
+    ]
+    assert decisions.subscriptions({}, [first], addressing) == []
 
 
 def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
@@ -59,7 +61,7 @@ def test_two_publishers_of_a_topic_in_one_process_are_one() -> None:
     for name in ("/one", "/two"):
         add_registration(addressing, endpoint, PUB, "/t", name)
     held = {"/a": [Registration(SUB, "/t", "/a")]}
-    assert policy.subscriptions(held, [endpoint], addressing) == [
+    assert decisions.subscriptions(held, [endpoint], addressing) == [
         TopicSubscription(endpoint, "/t", "/a")
     ]
 
@@ -85,7 +87,7 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
         "/ear": [add_registration(addressing, ear, SUB, "/t", "/ear")],
         "/speaker": [Registration(SUB, "/t", "/speaker")],
     }
-    found = policy.subscriptions(held, [speaker], addressing)
+    found = decisions.subscriptions(held, [speaker], addressing)
     assert found == subscribed(speaker, "/ear")[:count]
 
 
@@ -99,10 +101,10 @@ def test_neighbours_that_reach_a_publisher_by_its_own_uri_are_left_out(
     ],
 )
 def test_a_relay_serves_one_subscriber_of_one_topic_of_one_publisher(
-    relay: policy.TopicConnection, left: list[str]
+    relay: decisions.TopicConnection, left: list[str]
 ) -> None:
     wanted = subscribed(publisher("/t"), "/a", "/b")
-    assert names(policy.without_relay(wanted, {relay})) == left
+    assert names(decisions.without_relay(wanted, {relay})) == left
 
 
 ROWS = [
@@ -119,20 +121,22 @@ ROWS = [
 
 @pytest.mark.parametrize(("row", "found"), ROWS)
 def test_a_row_of_bus_info_is_read(row: Any, found: BusRow | None) -> None:
-    assert policy.read_bus([row]) == ([found] if found else [])
+    assert decisions.read_bus([row]) == ([found] if found else [])
 
 
 @pytest.mark.parametrize("value", [None, 0, "text", {}, []])
 def test_bus_info_of_another_form_tells_nothing(value: Any) -> None:
-    assert policy.read_bus(value) == []
+    assert decisions.read_bus(value) == []
 
 
 def test_a_subscriber_by_udpros_is_not_silent_and_one_by_tcpros_may_be() -> None:
     endpoint = publisher("/t")
     bus = {endpoint: [("/t", "/a", "UDPROS"), ("/t", "/b", "TCPROS")]}
-    assert names(policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
-    assert names(policy.unconnected(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == ["/a"]
-    assert names(policy.unconnected(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
+    assert names(decisions.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS)) == ["/b"]
+    assert names(decisions.unconnected(subscribed(endpoint, "/a", topic="/u"), bus, HOSTS)) == [
+        "/a"
+    ]
+    assert names(decisions.unconnected(subscribed(endpoint, "/a"), {}, HOSTS)) == ["/a"]
 
 
 FORWARDED = [
@@ -160,7 +164,7 @@ def test_a_host_with_as_many_connections_in_the_kernel_as_subscriptions_has_no_s
     endpoint.fast_peers = peers
     bus = {endpoint: [("/t", name, "TCPROS") for name in named]}
     left = subscribed(endpoint, "/a", "/b", "/c")
-    assert names(policy.unconnected(left, bus, HOSTS)) == found
+    assert names(decisions.unconnected(left, bus, HOSTS)) == found
 
 
 def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
@@ -168,17 +172,17 @@ def test_connections_in_the_kernel_count_for_their_own_endpoint() -> None:
     first, second = add_node(addressing), add_node(addressing, "http://10.0.0.6:40001/")
     first.fast_peers = {LAPTOP: 5}
     left = [*subscribed(first, "/a"), *subscribed(second, "/a")]
-    assert policy.unconnected(left, {}, HOSTS) == subscribed(second, "/a")
+    assert decisions.unconnected(left, {}, HOSTS) == subscribed(second, "/a")
 
 
 def test_a_host_that_is_not_found_has_no_connections() -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = {LAPTOP: 2}
-    assert names(policy.unconnected(subscribed(endpoint, "/a", "/d"), {}, HOSTS)) == ["/d"]
+    assert names(decisions.unconnected(subscribed(endpoint, "/a", "/d"), {}, HOSTS)) == ["/d"]
 
 
 def test_a_udpros_subscriber_needs_no_connection_in_the_kernel() -> None:
     endpoint = publisher("/t")
     endpoint.fast_peers = {LAPTOP: 1}
     bus = {endpoint: [("/t", "/a", "UDPROS")]}
-    assert policy.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []
+    assert decisions.unconnected(subscribed(endpoint, "/a", "/b"), bus, HOSTS) == []

@@ -1,6 +1,6 @@
 """Which ports the kernel may forward: those of user data, and what it was told before the start."""
 
-from rosproxy.forwarding.kernel.policy import HostForwarding, destination
+from rosproxy.forwarding.kernel.decisions import HostForwarding, destination
 from rosproxy.leases.ports import PortPool
 from rosproxy.net.addresses import HostPort
 from rosproxy.ros2.discovery.data_leases import DataLeases

@@ -8,7 +8,7 @@ the node itself is asked before anything is done.
 from collections.abc import Iterable, Mapping, Sequence
 
 from rosproxy.net.addresses import Network, is_address, is_inside, is_loopback
-from rosproxy.ros1.registry.endpoint import Endpoint, Place
+from rosproxy.ros1.registry.endpoint import Endpoint, NodeLocation
 from rosproxy.ros1.registry.health import UNKNOWN_PID, ProbeResult
 
 DIRECT_INTERVAL = 2.0
@@ -88,21 +88,21 @@ def movable(
     endpoints: Iterable[Endpoint], moved: Mapping[str, str], networks: Sequence[Network]
 ) -> dict[Endpoint, str]:
     """The endpoints at addresses that have changed, with their new one, if that is inside."""
-    found = {e: moved.get(e.place.address, "") for e in endpoints}
+    found = {e: moved.get(e.location.address, "") for e in endpoints}
     return {
-        e: new for e, new in found.items() if new != e.place.address and is_inside(new, networks)
+        e: new for e, new in found.items() if new != e.location.address and is_inside(new, networks)
     }
 
 
-def new_place(endpoint: Endpoint, address: str) -> Place:
+def new_place(endpoint: Endpoint, address: str) -> NodeLocation:
     """Where a node is that has moved to another address.
 
     Neighbours are sent through the proxy from now on, even if the node's host name leads there:
     to a URI that they know already, rospy doesn't connect again.
     """
-    host, before = endpoint.node.host, endpoint.place
+    host, before = endpoint.node.host, endpoint.location
     stale = is_address(host) and not is_loopback(host) and host != address
-    return Place(address, named=False, confirmed=before.confirmed, stale=stale)
+    return NodeLocation(address, named=False, confirmed=before.confirmed, stale=stale)
 
 
 def is_same_process(known: int | None, pid: int | None, borne_out: bool | None) -> bool:

@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rosproxy.net.addresses import is_loopback
-from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, row
+from rosproxy.ros1.protocol.master_methods import MASTER_METHODS, Kind, method_spec
 from rosproxy.ros1.protocol.uris import parse_slave_uri
-from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, NodeInfo
 
 MethodCall = tuple[str, list[Any]]
@@ -39,7 +39,7 @@ def unregister_call(held: Registration, uri: str, service: str) -> MethodCall:
     return _call(_UNREGISTERING[held.kind], held, uri, service)
 
 
-def to_register(held: Iterable[Held]) -> list[Held]:
+def to_register(held: Iterable[EndpointRegistration]) -> list[EndpointRegistration]:
     """Those of some registrations that have not ended meanwhile, in the order to make them.
 
     Subscribers come last, so that they are handed all publishers at once.
@@ -48,12 +48,12 @@ def to_register(held: Iterable[Held]) -> list[Held]:
     return sorted(current, key=lambda item: item[1].kind is Kind.SUBSCRIBER)
 
 
-def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[Held]:
+def one_publisher_per_topic(endpoints: Iterable[Endpoint]) -> list[EndpointRegistration]:
     """One publisher of each topic that some endpoints' nodes publish.
 
     Registering it makes the master tell all subscribers of the topic who its publishers are.
     """
-    topics: dict[str, Held] = {}
+    topics: dict[str, EndpointRegistration] = {}
     for endpoint in endpoints:
         for held in endpoint.registrations.values():
             if held.kind is Kind.PUBLISHER and not held.hidden:
@@ -89,12 +89,12 @@ def restore_calls(
     return [register_call(one, uris[one.caller_id], services.get(one.name, "")) for one in known]
 
 
-def release_calls(uris: Mapping[str, str], asker: str) -> list[MethodCall]:
+def release_calls(uris: Mapping[str, str], caller: str) -> list[MethodCall]:
     """The calls that end the parameter subscription that every node has, and tell what is left.
 
     There is nothing to see of such a subscription, apart from the name that stays known.
     """
-    ask: list[MethodCall] = [("lookupNode", [asker, name]) for name in uris]
+    ask: list[MethodCall] = [("lookupNode", [caller, name]) for name in uris]
     params = [Registration(Kind.PARAM, COMMON_PARAMETER, name) for name in uris]
     return [*ask, *free_calls(params, uris, {}), *ask]
 
@@ -195,7 +195,7 @@ def _known(held: Iterable[Registration], services: Mapping[str, str]) -> list[Re
 
 
 def _call(method: str, held: Registration, uri: str, service: str) -> MethodCall:
-    places = row(method)
+    places = method_spec(method)
     params = {
         0: held.caller_id,
         places.name: held.name,

@@ -13,24 +13,24 @@ from rosproxy.access.layers import Verdict, strictest
 from rosproxy.access.rules import RuleKind
 from rosproxy.forwarding.relay import Relay
 from rosproxy.ros1.clients.master import MasterClient, MasterError, Unreachable
-from rosproxy.ros1.protocol.master_methods import Kind, prefix, row
+from rosproxy.ros1.protocol.master_methods import Kind, method_spec, prefix
 from rosproxy.ros1.protocol.uris import parse_service_uri
 from rosproxy.ros1.protocol.xmlrpc import passing
 from rosproxy.ros1.protocol.xmlrpc.document import Call
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.registry import Registry
 from rosproxy.ros1.rewriting import policing
-from rosproxy.ros1.rewriting.addressing import Addressing, Asker
+from rosproxy.ros1.rewriting.addressing import Addressing, Caller
 from rosproxy.ros1.rewriting.master_api import holder
 from rosproxy.ros1.rewriting.master_calls import (
-    NOTHING_UNSEEN,
-    Admission,
+    NO_REPLY_CHANGES,
     Answered,
+    CallOutcome,
     LocalReply,
     MasterReply,
     Refusal,
+    ReplyChanges,
     Request,
-    Unseen,
     registration,
     second_name,
 )
@@ -42,7 +42,7 @@ MASTER = "/master"
 
 
 @dataclass(slots=True, eq=False)
-class PolicyJudge:
+class AccessChecks:
     """Applies the policy to calls and connections."""
 
     _policy: AccessPolicy
@@ -69,9 +69,9 @@ class PolicyJudge:
     def filters_names(self, request: Request) -> bool:
         """Whether the reply to a request lists parameters that its node may not see."""
         listing = any(call and call.method == "getParamNames" for call in request.calls)
-        asker = request.asker
-        callers = [asker.caller_id]
-        return listing and self._policy.may_deny({RuleKind.GET_PARAM}, callers, asker.address)
+        caller = request.caller
+        callers = [caller.caller_id]
+        return listing and self._policy.may_deny({RuleKind.GET_PARAM}, callers, caller.address)
 
     async def judge_request(self, request: Request) -> list[LocalReply | None]:
         """The replies to those calls of a request that the master does not get.
@@ -79,11 +79,11 @@ class PolicyJudge:
         Those that register are judged once they have an endpoint (`judge_registration`).
         Raises Unreachable.
         """
-        asker, params = request.asker, _KnownParams(self._upstream)
+        caller, params = request.caller, _KnownParams(self._upstream)
         if self.idle:
             return [None] * len(request.calls)
         return [
-            await self._judge_call(call, asker, params) if call else None for call in request.calls
+            await self._judge_call(call, caller, params) if call else None for call in request.calls
         ]
 
     def judge_long(self, method: str, head: bytes, source: str) -> LocalReply | None:
@@ -96,17 +96,17 @@ class PolicyJudge:
         return _refused(self._policy.tell(verdict, use.kind, f"of {caller_id}", source))
 
     def judge_registration(
-        self, call: Call, admission: Admission, asker: Asker, now: float
-    ) -> Admission:
+        self, call: Call, admission: CallOutcome, caller: Caller, now: float
+    ) -> CallOutcome:
         """What becomes of a call that registers or unregisters, once it is admitted."""
         if self.idle or isinstance(admission, LocalReply):
             return admission
-        held, found = registration(call, now, asker.address), row(call.method)
+        held, found = registration(call, now, caller.address), method_spec(call.method)
         if held is None or held.kind is Kind.PARAM:  # parameters were judged before
             return admission
         if found.unregisters:
-            return self._judge_end(held, call, asker) or admission
-        address = admission.address if isinstance(admission, Endpoint) else asker.address
+            return self._judge_end(held, call, caller) or admission
+        address = admission.address if isinstance(admission, Endpoint) else caller.address
         kind, callers = policing.KINDS[held.kind], [held.caller_id]
         verdict = self._policy.ask(kind, held.name, callers, address)
         if verdict.allowed:
@@ -114,28 +114,28 @@ class PolicyJudge:
         if not isinstance(admission, Endpoint):
             return _refused(verdict)  # a URI of somebody else, whom the proxy could not hide
         concealed = replace(held, hidden=True)
-        return policing.hidden_registration(concealed, admission, asker, self._addressing)
+        return policing.hidden_registration(concealed, admission, caller, self._addressing)
 
-    def unseen(self, reply: MasterReply) -> Unseen:
+    def unseen(self, reply: MasterReply) -> ReplyChanges:
         """What a reply has to say otherwise than the master does."""
         if self.idle:
-            return NOTHING_UNSEEN
-        publishers, asker = dict[str, list[str]](), reply.exported.request.asker
+            return NO_REPLY_CHANGES
+        publishers, caller = dict[str, list[str]](), reply.exported.request.caller
         for result in reply.results:
-            if row(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:
+            if method_spec(result.call.method).registers is Kind.SUBSCRIBER and result.endpoint:
                 topic = second_name(result.call)
                 publishers[topic] = policing.publishers_for(
                     result.endpoint, topic, [], self._addressing
                 )
         params: frozenset[str] = frozenset()
         if self.filters_names(reply.exported.request):
-            kind, callers = RuleKind.GET_PARAM, [asker.caller_id]
+            kind, callers = RuleKind.GET_PARAM, [caller.caller_id]
             params = frozenset(
                 name
                 for name in reply.param_names()
-                if not self._policy.judge(kind, name, callers, asker.address).allowed
+                if not self._policy.judge(kind, name, callers, caller.address).allowed
             )
-        return Unseen(publishers, params, bool(self._registry.hidden))
+        return ReplyChanges(publishers, params, bool(self._registry.hidden))
 
     # What outside asks of a node inside
 
@@ -236,28 +236,28 @@ class PolicyJudge:
         return any(e.address == source and e.trusted for e in self._registry)
 
     async def _judge_call(
-        self, call: Call, asker: Asker, params: "_KnownParams"
+        self, call: Call, caller: Caller, params: "_KnownParams"
     ) -> LocalReply | None:
         caller_id = call.string(0) or ""
         if call.method == "lookupNode":
-            return policing.hidden_node(call, asker, self._addressing)
+            return policing.hidden_node(call, caller, self._addressing)
         if call.method == "lookupService":
-            return self._judge_lookup(call, asker, caller_id)
+            return self._judge_lookup(call, caller, caller_id)
         use = policing.param_use_of(call)
         if use is None:
             return None
-        verdict = self._judge_use(use, caller_id, asker.address)
+        verdict = self._judge_use(use, caller_id, caller.address)
         if not verdict.allowed and use.below and call.method != "subscribeParam":
-            verdict = await self._judge_names(use, call, asker.address, params)
+            verdict = await self._judge_names(use, call, caller.address, params)
         what = f"{use.names[0]} of {caller_id}"
-        return _refused(self._policy.tell(verdict, use.kind, what, asker.address))
+        return _refused(self._policy.tell(verdict, use.kind, what, caller.address))
 
-    def _judge_lookup(self, call: Call, asker: Asker, caller_id: str) -> LocalReply | None:
+    def _judge_lookup(self, call: Call, caller: Caller, caller_id: str) -> LocalReply | None:
         name = second_name(call)
         known = self._registry.services.get(name)
         if known and not known[0].health.cleaned:
-            return policing.hidden_service(call, asker, self._addressing)
-        verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], asker.address)
+            return policing.hidden_service(call, caller, self._addressing)
+        verdict = self._policy.ask(RuleKind.CALL, name, [caller_id], caller.address)
         return None if verdict.allowed else policing.no_provider(verdict.reason)
 
     def _judge_use(self, use: ParamUse, caller_id: str, source: str) -> Verdict:
@@ -289,9 +289,9 @@ class PolicyJudge:
         found = [self._policy.judge(use.kind, name, [caller_id], source) for name in below]
         return strictest([*own, *found])
 
-    def _judge_end(self, held: Registration, call: Call, asker: Asker) -> Answered | None:
+    def _judge_end(self, held: Registration, call: Call, caller: Caller) -> Answered | None:
         """The answer to a call that ends what the master does not know of."""
-        endpoint = holder(call, asker, self._addressing)
+        endpoint = holder(call, caller, self._addressing)
         known = endpoint.registrations.get(held.key) if endpoint else None
         return policing.hidden_end(known) if known and known.hidden else None
 

@@ -21,7 +21,7 @@ from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.registry.endpoint import Endpoint, Registration
 from rosproxy.ros1.registry.graph import ROSOUT, TOPIC_KINDS, Graph, NodeInfo
 from rosproxy.ros1.rewriting.addressing import Addressing
-from rosproxy.ros1.upkeep.policy.registration import known_as
+from rosproxy.ros1.upkeep.decisions.registration import known_as
 
 Container = tuple[str, Collection[str]]
 """A container on an inside network: its IP address there, and its host names in lower case."""

@@ -19,10 +19,10 @@ from rosproxy.ros1.protocol.master_methods import Kind
 from rosproxy.ros1.protocol.uris import parse_slave_uri
 from rosproxy.ros1.protocol.xmlrpc import document as xmlrpc
 from rosproxy.ros1.registry import hidden
-from rosproxy.ros1.registry.endpoint import Endpoint, Held, Registration
+from rosproxy.ros1.registry.endpoint import Endpoint, EndpointRegistration, Registration
 from rosproxy.ros1.rewriting import policing
 from rosproxy.ros1.standins.ports import StandInPorts
-from rosproxy.ros1.upkeep.policy import registration as policy
+from rosproxy.ros1.upkeep.decisions import registration as decisions
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ RETRY = 2.0
 """Seconds after which the master is asked again that was away."""
 
 
-class Matchmaker:
+class PublisherUpdates:
     """Hands subscribers their publishers."""
 
     def __init__(self, context: Context, stand_ins: StandInPorts) -> None:
@@ -55,10 +55,10 @@ class Matchmaker:
         self, endpoint: Endpoint, topic: str, publishers: Sequence[str]
     ) -> bool:
         """The same for an endpoint's node, which gets the hidden ones, too, in its own form."""
-        asker, addressing = self._context.node_asker(endpoint), self._context.addressing
-        await self._stand_ins.listen_for(publishers, asker)
+        caller, addressing = self._context.caller_at(endpoint), self._context.addressing
+        await self._stand_ins.listen_for(publishers, caller)
         found = policing.publishers_for(endpoint, topic, publishers, addressing)
-        imported = dict.fromkeys(addressing.import_slave(uri, asker) for uri in found)
+        imported = dict.fromkeys(addressing.import_slave(uri, caller) for uri in found)
         return await self._update(endpoint.slave, topic, [*imported])
 
     def note(self, held: Registration) -> None:
@@ -94,11 +94,11 @@ class Matchmaker:
         finally:
             self._telling.discard(topic)
 
-    async def _hand_out(self, held: Sequence[Held]) -> None:
+    async def _hand_out(self, held: Sequence[EndpointRegistration]) -> None:
         """Hand subscribers of one topic their publishers. Raises Unreachable."""
         addressing = self._context.addressing
         shown = [(e, one) for e, one in held if not one.hidden]
-        calls = [policy.register_call(one, addressing.advertised_uri(e), "") for e, one in shown]
+        calls = [decisions.register_call(one, addressing.advertised_uri(e), "") for e, one in shown]
         values = await self._context.upstream.multicall(calls)
         lists = {
             e: value if isinstance(value, list) else []

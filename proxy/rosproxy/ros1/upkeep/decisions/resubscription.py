@@ -48,15 +48,15 @@ def subscriptions(
     """
     publishers: dict[str, dict[frozenset[int], list[Endpoint]]] = {}
     for endpoint in endpoints:
-        place = endpoint.place
-        literal = place.named and not place.stale
-        joint = _networks_of(place.address, addressing) if literal else frozenset()
+        location = endpoint.location
+        literal = location.named and not location.stale
+        joint = _networks_of(location.address, addressing) if literal else frozenset()
         for topic in dict.fromkeys(endpoint.shown(Kind.PUBLISHER)):
             publishers.setdefault(topic, {}).setdefault(joint, []).append(endpoint)
     found: list[TopicSubscription] = []
     for node, registrations in held.items():
         itself = addressing.registry.by_caller.get(node)
-        near = _networks_of(itself.place.address, addressing) if itself else frozenset()
+        near = _networks_of(itself.location.address, addressing) if itself else frozenset()
         for one in registrations:
             groups = publishers.get(one.name, {}) if one.kind is Kind.SUBSCRIBER else {}
             found += [

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 import msgspec
 
-from rosproxy.leases.fast_ports import Holder
+from rosproxy.leases.fast_ports import LeaseHolder
 from rosproxy.net.addresses import HostPort, is_loopback
 
 Forwards = Mapping[int, HostPort]
@@ -29,7 +29,7 @@ class HostForwarding(msgspec.Struct, frozen=True):
     own: Collection[str] = ()
 
 
-def destination(endpoint: Holder, host: HostForwarding) -> HostPort | str:
+def destination(endpoint: LeaseHolder, host: HostForwarding) -> HostPort | str:
     """Where an endpoint's fast port may be forwarded to, or why it may not.
 
     The address is the one that the proxy found the node at, the port the one that the node itself
@@ -50,7 +50,7 @@ def destination(endpoint: Holder, host: HostForwarding) -> HostPort | str:
     return HostPort(address, next(iter(ports)))
 
 
-def kept(now: Forwards, endpoints: Iterable[Holder], recovered: bool) -> dict[int, HostPort]:
+def kept(now: Forwards, endpoints: Iterable[LeaseHolder], recovered: bool) -> dict[int, HostPort]:
     """The forwards from before a restart that nothing is known against yet.
 
     Until the registry is rebuilt these are all; after that those of endpoints whose node has not
@@ -63,7 +63,7 @@ def kept(now: Forwards, endpoints: Iterable[Holder], recovered: bool) -> dict[in
 
 
 def unchanged(
-    now: Forwards, owners: Mapping[int, Holder], changed: Collection[Holder]
+    now: Forwards, owners: Mapping[int, LeaseHolder], changed: Collection[LeaseHolder]
 ) -> dict[int, HostPort]:
     """The forwards of all endpoints that still have them, without those that have changed."""
     found = ((port, where, owners.get(port)) for port, where in now.items())
